@@ -46,7 +46,7 @@ class Answer:
         interval: (lower, upper), in which the answer lies; an infinite end is open. None if it has no uncertainty.
         paper: The paper's answer.
         holds: Whether the criterion of the application is met.
-        note: What is to be known besides.
+        note: Further information.
         seconds: Seconds of wall time; measured if left out.
     """
 

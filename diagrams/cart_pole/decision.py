@@ -21,7 +21,7 @@ def cost(state: NDArray[np.float64]) -> float:
 
 
 def plan_of(scenario: CartPoleScenario, address: str) -> Trajectory:
-    """Return what is decided: the knots of the plan at ``address``, within the limits of the force."""
+    """Return the decision variables: the knots of the plan at ``address``, within the limits of the force."""
     limit = scenario.force_limit
     return Trajectory(address, scenario.knots, scenario.duration, scenario.order, lower=-limit, upper=limit)
 

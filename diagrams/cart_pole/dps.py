@@ -26,7 +26,7 @@ def make_dps(plan: Spline, *, period: float, force_limit: float, planner: System
         plan: The curve that the knots define, in N.
         period: Sample period of ``env`` and ``impl`` in seconds.
         force_limit: The largest force in N.
-        planner: What decides the plan, with the output port ``decision``; None leaves that to the command.
+        planner: The system that decides the plan, with the output port ``decision``; None: the plan is a command.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", Multiplexer([JOINTS, JOINTS]))

@@ -28,10 +28,10 @@ class CartPole:
     """The numbers of Drake's own cart-pole (``drake/examples/multibody/cart_pole/cart_pole.sdf``).
 
     Attributes:
-        cart_mass: m_c in kg.
-        pole_mass: m_p in kg, a point at the end of the pole.
-        pole_length: l in m.
-        gravity: g in m/s^2.
+        cart_mass: Mass m_c of the cart in kg.
+        pole_mass: Mass m_p in kg, a point at the end of the pole.
+        pole_length: Length l of the pole in m.
+        gravity: Acceleration g of free fall in m/s^2.
     """
 
     cart_mass: float = 10.0
@@ -63,9 +63,9 @@ class CartPole:
         """Return the state [x, theta, x', theta'] ``dt`` seconds after another one: one step of Runge and Kutta.
 
         Args:
-            state: Shape (4,), in m and rad.
-            force: On the cart, constant, in N.
-            dt: In seconds.
+            state: The state, shape (4,), in m and rad.
+            force: The constant force on the cart in N.
+            dt: The step in seconds.
         """
         m_c, m_p, length, g = self.cart_mass, self.pole_mass, self.pole_length, self.gravity
 

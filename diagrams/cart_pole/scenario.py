@@ -37,7 +37,7 @@ def _plant(time_step: float) -> MultibodyPlantConfig:
 
 @dataclass
 class CartPoleScenario(Scenario):
-    """Drake's cart-pole under a plan of forces [t_begin, knots in N], which is what is decided.
+    """Drake's cart-pole under a plan of forces [t_begin, knots in N], which is to be decided.
 
     The plan is the command ``u.plan``; or, with ``onboard``, the decision of a reasoner that is a part of the DPS,
     ``dps.planner``. The pole hangs at the angle 0 and stands at pi. A mental copy simulates the same cart-pole with a
@@ -180,10 +180,10 @@ class CartPoleScenario(Scenario):
         return all(replace(errors, seed=0) == ErrorModel() for errors in (self.position_errors, self.velocity_errors))
 
     def add_beliefs(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare that what the DPS perceives sets the joints of the simulated world.
+        """Declare that the perceived state sets the joints of the simulated world.
 
-        What it perceives was measured up to two periods before: sensors and ``env`` take one each. The present follows
-        from it and from the force that acts.
+        It was measured up to two periods before: sensors and ``env`` take one each. The present state follows from it
+        and from the force that acts.
         """
         T, model = self.period, CartPole()
         for k, name in enumerate(JOINT_NAMES):

@@ -29,7 +29,7 @@ def make_reasoner(scenario: CartPoleScenario, *, rollouts: int = 32, **options: 
     """Return a reasoner that decides the command ``u.plan`` of a cart-pole.
 
     Args:
-        scenario: That of the running cart-pole.
+        scenario: The scenario of the running cart-pole.
         rollouts: Budget of a decision.
         options: Further arguments of `Reasoner`, which replace those of `reasoning`.
     """
@@ -41,9 +41,9 @@ class Swing:
     """The course of a swing-up.
 
     Attributes:
-        times: In s, shape (n,).
+        times: Times in s, shape (n,).
         states: [x, theta, x', theta'] at these times, shape (n, 4), in m and rad.
-        decisions: What was decided at each of them, if a reasoner outside the DPS did.
+        decisions: The decision at each of them, if a reasoner outside the DPS decides.
     """
 
     times: Array
@@ -62,7 +62,7 @@ def swing_up(reasoner: Reasoner, scenario: CartPoleScenario, *, seconds: float =
     The time that a decision takes is not simulated: the cart-pole waits.
 
     Args:
-        reasoner: What decides, see `make_reasoner`.
+        reasoner: The reasoner, see `make_reasoner`.
         scenario: The cart-pole; it may differ from that of the reasoner.
         seconds: Duration of the simulation in seconds.
         every: Time from one decision to the next, in seconds.

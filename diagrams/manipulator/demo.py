@@ -67,7 +67,7 @@ class Attendant:
 
 
 class Demo:
-    """The way of one control law from the simulation to the machine."""
+    """The stages of one control law, from the simulation to the machine."""
 
     def __init__(self, law: str, hub: Hub) -> None:
         self.law = law

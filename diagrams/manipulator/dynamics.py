@@ -1,4 +1,4 @@
-"""The arm's kinematics and dynamics in CasADi: what its controllers know of it.
+"""The arm's kinematics and dynamics in CasADi: the model of its controllers.
 
 The model is the controllers' own: an arm with a tool and nothing around it, with the numbers of `Arm`.
 """

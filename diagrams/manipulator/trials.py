@@ -91,10 +91,10 @@ class Track:
 
     Attributes:
         motion: The motion under way, shape (n,).
-        clock: Since its begin, in s, (n,).
+        clock: The time since its begin, in s, (n,).
         wanted: The reference of the tip, (n, 3), in m, in the world.
-        tip: Where it was, by the measured joint positions, (n, 3).
-        force: That the environment exerts on the tip, as the DPS perceives it, (n, 3), in N.
+        tip: The position of the tip by the measured joint positions, (n, 3), in m.
+        force: The force of the environment on the tip, as the DPS perceives it, (n, 3), in N.
     """
 
     motion: NDArray[np.float64]
@@ -183,7 +183,7 @@ class Contact:
     """A press against the wall.
 
     Attributes:
-        clock: Since the begin of the motion, in s, (n,).
+        clock: The time since the begin of the motion, in s, (n,).
         predicted, felt: Force on the wall, in N, (n,).
     """
 

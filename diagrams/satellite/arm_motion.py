@@ -202,7 +202,7 @@ def make_dps(scenario: ArmMotionScenario, planner: System | None = None) -> Diag
 
     Args:
         scenario: Names the curve and the start.
-        planner: What decides the plan, with the output port ``decision``; None leaves that to the command.
+        planner: The system that decides the plan, with the output port ``decision``; None: the plan is a command.
     """
     builder = DiagramBuilder()
     env = builder.AddNamedSystem("env", ZeroOrderHold(PERIOD, ARM_JOINTS))
@@ -237,7 +237,7 @@ DEVIATION = Quality(deviation, of=BASE, reading="end", minimize=True)
 
 
 def free_knots(scenario: ArmMotionScenario, address: str) -> list[Parameter]:
-    """Return what is searched: the free knots of the plan at ``address``, with their ranges."""
+    """Return the decision variables: the free knots of the plan at ``address``, with their ranges."""
     move = scenario.move()
     ends = move.search_range
     first = 1 + ARM_JOINTS * RESTING
@@ -245,7 +245,7 @@ def free_knots(scenario: ArmMotionScenario, address: str) -> list[Parameter]:
 
 
 def limits(scenario: ArmMotionScenario, address: str) -> list[Constraint]:
-    """Return what a rollout under the plan at ``address`` keeps: the deviation on the way, and the plan's limits."""
+    """Return the constraints of a rollout with the plan at ``address``, on the deviation on the way and on the plan."""
     largest = scenario.move().largest
     excess = partial(_excess, tuple(scenario.start), tuple(scenario.goal), scenario.duration, scenario.knots)
     return [

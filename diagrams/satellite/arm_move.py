@@ -53,21 +53,21 @@ FEASIBILITY = 1e-5
 
 
 class MoveSpace:
-    """The arm's moves of one duration: what plans there are, and what they do to the base; compiled once.
+    """The arm's moves of one duration: the plans, and their effect on the base; compiled once.
 
     Attributes:
         spline: The curve of each joint.
         servicer: The satellite.
         model: Its momentum model, fingers open.
-        reaction: What computes the motion of the base and the torques.
+        reaction: The function that computes the motion of the base and the torques.
     """
 
     def __init__(self, *, duration: float = 20.0, knots: int = 9, servicer: Servicer | None = None) -> None:
         """Read the servicer's plant.
 
         Args:
-            duration: Of a move in seconds.
-            knots: Of a plan; all but the two at each end are free.
+            duration: The duration of a move in seconds.
+            knots: The number of knots of a plan; all but the two at each end are free.
             servicer: The satellite; by default that of the testbed.
 
         Raises:

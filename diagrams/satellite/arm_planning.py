@@ -28,7 +28,7 @@ GOOD_ENOUGH = 2e-3
 
 # The standard deviation of the starts from the straight path, in rad.
 _SPREAD = 0.2
-# The cost in the solvers' eyes, and their tolerance and patience.
+# Scale of the cost for the solvers, and their tolerance and patience.
 _SCALE, _TOLERANCE, _ITERATIONS = 1e2, 1e-4, 60
 
 
@@ -37,8 +37,8 @@ class Plan:
     """A plan of the arm, and how it was found.
 
     Attributes:
-        knots: In rad, shape (n, 7).
-        deviation: q in rad by the momentum model; infinite if no plan within the limits was found.
+        knots: The knots in rad, shape (n, 7).
+        deviation: The deviation q in rad by the momentum model; infinite if no plan within the limits was found.
         history: The best q so far in rad over the wall time in s: (time, q), each better than the one before.
         message: How the solver ended, in its own words.
     """
@@ -222,11 +222,11 @@ class MomentumDescent(Solver):
 
     Args:
         search: The free knots.
-        name: In the catalogue.
+        name: The name in the catalogue.
         origin: Joint positions at the begin, in rad.
         goal: Joint positions at the end, in rad.
-        duration: Of the move in seconds.
-        knots: Of a plan.
+        duration: The duration of the move in seconds.
+        knots: The number of knots of a plan.
         attempts: The most starts that are tried, until one leads to `GOOD_ENOUGH`.
     """
 

@@ -4,7 +4,7 @@
 captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with camera and
 scanner in the loop, and prints one row per capture.
 
-What counts, fixed before any result was seen:
+The criteria of success, fixed before any result was seen:
 
 * The bar is held: the supervisor is in its mode ``hold``, and the bar is in truth between the fingers' pads, no further
   than `GRIP_LENGTH` from the middle of the hand along it, and than `GRIP_DEPTH` along the direction of approach.
@@ -99,12 +99,12 @@ def capture_task(scenario: SatelliteScenario) -> RolloutTask:
 
 
 def capture_record() -> list[str]:
-    """Return the addresses of what a capture is judged by: mode and reason, and the true poses of bodies and joints."""
+    """Return the addresses that a capture is judged by: mode and reason, and the true poses of bodies and joints."""
     return [MODE, REASON, BASE, TARGET, *_JOINTS]
 
 
 def judge(result: RolloutResult) -> Capture:
-    """Return what came of a rollout of `capture_task`, from its true motion."""
+    """Return the end of the capture in a rollout of `capture_task`, from its true motion."""
     record = result.record
     tumble = float(np.linalg.norm(np.asarray(result.parameters["sim.env.release.velocity"])[:3]))
     if result.end == "failed" or len(result.times) < 2:

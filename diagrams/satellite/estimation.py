@@ -1,4 +1,4 @@
-"""How the servicer knows its own motion: an inertial navigation in a frame I that it sets up itself."""
+"""The servicer's estimate of its own motion: an inertial navigation in a frame I that is fixed at the start."""
 
 from __future__ import annotations
 

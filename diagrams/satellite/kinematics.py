@@ -1,4 +1,4 @@
-"""The arm's kinematics, as its controller knows them: where the gripper is, and which joint rates move it."""
+"""The arm's kinematics in its controller: the pose of the gripper, and the joint rates for a velocity of it."""
 
 from __future__ import annotations
 

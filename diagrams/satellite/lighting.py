@@ -6,7 +6,7 @@ and the exposure of its camera. The lights are the sun in front of the target, w
 it; the sun beside it, and grazing its face; and the sun behind it, where only a lamp on the camera helps. The cost is
 the time until the fingers hold the bar; the error of the bar that is perceived then is shown beside it.
 
-What could bend the answer was fixed before the candidates were judged:
+The choices that influence the answer were fixed before the candidates were judged:
 
 * the lights, `LIGHTS`;
 * the candidates, `CANDIDATES`, the first of which are the defaults of the robot;
@@ -14,13 +14,13 @@ What could bend the answer was fixed before the candidates were judged:
   No capture from either had been looked at before;
 * a capture that has not succeeded by `HORIZON`, or is aborted, costs `FAILURE`.
 
-All this was laid anew after an earlier layout, of which the starts 0 to 8 and 100 to 108 had been looked at: they do
-not count. There, the servicer had no wheels, and most failures were not the light's: the arm's reaction turned the base
-until the target left the image. So the servicer of `LightingScenario` holds its attitude by wheels, in all captures.
-The exposure is a new candidate.
+These choices replace earlier ones, with which captures from the starts 0 to 8 and 100 to 108 were simulated: those
+starts are not used. There, the servicer had no wheels, and most failures were not due to the light: the arm's reaction
+turned the base until the target left the image. So the servicer of `LightingScenario` holds its attitude by wheels, in
+all captures. The exposure is a new candidate.
 
-Choosing takes minutes. So the default run takes `CHOICE`, what was chosen, and compares it afresh with the default of
-the robot, from all starts of `CHECKED_ON`; ``--full`` chooses anew first.
+The choice takes minutes. So the default run takes its result `CHOICE`, and compares it with the default of the robot,
+from all starts of `CHECKED_ON`; ``--full`` repeats the choice first.
 
 ``python -m vtbdrake_diagrams.satellite.lighting [--starts N] [--full]`` prints the answer and draws it.
 """
@@ -82,15 +82,15 @@ CHOSEN_ON, CHECKED_ON = tuple(range(11, 19)), tuple(range(111, 119))
 
 @dataclass(frozen=True)
 class Settings:
-    """What is decided: a candidate.
+    """The parameters of the robot that are decided: a candidate.
 
     Attributes:
-        speed: The largest speed at which the gripper corrects its position, in m/s; so it comes to the fixture.
+        speed: The largest speed at which the gripper corrects its position, in m/s, also on the approach.
         closing_speed: The speed along the fixture's axis, in m/s.
         gain: The gains of position and orientation of the resolved-rate control, in 1/s.
         agility: Factor of the tracker's process noise, of rates and velocities.
-        exposure: That of the camera; at 1 a white surface in the sun is just not too bright.
-        threshold: That of the marker detector, in 8-bit counts.
+        exposure: The exposure of the camera; at 1 a white surface in the sun is just not saturated.
+        threshold: The threshold of the marker detector, in 8-bit counts.
     """
 
     speed: float = 0.12
@@ -197,7 +197,7 @@ def bar_error(record: Mapping[str, Any]) -> float:
 
 @dataclass(frozen=True)
 class Captures:
-    """What came of the captures with some settings.
+    """The results of the captures with some settings.
 
     Attributes:
         times: The cost of each of the settings under each light from each start, in s, shape (n, lights, starts).
@@ -251,7 +251,7 @@ class LightingAnswer:
     Attributes:
         choice: The settings that are best in their worst light.
         checked: The captures with the default and with the choice, from the starts for the comparison.
-        candidates: Among what was chosen; empty if `CHOICE` was taken.
+        candidates: The candidates of the choice; empty if `CHOICE` was taken.
         tried: The captures with these, from the starts for the choice.
     """
 
@@ -286,7 +286,7 @@ def find_settings(
     """Choose among candidates on some starts, and compare the choice with the default on others.
 
     Args:
-        candidates: What is tried.
+        candidates: The candidates.
         seeds: Start poses for the choice.
         others: Start poses for the comparison.
         executor: Runs the rollouts.
@@ -338,7 +338,7 @@ def answer_lighting(*, full: bool = False, starts: int = len(CHECKED_ON)) -> Lig
 
 
 def _table(captures: Captures, number: int) -> str:
-    """Return by light what came of the captures with some of the settings."""
+    """Return by light the results of the captures with some of the settings."""
     columns = zip(
         LIGHTS, captures.by_light[number], captures.failures[number], captures.error_by_light[number], strict=True
     )

@@ -4,17 +4,17 @@ The capture is led by a pose sensor, and the camera looks on: so the motion does
 recorded once for every capture (`vtbdrake.RecordedMotion`). The camera sits on the front face of the base, on which the
 arm stands, too. Its position on the face and the direction of its view are decided.
 
-What could bend the answer was fixed before the first placement was judged:
+The choices that influence the answer were fixed before the first placement was judged:
 
 * the placements by hand, `BY_HAND`: above the arm, on either side, in a corner, and beside the foot of the arm, all but
   the first aimed at the place where the bar is gripped;
 * the captures, `SEEDS`: the first start poses of the scenario, all of which succeed;
 * the time that counts: from the start until the base and the target rest against each other, `HORIZON`;
 * the light: the scenario's own;
-* what counts as a difference: `TELLING` markers. The count is a whole number, and moves by some tenths for no reason.
+* the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths.
 
-``python -m vtbdrake_diagrams.satellite.mount [--full]`` prints the answer and draws it. The DPS keeps the pose of the
-camera that it knows: what it detects in an image does not depend on it.
+``python -m vtbdrake_diagrams.satellite.mount [--full]`` prints the answer and draws it. The DPS keeps the nominal pose
+of the camera: the markers that it detects in an image do not depend on it.
 """
 
 from __future__ import annotations
@@ -148,8 +148,9 @@ def mount_problem(
 
     Args:
         parameters: Entries of the camera's pose.
-        seeds: Of the captures over which the quality is averaged.
-        reading: Of the number of markers over time: ``integral``, in markers times s, or ``best``, the paper's maximum.
+        seeds: The seeds of the captures over which the quality is averaged.
+        reading: The quality of the number of markers over time: ``integral``, in markers times s, or ``best``, the
+            paper's maximum.
         fixed: Values of other entries of the pose, by address.
         recorded: Whether candidates are judged along recorded motions.
     """
@@ -183,12 +184,12 @@ def mean_count(rollout: RolloutResult) -> float:
 
 @dataclass(frozen=True)
 class Placement:
-    """A placement of the camera, and what it sees in each capture.
+    """A placement of the camera, and its result in each capture.
 
     Attributes:
-        name: In words.
-        pose: [x, y, z, roll, pitch, yaw] in B, (6,), in m and rad.
-        rollouts: One per capture.
+        name: Its name.
+        pose: The pose [x, y, z, roll, pitch, yaw] in B, (6,), in m and rad.
+        rollouts: The rollouts, one per capture.
     """
 
     name: str
@@ -212,8 +213,8 @@ class MountAnswer:
 
     Attributes:
         best: The placement that was found.
-        by_hand: Those of `BY_HAND`.
-        afterwards: Those of `AFTERWARDS`, which do not count for `holds`.
+        by_hand: The placements of `BY_HAND`.
+        afterwards: The placements of `AFTERWARDS`, which do not count for `holds`.
         landscape: Rollouts on a grid over the position, with the view as in the best placement.
     """
 
@@ -281,7 +282,7 @@ def plot_answer(answer: MountAnswer, *, times: Sequence[float] = (2.0, 6.0, 10.0
 
     Args:
         answer: The answer.
-        times: Of the images, in s.
+        times: Times of the images in s.
     """
     placements = [answer.best, *answer.by_hand]
     figure = Picture(14.0, 4.6 + 1.35 * len(placements))

@@ -59,7 +59,7 @@ def target_faces(target: Target | None = None) -> Faces:
 
 @dataclass
 class PerceptionConfig:
-    """How the DPS perceives the target."""
+    """The configuration of the perception of the target."""
 
     detector: MarkerDetector = field(default_factory=MarkerDetector)
     registration: Registration = field(default_factory=Registration)
@@ -272,10 +272,10 @@ def add_marker_part(
     """Add the slow part ``markers`` with its ``image_arrival``, and the input port ``image`` of their Diagram.
 
     Args:
-        builder: Of the Diagram ``env`` of the DPS.
-        base: Remembers the base's poses.
-        target: Predicts the target's pose.
-        config: How images are evaluated.
+        builder: The builder of the Diagram ``env`` of the DPS.
+        base: The estimator that remembers the base's poses.
+        target: The tracker that predicts the target's pose.
+        config: The configuration of the evaluation of images.
         period: The period of the DPS, in s.
         info: The size of its images, and its intrinsics.
         image_latency: How old its images are when it shows them, in s.
@@ -318,10 +318,10 @@ def add_scan_part(
     """Add the slow part ``registration`` with its ``scan_arrival``, and the input port ``scan`` of their Diagram.
 
     Args:
-        builder: Of the Diagram ``env`` of the DPS.
-        base: Remembers the base's poses.
-        target: Predicts the target's pose.
-        config: How scans are evaluated.
+        builder: The builder of the Diagram ``env`` of the DPS.
+        base: The estimator that remembers the base's poses.
+        target: The tracker that predicts the target's pose.
+        config: The configuration of the evaluation of scans.
         period: The period of the DPS, in s.
         attitude: R_IT to begin with; None if the track begins with markers.
 

@@ -1,4 +1,4 @@
-"""How the grapple fixture moves against the base, and where the gripper is: what the capture is controlled by."""
+"""The motion of the grapple fixture against the base, and the pose of the gripper, by which a capture is controlled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where and how the target moves at the start of a capture."""
+"""The motion of the target at the start of a capture."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DRIFT = 0.005
 
 @dataclass(frozen=True)
 class Start:
-    """How the target moves at t = 0.
+    """The motion of the target at t = 0.
 
     Attributes:
         X_WT: Its pose.
@@ -58,7 +58,7 @@ def random_start(seed: int, *, tumble: float, distance: float) -> Start:
     """Return the start of a tumble about a random axis, in which the bar is near its nominal place at `MEETING`.
 
     Args:
-        seed: Of all random numbers.
+        seed: The seed of all random numbers.
         tumble: The angular velocity in rad/s.
         distance: The distance of the target's centre from the servicer's, along x, when the target faces it, in m.
     """

@@ -1,4 +1,4 @@
-"""The supervisor of a capture: which mode it is in, and why."""
+"""The supervisor of a capture: a state machine with its modes and the reasons of their changes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ GUIDANCE = 6
 
 @dataclass(frozen=True)
 class Guidance:
-    """What the supervisor asks of the controller.
+    """The supervisor's instructions to the controller.
 
     Attributes:
         mode: One of the modes.

@@ -49,11 +49,11 @@ class Course:
     """A motion of the arm in the full testbed.
 
     Attributes:
-        times: In s, shape (n,).
-        deviations: Of the base's attitude in rad, shape (n,).
+        times: Times in s, shape (n,).
+        deviations: Deviations of the base's attitude in rad, shape (n,).
         rates: The largest rate of each joint, as a share of its limit, shape (7,).
         torques: The largest torque of each drive, as a share of its limit, shape (7,).
-        miss: How far the joints are from the goal in the end, in rad.
+        miss: Distance of the joints from the goal at the end, in rad.
     """
 
     times: Array
@@ -78,8 +78,8 @@ def simulate(scenario: ArmMotionScenario, knots: Array | None = None) -> Course:
 
     Args:
         scenario: The motion.
-        knots: Of the plan in rad, shape (n, 7); None leaves that to the scenario: the straight path, or what it decides
-            on board.
+        knots: Knots of the plan in rad, shape (n, 7); None takes the scenario's: the straight path, or the decision on
+            board.
     """
     testbed = scenario.build()
     simulator = testbed.simulator()
@@ -122,8 +122,8 @@ def random_scenarios(count: int, *, seed: int = 0) -> list[ArmMotionScenario]:
     """Return motions from poses near the stowed one to poses that reach forward, whose straight paths keep the limits.
 
     Args:
-        count: How many.
-        seed: Of the random numbers.
+        count: Number of motions.
+        seed: Seed of the random numbers.
     """
     random, found = np.random.default_rng(seed), []
     servicer = Servicer()
@@ -148,7 +148,7 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """Return how many times less the base is turned in the end."""
+        """Return the ratio of the deviations at the end, of the straight path over the best plan."""
         return self.straight.end / self.best.end
 
     @property
@@ -198,7 +198,7 @@ def plot(courses: dict[str, Course]) -> Figure:
     """Return the deviation of the base over time.
 
     Args:
-        courses: By name.
+        courses: The courses by name.
     """
     from matplotlib.figure import Figure
 

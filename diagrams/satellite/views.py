@@ -28,8 +28,8 @@ def looking(eye: ArrayLike, at: ArrayLike) -> RigidTransform:
     """Return the pose of a camera (x right, y down, z forward) at ``eye`` that looks at ``at``, with z upwards.
 
     Args:
-        eye: Its place, shape (3,), in m.
-        at: What is in the middle of its image, shape (3,), in m.
+        eye: Its position, shape (3,), in m.
+        at: The point in the middle of its image, shape (3,), in m.
     """
     place = np.asarray(eye, dtype=float)
     z = np.asarray(at, dtype=float) - place
@@ -57,8 +57,8 @@ def film_strip(testbed: VirtualTestbed, times: Sequence[float]) -> Figure:
     """Simulate a capture from its start; return a figure with the scene, and the camera's view below, at some times.
 
     Args:
-        testbed: Of a `SatelliteScenario` with a camera that is not blind.
-        times: In s, increasing.
+        testbed: The testbed of a `SatelliteScenario` with a camera that is not blind.
+        times: Times in s, increasing.
     """
     import matplotlib.pyplot as plt
 

@@ -5,8 +5,8 @@ infinite, and t_m is 300 s. The robot asks its own testbed: the rollouts begin a
 
 The world differs from the map, see `differing`: its ground is rough, its friction and the robot's mass are others.
 Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
-that no heading counts as passable which only is with good luck. Among boulders a decimeter decides; so each heading can
-be tried from several samples of the belief, of which the worst counts.
+that only headings count as passable which are so for all of the range. Among boulders, a decimetre can make the
+difference; so each heading can be tried from several samples of the belief, of which the worst counts.
 
 ``python -m vtbdrake_diagrams.space_climber.crater`` draws h over a fine grid of headings (Figure 6), and compares a
 continuous search with it.
@@ -84,7 +84,7 @@ class World:
     """A simulated reality, which differs from the robot's model of it.
 
     Attributes:
-        scenario: Its crater, its roughness and its friction.
+        scenario: The scenario with its crater, its roughness and its friction.
         mass: Factor of the torso's mass.
     """
 
@@ -238,12 +238,12 @@ def _changed(names: Sequence[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """One crater: what the robot decided, and what came of it.
+    """One crater: the robot's decision, and its result.
 
     Attributes:
         seed: Seed of the crater.
-        decision: The robot's.
-        climb: What came of it in the world; None if the robot saw no way to the rim.
+        decision: The decision of the robot.
+        climb: The climb in the world; None if the robot found no way to the rim.
     """
 
     seed: int
@@ -252,7 +252,7 @@ class Case:
 
     @property
     def passable(self) -> dict[float, bool]:
-        """Return for each heading that was tried (rad) whether it passes the rim in the robot's mind."""
+        """Return for each heading that was tried (rad) whether it passes the rim in its mental rollouts."""
         tried = [candidate for candidate in self.decision.candidates if candidate.rollouts]
         return {float(c.values[HEADING]): all(map(passes, c.rollouts)) for c in tried}
 

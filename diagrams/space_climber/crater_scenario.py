@@ -29,7 +29,7 @@ PROGRESS = 0.5
 """How far a robot that is under way gets at least within its patience, in m: a tenth of what it walks in 30 s."""
 
 PASSED = "the robot has passed the rim"
-"""What a simulation says that ends there."""
+"""The message of a simulation that ends there."""
 
 TIPPED_OVER = np.radians(60.0)
 """From which roll or pitch on the robot has tipped over."""
@@ -154,8 +154,8 @@ class EndOfClimb(LeafSystem):
         Args:
             base: Index of the robot's torso in the plant.
             period: Period of its checks, in s.
-            patience: For how long a robot that is stuck has come no further from the axis (by `PROGRESS`), in s; 0: no
-                robot is stuck.
+            patience: Time without progress (by `PROGRESS`, away from the axis) after which a robot is stuck, in s;
+                0: it never is.
         """
         super().__init__()
         self._base = int(base)

@@ -1,4 +1,4 @@
-"""Where the robot goes over ground: a visual odometer, and the navigator of the DPS that uses it."""
+"""The robot's motion over ground: a visual odometer, and the navigator of the DPS that uses it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vtbdrake_diagrams.space_climber.pose_filter import wrap
 
 
 class VisualOdometer(SampledSensor):
-    """A sensor that tells the velocity of a body over ground, as from successive camera images.
+    """A sensor of the velocity of a body over ground, as from successive camera images.
 
     .. pydrake_system::
 
@@ -77,7 +77,7 @@ class Navigator(LeafSystem):
         - walk
 
     ``input`` is [roll, pitch, yaw, x, y, height (the estimated pose), heading, walk (the commands), visual_odometry
-    (3)]: all that the navigator knows comes from the robot's own sensors.
+    (3)]: everything comes from the robot's own sensors and commands.
 
     Position: ``position`` (x, y) integrates the visual odometry. Leg odometry would not notice when all feet slip.
 
@@ -88,7 +88,7 @@ class Navigator(LeafSystem):
 
     Slip: ``slip`` is the difference (x, y) between the velocities over ground of leg odometry and visual odometry,
     behind a first-order low-pass with the time constant ``slip_time``; ``slipping`` is 1 while it is larger than
-    ``slip_limit``. It is told, and has no further effect.
+    ``slip_limit``. It is for observers only, and has no effect on the robot.
 
     Tip: ``tipped`` becomes 1 when the estimated roll or pitch exceeds ``tip_angle``, and stays 1; the robot then stops.
     """

@@ -1,6 +1,6 @@
 """Application O4: how heavy may a component on the front of the robot be before it is no longer stable?
 
-What could bend the answer was fixed before the first payload was simulated:
+The choices that influence the answer were fixed before the first payload was simulated:
 
 * the lever, 0.51 m ahead of the torso's centre: a cube bolted flat onto the front plate (see `Morphology`);
 * friction, 0.8, and 0.5 and 1.1 as the two others: the ends of what the friction angles of lunar soil give;
@@ -89,8 +89,8 @@ def static_limit(testbed: VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: 
 
     Args:
         testbed: Testbed of the space climber, with its attachment.
-        legs: Whose feet stand.
-        ahead: How far their feet stand ahead of their nominal place, in m.
+        legs: The legs whose feet stand on the ground.
+        ahead: Distance of these feet ahead of their nominal positions, in m.
     """
     plant = testbed.plant
     assert plant is not None

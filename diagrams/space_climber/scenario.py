@@ -166,8 +166,8 @@ class SpaceClimberScenario(Scenario):
         """Declare that the base is where it is perceived, turns as the gyro says, and advances as the gait does.
 
         Args:
-            builder: Of the testbed.
-            place: Addresses of the estimates of its place.
+            builder: The builder of the testbed.
+            place: Addresses of the estimates of its position.
             position: Function of them that returns the position in m, shape (3,).
         """
         gait = GAITS[self.gait]

@@ -20,8 +20,8 @@ d high in every direction; beyond, the ground is flat. What was chosen, and why:
   1995); the exponent, and how dense the fields are, are assumed.
 
 First versions were steeper and had more harmonics, gullies and boulders. Rollouts in craters 0 to 8 showed that half of
-them had no passable direction, so that there was nothing to decide there. So the terrain was made easier twice. The
-present depth, slopes and harmonics were chosen by the slopes of 40 craters.
+them had no passable direction, and therefore no decision. So the terrain was made easier twice. The present depth,
+slopes and harmonics were chosen by the slopes of 40 craters.
 
 The gully, the boulders and the fine part of the mesh lie in the sector around the x axis that a robot may enter which
 sets out from the middle with a heading within 45 deg.
@@ -250,7 +250,7 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
 
     Args:
         plant: A plant that is not finalized.
-        crater: What is added.
+        crater: The crater.
     """
     world, default = plant.world_body(), ProximityProperties()
     vertices, triangles = crater.mesh

@@ -92,7 +92,7 @@ def make_walking(
         gait: The gait.
         period: Sample period in s.
         morphology: The robot's.
-        clearance: How high the gait lifts the feet by default, in m.
+        clearance: Default height to which the gait lifts the feet, in m.
         navigator: True puts a `Navigator`, with the port ``visual_odometry``, between the commands and the gait.
     """
     builder = DiagramBuilder()
