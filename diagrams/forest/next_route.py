@@ -15,7 +15,7 @@ on was driven:
 * The error of a route is the root mean square of the error of the position over the last `COUNTED` s of its drive and
   over the other surveys. With one map, it is a single draw of that map's errors, and draws differ by more than routes.
   The choice cannot profit from what only the map in use has, such as the trees that this map lacks by chance. Its gain
-  with the map in use is told beside: that is what the carrier gets, but it is measured less well.
+  with the map in use, one draw per forest, is told beside.
 * A scan without a pose counts as `UNKNOWN` off, and so does a pose that is farther off.
 * The gain of a forest is the error of the route in use, or the mean error of all routes, less that of the chosen one.
   Its standard error is that over the forests.
@@ -246,7 +246,7 @@ def _mean(values: Array) -> str:
 def main() -> None:
     """Decide in some forests, and print what was expected and what came."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--forests", type=int, default=1)
+    parser.add_argument("--forests", type=int, default=8)
     parser.add_argument("--seed", type=int, default=SEED)
     chosen = parser.parse_args()
     answers = {}
