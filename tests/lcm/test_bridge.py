@@ -308,9 +308,8 @@ def test_values_that_waited_in_a_pause_are_dated_back(closed: bool) -> None:
 
 
 def test_copy_of_an_own_message_is_foreign(hub: Hub) -> None:
-    told: list[str] = []
     peer = Peer(hub.url)
-    with closing(bridge(hub.url, watch=True, on_foreign=lambda channel, data: told.append(channel))) as arm:
+    with closing(bridge(hub.url, watch=True)) as arm:
         arm.open()
         in_step(arm, peer)
         for _ in range(5):
@@ -324,7 +323,6 @@ def test_copy_of_an_own_message_is_foreign(hub: Hub) -> None:
         assert arm.foreign_messages == {"IIWA_COMMAND": 0}
         peer.lcm.publish("IIWA_COMMAND", own)  # a recorded one, byte for byte
         assert wait(arm, lambda: arm.foreign_messages == {"IIWA_COMMAND": 1})
-        assert told == ["IIWA_COMMAND"]
 
 
 def test_competing_publisher_is_reported_for_a_while(hub: Hub) -> None:
@@ -418,19 +416,6 @@ def test_own_message_on_another_channel_is_foreign() -> None:
     foreign.expect("C", b"1")
     foreign.take("D", b"1")
     assert foreign.heard == {"C": 0, "D": 1}
-
-
-def test_callback_that_raises_is_not_called_again(hub: Hub) -> None:
-    def refuse(channel: str, data: bytes) -> None:
-        raise RuntimeError
-
-    peer = Peer(hub.url)
-    with closing(bridge(hub.url, watch=True, on_foreign=refuse)) as arm:
-        arm.open()
-        in_step(arm, peer)
-        peer.lcm.publish("IIWA_COMMAND", b"1")
-        peer.lcm.publish("IIWA_COMMAND", b"2")
-        assert wait(arm, lambda: arm.foreign_messages == {"IIWA_COMMAND": 2})
 
 
 def test_foreign_publisher_is_heard_on_udpm() -> None:

@@ -107,17 +107,17 @@ def png(image: NDArray[np.uint8]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def grain(color: ArrayLike, *, pixels: int = 512, seed: int = 0) -> NDArray[np.uint8]:
-    """Return a square image of spots of all sizes that repeats without a seam, shape (pixels, pixels, 3).
+def grain(color: ArrayLike, *, seed: int = 0) -> NDArray[np.uint8]:
+    """Return a square image of spots of all sizes that repeats without a seam, shape (512, 512, 3).
 
     Its brightness is noise whose amplitudes fall with the square root of the frequency; the smallest spots are about
     three pixels wide. On a tile that is higher than wide, it resembles bark.
 
     Args:
         color: The mean red, green and blue, from 0 to 1, shape (3,).
-        pixels: The edge of the image.
         seed: Determines the spots.
     """
+    pixels = 512
     spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(pixels, pixels)))
     frequency = np.hypot(np.fft.fftfreq(pixels)[:, np.newaxis], np.fft.rfftfreq(pixels))
     spectrum *= np.exp(-((frequency / _FINEST) ** 2)) / np.maximum(frequency, 1.0 / pixels) ** 0.5

@@ -71,7 +71,6 @@ class LcmBridge(Bridge):
         commands: Sequence[LcmMap] = (),
         reported: Mapping[str, str] | None = None,
         watch: bool | None = None,
-        on_foreign: Callable[[str, bytes], None] | None = None,
         reorder_window: float = 0.1,
         connect_timeout: float = 2.0,
         burst: int = 200,
@@ -89,7 +88,6 @@ class LcmBridge(Bridge):
                 machine says it executes.
             watch: Whether to listen on the actuator channels for other publishers. By default on every bus that others
                 can be on.
-            on_foreign: Called, in `poll`, with channel and bytes of a message of another publisher.
             reorder_window: Window in seconds, see above.
             connect_timeout: Seconds that `open` waits for a hub.
             burst: The most messages that one `poll` receives.
@@ -123,7 +121,7 @@ class LcmBridge(Bridge):
         self._writers = [ChannelWriter(map, _signals(interface.act, map), self.sent) for map in act]
 
         self._watch = not url.startswith(_PRIVATE) if watch is None else watch
-        self._foreign = ForeignCommands([map.channel for map in act], lambda: self.link.name, on_foreign)
+        self._foreign = ForeignCommands([map.channel for map in act], lambda: self.link.name)
         self.foreign_messages: Mapping[str, int] = self._foreign.heard
         handlers: dict[str, Handler] = {reader.channel: self._tapped(reader) for reader in self._readers}
         if self._watch:
@@ -399,24 +397,17 @@ class ForeignCommands:
 
     _MEMORY = 4096  # own messages on their way per channel: those of some seconds in which the hub is stopped
 
-    def __init__(
-        self,
-        channels: Sequence[str],
-        name: Callable[[], str | None],
-        on_foreign: Callable[[str, bytes], None] | None = None,
-    ) -> None:
+    def __init__(self, channels: Sequence[str], name: Callable[[], str | None]) -> None:
         """Start with nothing heard.
 
         Args:
             channels: The actuator channels.
             name: Returns the present name of our connection at the hub.
-            on_foreign: Called with channel and bytes of a foreign message.
         """
         self.heard = dict.fromkeys(channels, 0)
         self.refused = 0
         self.blocked: frozenset[str] = frozenset()
         self._name = name
-        self._on_foreign = on_foreign
         self._protected: frozenset[str] = frozenset()
         # By channel and message, how often it was sent and has not come back; the oldest first.
         self._own: dict[str, dict[bytes, int]] = {channel: {} for channel in channels}
@@ -440,13 +431,6 @@ class ForeignCommands:
             return
         self.heard[channel] += 1
         self._heard_at[channel] = time.monotonic()
-        if self._on_foreign is None:
-            return
-        try:
-            self._on_foreign(channel, data)
-        except Exception:
-            _log.exception("on_foreign raised an exception and is not called any more")
-            self._on_foreign = None
 
     def take_status(self, _: str, data: bytes) -> None:
         """Handle a message of the hub's status channel."""

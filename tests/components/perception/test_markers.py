@@ -28,10 +28,16 @@ from vtbdrake.components.perception.markers import (
     check_marker_size,
     detect_markers,
     pose_from_markers,
-    project,
 )
 
 INTRINSICS = np.array([400.0, 410.0, 150.0, 125.0])  # Not in the middle, and not square.
+
+
+def project(points: np.ndarray, X_CT: RigidTransform, intrinsics: np.ndarray) -> np.ndarray:
+    """Return the pixels (n, 2) of points of T (n, 3), by the pinhole equations."""
+    fx, fy, cx, cy = intrinsics
+    x, y, z = X_CT.multiply(points.T)
+    return np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
 
 
 def board(size: float = 0.16) -> MarkerBoard:

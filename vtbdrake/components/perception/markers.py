@@ -324,20 +324,6 @@ def _intersections(p: Array, u: Array, q: Array, v: Array) -> Array:
 
 # -- the pose
 
-
-def project(points: Array, X_CT: RigidTransform, intrinsics: ArrayLike) -> Array:
-    """Return the pixels (n, 2) of points of T (n, 3) in m, by the pinhole equations.
-
-    Args:
-        points: In T, (n, 3) in m.
-        X_CT: The pose of T in the camera frame C: x right, y down, z forward.
-        intrinsics: [fx, fy, cx, cy] in pixels.
-    """
-    fx, fy, cx, cy = np.asarray(intrinsics, dtype=float)
-    x, y, z = X_CT.rotation().matrix() @ points.T + X_CT.translation()[:, None]
-    return np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
-
-
 # A pose is clear if another one is less likely by a factor of a thousand: twice the logarithm of that.
 _CLEAR = 2.0 * log(1000.0)
 # Two poses are apart if one is outside of what the covariance of the other allows: chi-squared, 6 degrees, 99 %.
