@@ -103,6 +103,10 @@ def test_nearest_objects_come_first(stand: WorldModel) -> None:
     assert WorldModel().nearest([0.0, 0.0, 0.0]) == () == WorldModel().find(near=([0.0, 0.0], 1.0))
 
 
+def test_objects_are_told_on_one_line() -> None:
+    assert repr(tree("a", [1.0, -2.0, 0.5])) == "<tree a: confirmed, at (1.00, -2.00, 0.50) m>"
+
+
 def test_status_selects(stand: WorldModel) -> None:
     model = WorldModel([tree("a", [0, 0, 0]), tree("b", [1, 0, 0], status="retired")])
     assert [one.identity for one in model.find(status="retired")] == ["b"]
@@ -212,6 +216,9 @@ def test_what_is_no_object_is_refused(make: object, message: str) -> None:
 def test_status_and_deviation_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="a status is one of tentative, confirmed, revised, retired, not 'confirmd'"):
         WorldModel().find(status="confirmd")
+    for wanted in (5.0, (2.0, 1.0), (1.0, 2.0, 3.0)):
+        with pytest.raises(ValueError, match="the condition of height is a text, or the least and the largest number"):
+            WorldModel().find(attributes={"height": wanted})
     for rings in (SQUARE, [SQUARE[:2]], [[(0.0, 0.0), (1.0, np.nan), (1.0, 1.0)]]):
         with pytest.raises(ValueError, match="a list of rings of at least 3 corners"):
             WorldModel().find(polygon=rings)

@@ -250,7 +250,7 @@ def _in_polygon(places: Array, rings: Sequence[ArrayLike]) -> NDArray[np.bool_]:
 def _condition(name: str, wanted: str | tuple[float, float]) -> str | tuple[float, float]:
     if isinstance(wanted, str):
         return wanted
-    low, high = wanted
+    low, high = wanted if np.shape(wanted) == (2,) else (inf, -inf)
     if not -inf <= low <= high <= inf:
         raise ValueError(f"the condition of {name} is a text, or the least and the largest number, not {wanted!r}")
     return (low, high)

@@ -162,6 +162,10 @@ class WorldObject:
             )
         return float(quantity.value)
 
+    def __repr__(self) -> str:
+        x, y, z = self.p_WoOo_W
+        return f"<{self.kind} {self.identity}: {self.status}, at ({x:.2f}, {y:.2f}, {z:.2f}) m>"
+
     def __deepcopy__(self, memo: dict[int, Any]) -> WorldObject:
         return self
 
