@@ -6,7 +6,6 @@ import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from math import inf, isnan
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, defau
 from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
 from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
 from vtbdrake.control.staleness import check_all
+from vtbdrake.error_text import error_text
 from vtbdrake.testbed import Interface, Signal
 
 _log = logging.getLogger(__name__)
@@ -276,7 +276,7 @@ class Guards:
     def _general_faults(self, now: float, error: BaseException | None, missed: int, blocked: str | None) -> list[Fault]:
         faults = []
         if error is not None:
-            faults.append(Fault(now, None, "raised", f"the DPS raised {_described(error)}"))
+            faults.append(Fault(now, None, "raised", f"the DPS raised {error_text(error)}"))
         if missed > self._max_missed:
             reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
             faults.append(Fault(now, None, "missed", reason))
@@ -375,12 +375,3 @@ def _reject_unknown(what: str, given: Iterable[str], signals: Iterable[Signal]) 
     names = [signal.name for signal in signals]
     if unknown := sorted(set(given) - set(names)):
         raise ValueError(f"{what} is given for {', '.join(unknown)}, but the signals are {', '.join(names)}")
-
-
-def _described(error: BaseException) -> str:
-    """Return an error as one line, with the line of code that raised it, if that is known."""
-    place = error.__traceback__
-    while place is not None and place.tb_next is not None:
-        place = place.tb_next
-    where = "" if place is None else f" ({Path(place.tb_frame.f_code.co_filename).name}, line {place.tb_lineno})"
-    return f"{type(error).__name__}: {error}{where}"

@@ -15,6 +15,7 @@ import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
+from vtbdrake.error_text import error_text
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
@@ -327,8 +328,7 @@ class _FailuresAsOutcomes:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, Exception | SystemExit):
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise SimulationError(f"{type(error).__name__}: {text}") from error
+            raise SimulationError(error_text(error)) from error
 
 
 _failures_as_outcomes = _FailuresAsOutcomes()
