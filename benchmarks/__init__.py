@@ -1,1 +1,1 @@
-"""Every speed claim, as a ratio measured side by side in one run."""
+"""Benchmarks: every claim about speed, measured as a ratio side by side in one run."""

@@ -1,6 +1,6 @@
 """Every benchmark: ``python -m benchmarks [ONLY...]``.
 
-Prints one row each and writes ``benchmarks/results.json``, which holds what this run has measured, and nothing older.
+Prints one row each and writes the results of this run to ``benchmarks/results.json``.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from vtbdrake_diagrams.satellite.arm_move import RESTING
 from vtbdrake_diagrams.satellite.arm_planning import Plan, plan_by_casadi, plan_by_drake
 from vtbdrake_diagrams.satellite.trajectory import search_problem
 
-# Of the deviation at the end, in rad.
+# Target of the deviation at the end, in rad.
 TARGET = np.radians(1.0)
 SCENARIO = ArmMotionScenario(thinking_time=0.2)
 # Of CMA-ES at first, as a part of the ranges.

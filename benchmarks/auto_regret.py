@@ -1,8 +1,8 @@
 """Regret of the default solver after few rollouts, against solvers that are known to be good.
 
-The gap of a run is how much worse its best point is than the optimum, in units of the median gap of random points. It
-counts as `SOLVED` if it is smaller: no simulation is that exact. Of every function and budget, what is compared are
-the medians of the gaps over the seeds.
+The gap of a run is the difference of its best point from the optimum, in units of the median gap of random points. Gaps
+below `SOLVED` count as equal to it: no simulation is that exact. For every function and budget, the medians of the gaps
+over the seeds are compared.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Case:
     """A function to be minimized.
 
     Attributes:
-        cost: what a solver sees at a point: one cost, or two.
-        space: the parameters.
-        lowest: the smallest cost; of two costs, the hypervolume of the ideal front, negated.
-        true: the cost without noise, which is what counts; None: as seen.
-        corner: the reference point of the hypervolume, of two costs.
-        rollouts: how many an evaluation takes.
+        cost: The cost, or two costs, that a solver gets at a point.
+        space: The parameters.
+        lowest: The smallest cost; of two costs, the hypervolume of the ideal front, negated.
+        true: The cost without noise, which is compared; None if `cost` has no noise.
+        corner: The reference point of the hypervolume of two costs.
+        rollouts: The number of rollouts of an evaluation.
     """
 
     cost: Callable[[Point], Costs]
@@ -252,7 +252,7 @@ class _Record:
         return self(tuple(parameter.from_unit(x) for parameter, x in zip(self._case.space, u, strict=True)))[0]
 
     def gap(self, budget: int) -> float:
-        """After ``budget`` rollouts: of the point that looked best, how far it is from the optimum."""
+        """Return the distance of the apparently best point after ``budget`` rollouts from the optimum."""
         count = budget // self._case.rollouts
         costs, true = self.costs[:count], self.true[:count]
         if self._case.corner:
@@ -261,7 +261,7 @@ class _Record:
 
 
 def hypervolume(costs: Sequence[Costs], corner: tuple[float, float]) -> float:
-    """The area that two costs dominate below ``corner``."""
+    """Return the area that points with two costs dominate below ``corner``."""
     area, ceiling = 0.0, corner[1]
     for first, second in sorted(costs):
         if first < corner[0] and second < ceiling:
@@ -271,7 +271,7 @@ def hypervolume(costs: Sequence[Costs], corner: tuple[float, float]) -> float:
 
 
 def _our(name: str, record: _Record, case: Case, seed: int, budget: int) -> None:
-    """One of our solvers, from one start to its end."""
+    """Run one of our solvers from one start to its end."""
     start = None
     if name.startswith("LN_"):
         start = tuple(p.from_unit(x) for p, x in zip(case.space, np.random.default_rng(seed).random(9), strict=False))

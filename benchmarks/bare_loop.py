@@ -17,17 +17,17 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 
 class NoCompilerError(RuntimeError):
-    """There is nothing that the C loop could be compiled with."""
+    """There is no compiler for the C loop."""
 
 
 @dataclass(frozen=True)
 class BareRun:
-    """What the C loop did.
+    """The result of a run of the C loop.
 
     Attributes:
-        priority: of SCHED_FIFO that it got; 0 if none was granted.
-        missed: deadlines, by the rule of `Runtime`.
-        lateness: of each wake-up, in seconds, of shape (cycles,).
+        priority: The granted priority of SCHED_FIFO; 0 if none was granted.
+        missed: The number of missed deadlines, by the rule of `Runtime`.
+        lateness: The lateness of each wake-up in seconds, shape (cycles,).
     """
 
     priority: int
@@ -43,7 +43,7 @@ class BareLoop:
 
     def run(self, *, priority: int, period: float, cycles: int) -> BareRun:
         command = [str(self._program), str(priority), str(round(period * 1e9)), str(cycles)]
-        # Should it hang, its time is over after ten times what it needs, and a second for its start.
+        # If it hangs, it is ended after ten times its duration, and a second for its start.
         timeout = 10.0 * cycles * period + 1.0
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=timeout)
         granted, missed, *late = map(int, done.stdout.split())
@@ -52,10 +52,10 @@ class BareLoop:
 
 @contextmanager
 def bare_loop() -> Iterator[BareLoop]:
-    """Compiles it into a folder that goes away.
+    """Compile the C loop in a temporary folder.
 
     Raises:
-        NoCompilerError: there is no C compiler.
+        NoCompilerError: There is no C compiler.
     """
     name = os.environ.get("CC", "cc")
     compiler = shutil.which(name)

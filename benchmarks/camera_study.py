@@ -18,9 +18,9 @@ CANDIDATES = 50
 def camera_study_speedup(repeats: int = 3) -> Benchmark:
     """Return how much faster `CANDIDATES` placements of the docking camera are judged along one recorded capture.
 
-    Against it, each is simulated with its images from the start. Processor time, in one thread. The time of the study
-    is that of the recording and `CANDIDATES` times that of a placement, each measured on placements by hand, in turns
-    with whole rollouts.
+    The comparison simulates each of them with its images from the start. Processor time, in one thread. The time of the
+    study is that of the recording and `CANDIDATES` times that of a placement, each measured on placements by hand, in
+    turns with whole rollouts.
 
     Raises:
         AssertionError: The results differ in any bit.

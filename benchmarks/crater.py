@@ -31,7 +31,7 @@ FINE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.045, accuracy
 def crater_decision_time() -> list[Benchmark]:
     """Wall time of a decision among 7 headings of 300 s on two cores, with and without ending rollouts that are stuck.
 
-    The workers are warm: what starting them and building their testbeds takes is told beside it.
+    The workers are warm: the note has the time of their start and of building their testbeds.
     """
     scenario = model(SEED)
     to_the_end, first, plain = _decide(replace(scenario, patience=0.0))

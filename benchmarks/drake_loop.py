@@ -92,8 +92,9 @@ class DrakeLoop:
         self._simulator.Initialize()
 
     def run(self, cycles: int, *, warm_up: int) -> np.ndarray:
-        """From each deadline to the end of its cycle, in seconds, of shape (cycles,); a late one is not left out, but
-        caught up with."""
+        """Return the times from each deadline to the end of its cycle, in seconds, shape (cycles,).
+
+        Late cycles are not left out: the loop catches up."""
         simulator = self._simulator
         ends: list[tuple[float, float]] = []
 

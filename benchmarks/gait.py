@@ -62,7 +62,7 @@ class Search:
 def time_to_target(seeds: int = 10) -> list[Benchmark]:
     """Wall time of differential evolution over that of a study, each until it reaches the target; medians over seeds.
 
-    A search that does not reach the target has taken for ever.
+    The time of a search that does not reach the target is infinite.
 
     The target is 97 % of the best distance known, and was fixed before. The study: default solver, default executor on
     all cores, or serial; the problem is new each time, so that its build and the start of the workers count. The other:

@@ -38,9 +38,11 @@ while True:
 
 
 def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: int = 8) -> list[Benchmark]:
-    """The median time from a client's publication to its arrival at the same client, an unmodified `lcm.LCM`, through
-    the hub and through a naive one, in turns; and, printed only, that to another client and back (twice through the
-    hub), and that of this package's own client, by the hub's shortcut and by TCP."""
+    """Median time from a client's publication to its arrival at the same client, through the hub and a naive one.
+
+    The client is an unmodified `lcm.LCM`; the hubs take turns. Printed only: the time to another client and back (twice
+    through the hub), and that of this package's own client, by the hub's shortcut and by TCP.
+    """
     times: dict[str, list[float]] = {"hub": [], "naive": [], "echo": [], "shortcut": [], "own by TCP": []}
     with Hub(port=0) as hub, _naive_hub() as naive_url, contextlib.ExitStack() as stack:
         rights = stack.enter_context(RealTime(priority=None, lock_memory=False))

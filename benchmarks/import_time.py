@@ -15,18 +15,19 @@ ROOT = Path(__file__).resolve().parents[1]
 # Timed inside a new interpreter, so that its own start does not count.
 _PROGRAM = "import time; begin = time.perf_counter(); {}; print(time.perf_counter() - begin)"
 
-# What a user of vtbdrake gets, whether it is loaded on import or when it is first asked for.
+# All public names, whether they are loaded on import or at their first use.
 EVERYTHING = "from vtbdrake import *"
 
 
 def import_time(repeats: int = 9, longer: int = 3, warm_up: int = 1) -> list[Benchmark]:
-    """``import vtbdrake`` against ``import pydrake``; and, printed only, all public names against the parts of pydrake
-    that they stand on, and against ``import pydrake.all``.
+    """Time of ``import vtbdrake`` against ``import pydrake``.
+
+    Printed only: all public names against the parts of pydrake that they use, and against ``import pydrake.all``.
 
     Args:
-        repeats: of the first, which takes the shortest time.
-        longer: repeats of the others.
-        warm_up: imports of each that are not counted.
+        repeats: Repeats of the first, which takes the shortest time.
+        longer: Repeats of the others.
+        warm_up: Imports of each that are not counted.
     """
     parts = f"import {', '.join(pydrake_modules())}"
     comparisons = {

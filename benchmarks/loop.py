@@ -36,13 +36,14 @@ while True:
 
 
 def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
-    """The time from the machine's telling of its state to the arrival of a command, as the machine sees it, with the
-    stripped DPS in lock-step with the states; in turns with a plain echo at the same rate through the same hub: a
-    message of the state's size to another process, which does nothing but send it back. The machine runs throughout.
+    """Time from a state's departure from the machine to the arrival of a command at it, with the DPS alone.
+
+    Each state begins a cycle of the loop. In turns with a plain echo at the same rate through the same hub: a message
+    of the state's size to another process, which only sends it back. The machine runs throughout.
 
     Raises:
-        RuntimeError: the answers come more than a period late, so that the machine takes them for those to the next
-            states: it would see less time than the controller needs.
+        RuntimeError: The answers come more than a period late, so that the machine takes them for those to the next
+            states: it would measure less time than the controller needs.
     """
     states, echoes = Histogram(), []
     answered, told = 0, 0
@@ -60,7 +61,7 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
     if states.percentile(50.0) < needed:
         raise RuntimeError(
             f"the machine sees an answer after {1e6 * states.percentile(50.0):.0f} us, but it takes the controller "
-            f"{1e6 * needed:.0f} us: answers come more than a period late; measure where less else runs"
+            f"{1e6 * needed:.0f} us: answers come more than a period late; measure on a machine with less load"
         )
     note = (
         f"{percentiles(states)}; {answered} answers to {told} states; echo: {percentiles(histogram(echoes))}; {granted}"
@@ -81,12 +82,11 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
 
 
 def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
-    """Missed deadlines of our loop, n, and of a bare one in C at the same priority, m, in turns, while hub and machine
-    run: (n + 1) / (m + 1), both for 10,000 cycles.
+    """Missed deadlines of our loop, n, and of a bare one in C, m: (n + 1) / (m + 1), both for 10,000 cycles.
 
-    The 1 accounts for a miss that was just not observed, and keeps the ratio finite; two loops without any miss
-    come out at 1. By the rule of both, a deadline is missed if it passes before the cycle of an earlier one has ended.
-    For ours that is wake-up, step and all the rest; the C loop only wakes up.
+    They have the same priority, and take turns, while hub and machine run. The 1 accounts for a miss that was just not
+    observed, and keeps the ratio finite; without any miss it is 1. By the rule of both, a deadline is missed if it
+    passes before the cycle of an earlier one has ended. Our cycle is the whole cycle; the C loop only wakes up.
     """
     ours, bare = 0, 0
     late: dict[str, list[float]] = {"ours": [], "C": []}
@@ -114,12 +114,14 @@ def loop_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
 
 
 def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
-    """The time that a cycle takes (last messages in, checks, guards, statistics, messages out) less that of the DPS's
-    step (`Simulator.AdvanceTo` and its output), in the full loop, with the stripped DPS; and, printed only, the time of
-    a step of the full testbed with both switches on real against that of the stripped DPS, in turns.
+    """Time of a cycle less that of the DPS's step, in the full loop, with the DPS alone.
 
-    Most messages are taken in shortly before a cycle is due. That, too, is in the processor time of the loop's thread,
-    less that of the steps, which the note tells; so is the time for which it polls the clock.
+    A cycle receives the last messages, checks them, steps the DPS (`Simulator.AdvanceTo` and its output), applies the
+    guards, counts, and sends messages. Printed only: the time of a step of the full testbed with both switches on real
+    against that of the DPS alone, in turns.
+
+    Most messages are received shortly before a cycle is due. That is part of the processor time of the loop's thread,
+    less that of the steps, in the note; so is the time for which it polls the clock.
     """
     overheads: list[float] = []
     worked = 0.0
@@ -159,12 +161,12 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
 
 
 def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
-    """What a user of Drake would build otherwise, `LcmSubscriberSystem`, the same DPS and `LcmPublisherSystem` with
-    ``set_target_realtime_rate(1.0)``, against ours, in turns, in the same thread: the time from a deadline to the end
-    of its cycle at the 99th percentile, and the misses, counted as in `loop_misses`. Printed only.
+    """A loop of Drake's own parts against ours: lateness at the 99th percentile, and misses. Printed only.
 
-    Drake misses no deadline in its own eyes, since it catches up with all; here, each whole period that a cycle ends
-    after its deadline counts.
+    Drake's parts are `LcmSubscriberSystem`, the same DPS and `LcmPublisherSystem` with
+    ``set_target_realtime_rate(1.0)``. The loops take turns, in the same thread. Lateness is the time from a deadline to
+    the end of its cycle; misses are counted as in `loop_misses`. Drake's loop catches up, so that it drops no cycle;
+    here, each whole period that a cycle ends after its deadline counts.
     """
     ours, theirs, our_misses = [], [], 0
     with loop_rig() as rig:
@@ -202,7 +204,7 @@ def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
 
 @contextmanager
 def _echo(url: str) -> Iterator[lcm.LCM]:
-    """A client that hears the echo of what it says."""
+    """A client whose messages another process sends back."""
     bus = lcm.LCM(url)
     bus.subscribe("PONG", lambda *_: None)
     with subprocess.Popen([sys.executable, "-c", _ECHO, url]) as process:

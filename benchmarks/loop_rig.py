@@ -32,18 +32,18 @@ CPUS = {max(os.sched_getaffinity(0))}
 PERIOD = 1e-3  # s
 WARM_UP = 200  # cycles before each round that do not count
 PATIENCE = 1.0  # s that a sensor signal may be old
-# Of the machine's joints, in N m s/rad: with so much of it, no stall of the loop lets it come to any harm.
+# Damping of the machine's joints in N m s/rad: so large that a stall of the loop has no consequences.
 FRICTION = {"sim.act.drives.viscous": [40.0] * JOINTS}
 
 
 class TimedRuntime(Runtime):
-    """Keeps what each cycle took, all of it, watched from outside.
+    """A loop that records the times of its cycles, measured from outside.
 
     Attributes:
-        overheads: of each cycle, from its call to its return, less the DPS's step, in seconds.
-        commanded: from each cycle's deadline until its commands had left, in seconds.
-        lateness: from each cycle's deadline to its end, after all watchers were called, in seconds.
-        worked: processor time of the loop's thread in all those cycles, and while it waited for them, in seconds.
+        overheads: Time of each cycle, from its call to its return, less the DPS's step, in seconds.
+        commanded: Time from each cycle's deadline until its commands had left, in seconds.
+        lateness: Time from each cycle's deadline to its end, after all watchers were called, in seconds.
+        worked: Processor time of the loop's thread in all these cycles, and while it waited for them, in seconds.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -75,7 +75,7 @@ class Rig:
     real_time: RealTime
 
     def runtime(self, target: VirtualTestbed | DpsAlone, *, pace: str | None = None) -> TimedRuntime:
-        """One that commands the machine already."""
+        """Return a loop that commands the machine already."""
         self.drain()
         # How long the system holds up the loop is to be measured: it must not end the measurement.
         patient = [replace(signal, max_age=PATIENCE) for signal in target.interface.sense]
@@ -86,11 +86,10 @@ class Rig:
         return runtime
 
     def run(self, runtime: TimedRuntime, cycles: int) -> int:
-        """One round of it; says how many deadlines were missed. A round before it, which does not count, puts an end
-        to what the others left behind.
+        """Run one round of a loop, after a warm-up that is not counted; return the number of missed deadlines.
 
         Raises:
-            RuntimeError: the guards have latched: what was measured is not the DPS's control of the machine.
+            RuntimeError: The guards have latched: the DPS did not command the machine while it was measured.
         """
         self.drain()
         runtime.run(cycles=WARM_UP)

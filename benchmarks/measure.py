@@ -1,4 +1,4 @@
-"""How speed is measured: what is compared runs in turns, in one run, and medians are compared."""
+"""Measurement of speed: variants run in turns, in one run, and their medians are compared."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Benchmark:
     """One measured number.
 
     Attributes:
-        name: of the row.
-        value: measured; infinite where a target was not reached.
-        unit: SI, or ``"1"`` for a ratio.
-        goal: None if the number is only printed.
+        name: The name of the row.
+        value: The measured value; infinite if a target was not reached.
+        unit: The SI unit, or ``"1"`` for a ratio.
+        goal: The goal; None if the number is only printed.
         better: ``"higher"`` or ``"lower"``.
-        against: what it was measured beside, in the same run.
-        holds: whether the goal is reached; left out, ``value`` against ``goal`` (equal is good enough).
-        note: spread, conditions, or what else belongs to the number.
+        against: The comparison, measured in the same run.
+        holds: Whether the goal is reached; by default, ``value`` is compared with ``goal`` (equal is good enough).
+        note: Spread, conditions, and so on.
 
     Raises:
         ValueError: ``better`` is neither.
@@ -53,12 +53,12 @@ class Benchmark:
 def interleaved(
     a: Callable[[], Any], b: Callable[[], Any], *, repeats: int = 5, warm_up: int = 1, first: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Wall times of ``a`` and ``b`` in seconds, each of shape (repeats,).
+    """Return wall times of ``a`` and ``b`` in seconds, each of shape (repeats,).
 
-    They run in turns, a b, b a, a b, ..., so that what else the machine does meets both alike.
+    They run in turns, a b, b a, a b, ..., so that other load of the machine affects both equally.
 
     Args:
-        warm_up: runs of each that are not counted.
+        warm_up: Runs of each that are not counted.
         first: 1 if ``b`` begins.
 
     Raises:

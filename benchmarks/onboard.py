@@ -1,4 +1,4 @@
-"""Benchmark of the loop's punctuality beside a reasoner that thinks on the same machine."""
+"""Benchmark of the loop's punctuality beside a reasoner that decides on the same machine."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def speed(joint_velocity: np.ndarray) -> float:
 
 
 @dataclass
-class ThinkingScenario(ManipulatorScenario):
-    """The arm, with a reasoner beside its control law that thinks all the time, in its whole testbed.
+class ReasoningScenario(ManipulatorScenario):
+    """The arm, with a reasoner beside its control law that decides all the time, by rollouts of the whole testbed.
 
     Its decision is not used, so that the arm does the same with and without it.
     """
@@ -69,26 +69,27 @@ class ThinkingScenario(ManipulatorScenario):
 
 
 def loop_p99_beside_reasoner(cycles: int = 10_000, rounds: int = 5) -> Benchmark:
-    """The 99th percentile of the time from a deadline of the 1 kHz loop to the end of its cycle, while a reasoner
-    thinks all the time beside it, over that without one; in turns, in the full loop with hub and machine.
+    """Lateness of the 1 kHz loop at the 99th percentile, with a reasoner that decides all the time, over that without.
+
+    The lateness is the time from a deadline to the end of its cycle. In turns, in the full loop with hub and machine.
 
     Raises:
-        RuntimeError: the reasoner was not at work for half of the time: there was nothing beside the loop.
+        RuntimeError: The reasoner was not at work for half of the time: there was nothing beside the loop.
     """
     late: dict[str, list[float]] = {"with": [], "without": []}
-    with loop_rig() as rig, rig.runtime(DpsAlone(ThinkingScenario())) as thinking:
-        if not thinking.slow_parts.wait(timeout=120.0):
-            raise RuntimeError("the reasoner does not come to its start: measure where less else runs")
-        runtimes = {"without": rig.runtime(DpsAlone(rig.scenario)), "with": thinking}
+    with loop_rig() as rig, rig.runtime(DpsAlone(ReasoningScenario())) as reasoning:
+        if not reasoning.slow_parts.wait(timeout=120.0):
+            raise RuntimeError("the reasoner does not start: measure on a machine with less load")
+        runtimes = {"without": rig.runtime(DpsAlone(rig.scenario)), "with": reasoning}
         for _ in range(rounds):
             for name, runtime in runtimes.items():
                 rig.run(runtime, cycles // rounds)
                 late[name] += runtime.lateness
-        (found,) = thinking.slow_parts.statistics.values()
+        (found,) = reasoning.slow_parts.statistics.values()
         granted = rig.granted()
     busy = found.took.mean / EVERY
     if busy < 0.5:
-        raise RuntimeError(f"the reasoner was at work for {busy:.0%} of the time: measure where less else runs")
+        raise RuntimeError(f"the reasoner was at work for {busy:.0%} of the time: measure on a machine with less load")
     with_, without = (float(np.percentile(late[name], 99.0)) for name in ("with", "without"))
     punctuality = "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
     return Benchmark(

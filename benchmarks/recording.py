@@ -31,13 +31,15 @@ for _ in watch(sys.argv[1], sys.argv[2:], every=10):
 
 
 def recording_cost(cycles: int = 10_000, rounds: int = 20) -> list[Benchmark]:
-    """Lateness of the 1 kHz loop's commands, from each deadline until they have left, with a recorder and a live watch
-    from another process, over that without both, in turns: the ratio of the 99th percentiles; and, printed, the same to
-    the end of the cycle, when a cycle is recorded and the watched values are read, and the ratio of misses.
+    """Lateness of the 1 kHz loop's commands with a recorder and a live watch, over that without, in turns.
+
+    The lateness is the time from each deadline until the commands have left; the ratio is that of the 99th percentiles.
+    The watch is in another process. Printed only: the same to the end of the cycle, when a cycle is recorded and the
+    watched values are read, and the ratio of misses.
 
     Raises:
-        RuntimeError: the recorder lost something: what was measured is not what it costs.
-        TimeoutError: the other process does not watch.
+        RuntimeError: The recorder lost cycles, so that its cost was not measured.
+        TimeoutError: The other process does not watch.
     """
     commanded: dict[bool, list[float]] = {True: [], False: []}
     ended: dict[bool, list[float]] = {True: [], False: []}
@@ -46,7 +48,7 @@ def recording_cost(cycles: int = 10_000, rounds: int = 20) -> list[Benchmark]:
     with TemporaryDirectory() as folder, loop_rig() as rig:
         runtime = rig.runtime(DpsAlone(rig.scenario))
         for i in range(rounds):
-            # Who begins changes, so that what else this computer does meets both alike.
+            # The first one alternates, so that other load of this computer affects both equally.
             for on in (True, False) if i % 2 else (False, True):
                 with ExitStack() as stack:
                     if on:
@@ -111,11 +113,12 @@ def _check_complete(recorder: Recorder) -> None:
 
 
 def replay_rtf(simulated: float = 60.0, repeats: int = 3) -> Benchmark:
-    """Seconds of the loop per second of replaying its log with the DPS alone; to read the file and to build the DPS is
-    part of it. The log is that of the arm on the machine, with the bridge's messages; the replay has to be identical.
+    """Seconds of the loop per second of replaying its log with the DPS alone, reading and building included.
+
+    The log is that of the arm on the machine, with the bridge's messages; the replay must be identical.
 
     Raises:
-        RuntimeError: the replay was not.
+        RuntimeError: The replay was not identical.
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "arm.lcm"

@@ -1,4 +1,4 @@
-"""Which benchmarks there are, and the table of their results."""
+"""The list of all benchmarks, and the table of their results."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ _SIGNS = {"higher": ">=", "lower": "<="}
 def benchmark_all(
     only: Sequence[str] = (), *, registry: Registry = BENCHMARKS, echo: Callable[[str], Any] = print
 ) -> list[Benchmark | Crash]:
-    """Runs the benchmarks named, or all. One that raises is a `Crash`, and the others still run.
+    """Run the named benchmarks, or all. One that raises becomes a `Crash`, and the others still run.
 
     Raises:
-        ValueError: a name is unknown.
+        ValueError: A name is unknown.
     """
     results: list[Benchmark | Crash] = []
     for name in chosen(registry, only):
@@ -94,7 +94,7 @@ def _crash_row(crash: Crash) -> tuple[str, ...]:
 
 
 def write_results(path: Path, results: Sequence[Benchmark | Crash]) -> None:
-    """Writes what was measured, with the fields `FIELDS`; a crash has no value, and does not hold."""
+    """Write the results with the fields `FIELDS`; a crash has no value, and does not hold."""
     write_json(path, [_fields(result) for result in results])
 
 

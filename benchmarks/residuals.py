@@ -25,7 +25,7 @@ from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.motions import CIRCLE
 from vtbdrake_diagrams.manipulator.safety import CONTINUITY
 
-# Of the machine's sensors, in their units.
+# Noise of the machine's sensors, in their units.
 NOISE = {"joint_position": 1e-5, "joint_velocity": 1e-3, "joint_torque_measured": 0.1, "wrench": 0.1}
 PATIENCE = 60.0  # s that the machine may take for an answer
 
@@ -36,12 +36,13 @@ LEARNING, SEARCH = 8.0, 2.0  # s
 
 
 def payload_alarm(nominal: float = 10.0) -> list[Benchmark]:
-    """Seconds from the first judged window to the alarm, of a twin of the arm whose tool is 5 % (20 g) heavier than its
-    model; and alarms in ``nominal`` seconds with the right tool. Arm, loop and residuals are processes of their own, in
+    """Seconds from the first judged window to the alarm, for an arm whose tool is 5 % (20 g) heavier than its model.
+
+    Also the alarms in ``nominal`` seconds with the right tool. Arm, loop and residuals are separate processes, in
     lock-step, with noise; scales are calibrated in a run before.
 
     Raises:
-        RuntimeError: the wrong payload was not found.
+        RuntimeError: The wrong payload was not found.
     """
     with arm_loop(seed=1) as runtime:
         calibration = learn(runtime)

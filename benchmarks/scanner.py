@@ -69,8 +69,8 @@ def scanner_cost(repeats: int = 11) -> Benchmark:
     """CPU time of a simulated second of the scanner, with all that it does, over that of its rays in bare embreex.
 
     As the bodies move, the rays must be cast at each of them, in its own frame: the bare ray caster gets the rays in
-    all these frames for nothing. The scanner is simulated alone, with poses and velocities at its ports; range noise
-    and incidence count, divergence and haze are off.
+    all these frames. The scanner is simulated alone, with poses and velocities at its ports; range noise and incidence
+    are on, divergence and haze are off.
     """
     made = scene()
     simulator = _scanning(made)

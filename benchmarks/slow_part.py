@@ -20,7 +20,7 @@ SAMPLE_PERIOD, LATENCY = 0.1, 0.2  # s
 
 
 def perceive(joint_position: np.ndarray) -> np.ndarray:
-    """Works on numbers for as long as a perception works on an image."""
+    """Compute for as long as a perception works on an image."""
     end = time.process_time() + TAKES
     found = joint_position
     numbers = np.random.default_rng(0).normal(size=(200, 200))
@@ -53,17 +53,18 @@ class PerceivingScenario(ManipulatorScenario):
 
 
 def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
-    """Missed deadlines of the 1 kHz loop with a perception beside it that takes 50 ms of a processor every 100 ms, n,
-    and without it, m, in turns, in the full loop with hub and machine: (n + 1) / (m + 1), both for 10,000 cycles.
+    """Missed deadlines of the 1 kHz loop with a perception, n, and without, m: (n + 1) / (m + 1), for 10,000 cycles.
+
+    The perception takes 50 ms of a processor every 100 ms. In turns, in the full loop with hub and machine.
 
     Raises:
-        RuntimeError: the perception did not come to work: there was nothing beside the loop.
+        RuntimeError: The perception did not work: there was nothing beside the loop.
     """
     misses = {"with": 0, "without": 0}
     late: dict[str, list[float]] = {"with": [], "without": []}
     with loop_rig() as rig, rig.runtime(DpsAlone(PerceivingScenario())) as perceiving:
         if not perceiving.slow_parts.wait(timeout=60.0):
-            raise RuntimeError("the perception does not come to its start: measure where less else runs")
+            raise RuntimeError("the perception does not start: measure on a machine with less load")
         runtimes = {"without": rig.runtime(DpsAlone(rig.scenario)), "with": perceiving}
         for _ in range(rounds):
             for name, runtime in runtimes.items():
@@ -72,7 +73,7 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
         (found,) = perceiving.slow_parts.statistics.values()
         granted = rig.granted()
     if found.took.count < 0.5 * cycles * PERIOD / SAMPLE_PERIOD:
-        raise RuntimeError(f"the perception has worked {found.took.count} times: measure where less else runs")
+        raise RuntimeError(f"the perception has worked {found.took.count} times: measure on a machine with less load")
     of, to = (misses[name] * PER / cycles for name in ("with", "without"))
     punctuality = "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
     return Benchmark(

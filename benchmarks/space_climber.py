@@ -23,9 +23,9 @@ REFERENCE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.1, accur
 def testbed_overhead(repeats: int = 20, chunk: float = 0.5) -> Benchmark:
     """The testbed against the same systems wired by hand in plain Drake, same integrator, 15 s of walking.
 
-    The machine's speed drifts within a rollout: both walk side by side, in turns of ``chunk`` simulated seconds, and
-    each turn is held against its neighbour. Where their memory happens to lie counts for a percent: both are rebuilt
-    for every rollout, the one or the other first, and kept, so that none is laid out in the gaps of an earlier one.
+    The machine's speed drifts within a rollout: so both walk in turns of ``chunk`` simulated seconds, and each turn is
+    compared with its neighbour. The layout of their memory makes a difference of a percent: so both are rebuilt for
+    every rollout, in alternating order, and kept, so that none is laid out in the gaps of an earlier one.
     """
     scenario = SpaceClimberScenario()
     ends = chunk * np.arange(1, round(HORIZON / chunk) + 1)
@@ -114,7 +114,7 @@ def _naive_rollout(mass: float, scenario: SpaceClimberScenario, times: np.ndarra
 
 
 def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
-    """Simulated seconds per wall second of one rollout with the scenario's settings, and why it has them."""
+    """Simulated seconds per wall second of one rollout with the scenario's settings, and the reasons for these."""
     scenario = SpaceClimberScenario()
     reference = _walk(scenario, REFERENCE)
     step = scenario.simulator_config.max_step_size

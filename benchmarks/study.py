@@ -45,15 +45,15 @@ def study_overhead_processes(rollouts: int = 512, repeats: int = 9) -> Benchmark
 def _overhead(name: str, executor: Executor, *, rollouts: int, repeats: int) -> Benchmark:
     """Milliseconds a rollout of `Study.run` into a file on disk, less those of `RolloutRunner.run` in a loop.
 
-    The rollouts are as short as they can be, a single step of a pendulum, so that what is beside them is measured and
-    not drowned. Both do the same points, one rollout at a time: two workers would hide the one's overhead behind the
-    other's rollout. A process still hides some: it has its next point before it has finished the last, and what this
-    process does meanwhile costs no time if there is a core for it. Points that are asked for one by one gain nothing
-    from that; the overhead of the executor for one of them is printed, too.
+    The rollouts are as short as possible, a single step of a pendulum, so that they do not hide the overhead. Both
+    simulate the same points, one rollout at a time: with two workers, the overhead of one would coincide with the
+    rollout of the other. With a process, some of it still does: it has its next point before it has finished the last,
+    and the work of this process meanwhile costs no time if there is a core for it. Points that are asked for one by one
+    do not gain from that; the overhead of the executor for one of them is printed, too.
 
-    The points are a Sobol design; the time that the solver itself takes for them, asked and told as the study does it,
-    is measured apart and subtracted. The executor has started its worker and built its testbed before. All that `run`
-    does is counted, its beginning and its end included; to create the file is not.
+    The points are a Sobol design; the time that the solver itself takes for them is measured apart and subtracted. The
+    executor has started its worker and built its testbed before. The whole of `run` is counted, with its beginning and
+    its end; creating the file is not.
     """
     problem = _pendulum()
     search = partial(make_solver, "sobol", problem.parameters, budget=rollouts)

@@ -21,7 +21,7 @@ def run(notebook: NotebookNode) -> NotebookNode:
     """Run a notebook from top to bottom in the root of the checkout, and return it with its outputs.
 
     Raises:
-        nbclient.exceptions.CellExecutionError: a cell raised.
+        nbclient.exceptions.CellExecutionError: A cell raised.
     """
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
     return notebook
