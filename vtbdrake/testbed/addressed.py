@@ -178,9 +178,9 @@ class AddressedDiagram:
         are not part of the snapshot.
 
         Args:
-            simulator: A simulator of this testbed, between two calls of its AdvanceTo. (Before Initialize, initialization
-                events would happen in neither simulation; after AdvancePendingEvents, the updates of the present
-                instant would happen again in both.)
+            simulator: A simulator of this testbed, between two calls of its AdvanceTo. (Before Initialize, the
+                initialization events would happen in neither simulation; after AdvancePendingEvents, the updates of the
+                present instant would happen again in both.)
 
         Raises:
             ValueError: ``simulator`` is no Simulator, or one of another Diagram.
