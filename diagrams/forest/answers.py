@@ -97,8 +97,8 @@ def localization(full: bool) -> Answer:
         holds=machine.agrees and all(GOALS[name].is_met(found[name]) for name in JUDGED) and _is_careful(found),
         note=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess. "
         + "; ".join(_told(name, one) for name, one in found.items())
-        + f". Neighbours on the poor map share their errors: no unbiased estimate by the trees within {REACH:g} m of "
-        f"these drives errs by less than {least:.2f} m (RMS). Over LCM, fed by another process, "
+        + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
+        f"trees within {REACH:g} m of these drives errs by {least:.2f} m (RMS). Over LCM, fed by another process, "
         + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
     )
 
