@@ -26,7 +26,7 @@ class Bridge(ABC):
     """The connection between the real ports of a testbed and the machine; it lives outside the Diagram.
 
     One thread uses it. No call waits longer than its ``timeout``, and none raises because of a received message or
-    because the machine is gone: messages are counted, and `connected` tells the state.
+    because the machine is gone: messages are counted, and `connected` is the state.
 
     Attributes:
         interface: Signals of the DPS.
@@ -73,7 +73,7 @@ class Bridge(ABC):
             signals: Names of the sensor signals whose values would be too old if they had arrived then.
 
         Returns:
-            Whether values are dated back: newer ones may have to be waited for.
+            True if values count as older than their arrival, so that the loop may have to wait for newer ones.
         """
         return False
 

@@ -50,7 +50,7 @@ class Runtime(Stepped):
     The slow parts of the DPS run beside it, each in a separate process, until `close` or the end of a ``with`` block.
 
     If another publisher commands the same machine, that is an alarm: it is logged and counted in the statistics. No
-    signal is switched to real while another publisher is heard. Guards cannot stop him; a hub can, by protected
+    signal is switched to real while another publisher is heard. The guards cannot stop it; a hub can, by protected
     channels.
 
     Args:

@@ -78,7 +78,7 @@ class Buffers(threading.local):
     """The arrays on which one thread evaluates a function.
 
     Attributes:
-        parts: z, which holds the arguments; what evaluates; y, which holds the result. To look them up costs.
+        parts: The array z of the arguments, the function, and the array y of the result; looking them up costs time.
     """
 
     def __init__(self, function: casadi.Function, may_fail: bool) -> None:
