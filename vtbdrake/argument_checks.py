@@ -52,6 +52,17 @@ def as_addresses(name: str, values: Any) -> tuple[str, ...]:
     return all_of(str, (values,) if isinstance(values, str) else values, name=name, form="[address, ...]")
 
 
+def check_plain(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a scenario's record; raise a ValueError if no file can hold a field: one that is no text and no number."""
+    for name, value in record.items():
+        if not isinstance(value, str | int | float | None):
+            raise ValueError(
+                f"the scenario's field {name} is a {type(value).__name__}, which no file can hold: make it of numbers, "
+                "texts, lists and dataclasses of them"
+            )
+    return record
+
+
 def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
     """Return the values as a tuple, after a check that each is a ``kind``.
 

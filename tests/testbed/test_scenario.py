@@ -3,6 +3,7 @@
 import os
 import pickle
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
-from vtbdrake.state import AddressError
+from vtbdrake.state import AddressError, Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
@@ -321,6 +322,26 @@ class Varied(AcrobotScenario):
         super().validate()
         if self.legs < 4:
             raise ScenarioError(f"Varied.legs must be at least 4, not {self.legs}")
+
+
+@dataclass
+class Remembering(AcrobotScenario):
+    extra: object = None
+
+
+@pytest.mark.parametrize("extra", [np.int64(3), [np.float32(0.5)], Path("maps/a.csv")])
+def test_a_snapshot_with_fields_of_numpy_and_paths_is_saved(extra):
+    testbed = Remembering(extra=extra).build()
+    context = testbed.default_context()
+    testbed.restore(context, Snapshot.load(testbed.snapshot(context).to_bytes()))
+    with pytest.raises(SnapshotError, match="of another scenario"):
+        Remembering(extra=4).build().check_scenario(Snapshot.load(testbed.snapshot(context).to_bytes()))
+
+
+def test_a_field_that_no_file_can_hold_is_named():
+    testbed = Remembering(extra={"a": {1, 2}}).build()
+    with pytest.raises(ValueError, match="the scenario's field extra.a is a set, which no file can hold"):
+        testbed.snapshot(testbed.default_context()).to_bytes()
 
 
 def test_fields_are_set_in_a_copy_nested_ones_too():

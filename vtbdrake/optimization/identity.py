@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Diagram, System
 
+from vtbdrake.argument_checks import check_plain
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.rollout import Constraint, Quality
@@ -35,7 +36,7 @@ def describe(problem: Problem) -> dict[str, Any]:
     """Return a problem as JSON data."""
     task = problem.task
     described = {
-        "scenario": problem.scenario.record(),
+        "scenario": check_plain(problem.scenario.record()),
         "parameters": [asdict(parameter) for parameter in problem.parameters],
         "qualities": [_measure(quality) for quality in problem.objectives],
         "constraints": [_measure(constraint) for constraint in problem.constraints],

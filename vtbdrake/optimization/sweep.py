@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_whole
+from vtbdrake.argument_checks import all_of, as_whole, check_plain
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
@@ -236,7 +236,7 @@ class Sweep:
             "parameters": [asdict(parameter) for parameter in self.parameters],
             "units": list(self.units),
             "conditions": [{k: np.asarray(v).tolist() for k, v in c.items()} for c in self.conditions],
-            "scenario": dict(self.scenario),
+            "scenario": dict(check_plain(self.scenario)),
             "complete": self.complete,
             "minimize": list(self.minimize),
             "constraints": list(self.constraints),

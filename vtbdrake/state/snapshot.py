@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
+from vtbdrake.argument_checks import check_plain
 from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.codecs import SnapshotError, abstract_state
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
@@ -103,7 +104,7 @@ class Snapshot:
     def _parts(self) -> dict[str, Any]:
         arrays = {f"values/{key}": value for key, value in self.values.items()}
         arrays |= {f"groups/{key}": value for key, value in self.groups.items()}
-        return {"header": {"time": self.time, "scenario": dict(self.scenario)}, "arrays": arrays}
+        return {"header": {"time": self.time, "scenario": dict(check_plain(self.scenario))}, "arrays": arrays}
 
     @classmethod
     def load(cls, source: str | os.PathLike[str] | bytes) -> Snapshot:

@@ -296,8 +296,10 @@ def _values(owner: Any) -> dict[str, Any]:
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (dotted name, value) of everything inside."""
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
+    elif isinstance(value, os.PathLike):
+        value = os.fspath(value)
     if isinstance(value, dict | list | tuple) and not value:
         yield name, None
     elif isinstance(value, list | tuple):
