@@ -246,7 +246,7 @@ def _mean(values: Array) -> str:
 def main() -> None:
     """Decide in some forests, and print what was expected and what came."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--forests", type=int, default=8)
+    parser.add_argument("--forests", type=int, default=12)
     parser.add_argument("--seed", type=int, default=SEED)
     chosen = parser.parse_args()
     answers = {}
