@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _BATCH = 100  # consecutive windows from which a calibration takes one mean and deviation
 _MIN_WINDOWS = 2 * _BATCH
 _SHARE = 4.0
+_LONGEST = 64  # windows of the longest sums whose scatter a calibration determines
 _EXCESS = 1.166  # Siegmund's correction for the excess over the threshold, for normal steps
 
 
@@ -33,7 +34,8 @@ class CalibrationError(ValueError):
 class Calibration:
     """Mean and deviation of every residual in nominal operation, as plain data."""
 
-    # mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``)
+    # mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``); the deviation is that of
+    # independent values whose sums scatter as much (see `calibrate`)
     mean: Mapping[str, list[float]]
     deviation: Mapping[str, list[float]]
     windows: int  # number of windows that it was made of
@@ -66,11 +68,17 @@ class Calibration:
 def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizon: int, period: float) -> Calibration:
     r"""Return the calibration from the windows of a nominal run, which should include all motions of the later runs.
 
-    A cumulative sum test takes a slow change within the run for a shift. So the deviation is the largest deviation of a
-    batch of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), and at least four
-    times the largest distance of a batch's mean from the overall mean: then a lasting offset takes no more than half of
-    the allowance of 1/2 (`Cusum`). For independent values, the mean of a batch scatters by a tenth of the deviation, so
-    that the second condition has no effect.
+    A cumulative sum test takes a slow change within the run for a shift, and values that resemble the ones before (an
+    imperfect model during a motion) add up faster than independent ones. So the deviation is the largest deviation of a
+    batch of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), times the largest
+    ratio, over L = 1, 2, 4 .. 64, of the deviation of sums of L consecutive windows to sqrt(L) times that of one. For
+    an autocorrelation rho^n, this ratio tends to sqrt((1 + rho) / (1 - rho)). The standard error of the ratio in n
+    windows is about sqrt(L / (3 n)) of it (from overlapping sums); two such errors are added, and L is at most n / 8.
+
+    The deviation is also at least four times the largest distance of a batch's mean from the overall mean: then a
+    lasting offset takes no more than half of the allowance of 1/2 (`Cusum`).
+
+    Correlation over more than an eighth of the run, or 64 windows, is found in part only. Then give a tolerance.
 
     Args:
         residuals: Residuals of consecutive windows, each of shape (size,).
@@ -93,7 +101,9 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
         deviations = np.sqrt(squares.sum(axis=1) / (counts - 1))
         mean = np.nan_to_num(np.where(counts > 0, means * counts, 0.0).sum(axis=0) / counts.sum(axis=0))
         apart = np.where(counts > 0, np.abs(means - mean), 0.0).max(axis=0)
-        deviation = np.maximum(np.where(counts > 1, deviations, 0.0).max(axis=0), _SHARE * apart)
+        once, ratio = _scatter(table - mean)
+        deviation = np.fmax(np.where(counts > 1, deviations, 0.0).max(axis=0), once) * ratio
+        deviation = np.maximum(deviation, _SHARE * apart)
     return Calibration(
         mean={name: mean[place].tolist() for name, place in places.items()},
         deviation={name: deviation[place].tolist() for name, place in places.items()},
@@ -101,6 +111,26 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
         horizon=horizon,
         period=period,
     )
+
+
+def _scatter(table: Array) -> tuple[Array, Array]:
+    """Return the deviation of one window, and the factor by which sums of windows scatter more than independent ones.
+
+    Args:
+        table: Deviations of consecutive windows from the mean, of shape (windows, size), NaN where unknown.
+    """
+    known = ~np.isnan(table)
+    sums, counts = (np.pad(np.cumsum(a, axis=0), ((1, 0), (0, 0))) for a in (np.where(known, table, 0.0), known))
+    once, ratio, length = np.zeros(table.shape[1]), np.ones(table.shape[1]), 1
+    while length <= min(_LONGEST, len(table) // 8):
+        square = ((sums[length:] - sums[:-length]) ** 2).sum(axis=0) / (counts[length:] - counts[:-length]).sum(axis=0)
+        if length == 1:
+            once = np.nan_to_num(np.sqrt(square))
+        else:
+            error = np.sqrt(length / (3.0 * counts[-1]))
+            ratio = np.fmax(ratio, np.sqrt(square) / once * (1.0 + 2.0 * error))
+        length *= 2
+    return once, ratio
 
 
 # -- the cumulative sum test
@@ -135,7 +165,8 @@ class Cusum:
         S+ <- max(0, S+ + z - k),   S- <- max(0, S- - z - k).
 
     A shift of z by d > k is found, that is S > h, after about h / (d - k) windows. The sums are limited to 2 h, so that
-    they decrease soon after the shift has gone.
+    they decrease soon after the shift has gone. One window beyond h + k is enough: so the jump of a sensor is found on
+    which the belief is based, too, and outliers raise alarms.
 
     Args:
         size: Number of values.

@@ -43,7 +43,8 @@ class ResidualConfig:
         tolerance: By signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
             each; persistent residuals below half of it are not reported.
         allowance: Allowance k of `Cusum`, in scales.
-        false_alarm_interval: Mean time between two false alarms of all signals together, in seconds.
+        false_alarm_interval: Mean time between two false alarms of all signals together, in seconds, if the calibration
+            includes all motions, and the sums of residuals are about normal. Outliers alarm more often.
 
     Raises:
         ValueError: A value is out of its range.
