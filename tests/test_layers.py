@@ -47,6 +47,7 @@ BELOW["lazy"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)
+BELOW["__main__"] = {"cli"}
 TOP = {"visualization", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by

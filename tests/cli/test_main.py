@@ -41,7 +41,7 @@ def test_scenarios_are_found_from_the_current_directory(tmp_path: Path) -> None:
 
 def test_current_directory_is_searched_last(tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text("print('has run')\nfrom tests.testbeds import PendulumScenario as Mine\n")
-    for command in (["-m", "vtbdrake.cli"], ["-P", "-c", "from vtbdrake.cli import main; main()"]):
+    for command in (["-m", "vtbdrake"], ["-m", "vtbdrake.cli"], ["-P", "-c", "from vtbdrake.cli import main; main()"]):
         result = subprocess.run(
             [sys.executable, *command, "variables", "wave:Mine"],
             cwd=tmp_path,

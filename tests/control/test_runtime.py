@@ -229,6 +229,12 @@ def test_unknown_switches_are_rejected_without_change(asked, message):
         runtime.prepare(**asked)
 
 
+def test_unknown_side_of_a_switch_is_named():
+    runtime, _, _ = make()
+    with pytest.raises(TypeError, match=r"Runtime.switch\(\) got .* 'sensors'"):
+        runtime.switch(sensors="real")
+
+
 def test_switch_to_unconnected_or_unready_machine_is_refused():
     runtime, bridge, _ = make(rate=0.0, blocked_by=lambda: "its brakes are closed")
     runtime.cycle()

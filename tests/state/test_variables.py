@@ -288,6 +288,11 @@ def test_a_vector_that_is_declared_as_one_number_is_refused():
         collect(builder.Build())
 
 
+def test_single_system_is_refused():
+    with pytest.raises(ValueError, match="collect takes a Diagram; Filter is one system"):
+        collect(Filter())
+
+
 def test_camera_pose_is_written_to_the_camera():
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)

@@ -29,6 +29,7 @@ from vtbdrake.control.switching import (
 )
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
+from vtbdrake.testbed.testbed import Positions
 
 _log = logging.getLogger(__name__)
 
@@ -347,12 +348,12 @@ class Runtime(Stepped):
 
     # -- switches
 
-    def prepare(self, mode: str | None = None, **sides: Any) -> Preparation:
+    def prepare(self, mode: str | None = None, *, sense: Positions = None, act: Positions = None) -> Preparation:
         """Check whether switches can be thrown (first phase), without changing anything.
 
-        The arguments, ``sense`` and ``act`` among them, are those of `VirtualTestbed.switch`.
+        The arguments are those of `VirtualTestbed.switch`.
         """
-        return prepare(self, mode, **sides)
+        return prepare(self, mode, sense=sense, act=act)
 
     def perform(self, preparation: Preparation) -> None:
         """Throw the switches of a preparation (second phase), before another cycle has run.
@@ -367,13 +368,13 @@ class Runtime(Stepped):
             raise SwitchRefusedError("; ".join(preparation.reasons))
         perform(self, preparation.sense, preparation.act)
 
-    def switch(self, mode: str | None = None, **sides: Any) -> None:
+    def switch(self, mode: str | None = None, *, sense: Positions = None, act: Positions = None) -> None:
         """Prepare and perform a switch, see `prepare`. Call it in the thread that runs the cycles, or between cycles.
 
         Raises:
             SwitchRefusedError: There are reasons against the switch; nothing has changed.
         """
-        self.perform(self.prepare(mode, **sides))
+        self.perform(self.prepare(mode, sense=sense, act=act))
 
     def take_over(self, *, timeout: float = 60.0, report: Callable[[str], None] | None = None) -> None:
         """Run cycles until nothing prevents a switch to real, and switch; `run` goes on from there.

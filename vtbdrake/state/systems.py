@@ -239,7 +239,12 @@ def collect(
             of that instance. By default the path of the plant.
         skip: Predicate of a path that selects the leaf systems to leave out.
         extra: Further variables of the diagram.
+
+    Raises:
+        ValueError: The system is no Diagram.
     """
+    if not hasattr(diagram, "GetSystems"):
+        raise ValueError(f"collect takes a Diagram; {class_name(diagram)} is one system: build a Diagram that has it")
     plant_prefix = plant_prefix or (lambda path, instance: path)
     systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
     scene_graphs = [system for _, system in systems if is_scene_graph(system)]

@@ -1,0 +1,3 @@
+"""``python -m vtbdrake`` is the program ``vtbdrake``."""
+
+import vtbdrake.cli.__main__  # noqa: F401
