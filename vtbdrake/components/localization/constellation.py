@@ -1,34 +1,35 @@
 """Global localization without a guess: the constellation of the landmarks around the carrier, found again on a map.
 
 Pairs of landmarks vote for poses (`pair_votes`). Those with most votes are fitted to the nearest landmarks of the map
-(least squares with weights that fall with the distance), and the best of them are judged by their likelihood.
+(least squares with weights that fall with the distance), and the best of them are compared by their likelihood.
 
 **Likelihood.** Of the n local landmarks, the share w is on the map; the rest is not: false trunks, and trees that the
 map lacks. Let λ_k be the density of the map's landmarks in 1/m² around its landmark k (within 8 m, at least the mean of
 the map), N_ik the normal density of the difference of the local landmark i from it, and D_ik the density of the local
-diameter, if both are the same, divided by its density among all diameters of the map. Compared with a place that the
-map does not show, a pose has the logarithm of the likelihood
+diameter, if both are the same, divided by its density among all diameters of the map. The logarithm of the likelihood
+ratio of a pose, against the hypothesis that the map does not show the place, is
 
     Λ = Σ_i ln(1 - w + w Σ_k N_ik ((1 - ε) D_ik + ε) / λ_k),
 
 where ε is the share of diameters that are measured badly. The pose is found by expectation maximization, its covariance
 is the inverse of the observed information: matches that are in doubt count less (Louis, J. R. Stat. Soc. B 44, 1982).
 
-**Test of uniqueness.** A pose is sure if all of this holds, with s² the variance of the difference of a landmark here
-and on the map, per axis:
+**Test of uniqueness.** A pose is sure if all of these conditions hold, where s² is the variance per axis of the
+difference between the local position of a landmark and that on the map:
 
 * There are at least `fewest` local landmarks.
-* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 200: the number of poses that can be told apart on a map of area A, and a
-  factor of 200 beside it.
-* No other pose has more than Λ - 5, or than half of Λ. It is another one if it has less than half of its matches in
-  common. (In the rows of a plantation many poses nearly match; by chance, the best of them is ahead by more than 5.)
-* Λ is at least 0.6 of what is expected of a right pose with these landmarks.
+* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 200. The first logarithm is that of the number of distinguishable poses on a
+  map of area A; the factor of 200 is a margin.
+* Every other pose has at most Λ - 5 and at most Λ / 2. Poses are different if they have less than half of their matches
+  in common. (In the rows of a plantation many poses nearly match; the best of them may lead by more than 5 by chance.)
+* Λ is at least 0.6 of its expectation for the right pose with these landmarks.
 
 **Errors of the map that neighbours share.** With a correlation length L, the errors of a map at a distance r have the
 correlation exp(-r² / (2 L²)). The field of errors is a sum of smooth functions with random factors that are estimated
-together with the pose (`_shared_functions`); what they leave of the variance is independent. So neighbours may be
-displaced together, but not apart, and the covariance of the pose contains the displacement that cannot be known. The
-less the errors of a map are like that, the less its curvature says about its displacement: the covariance is too small.
+together with the pose (`_shared_functions`); the rest of the variance is independent. So neighbours may be displaced
+together, but not apart, and the covariance of the pose contains the displacement that cannot be observed. If the errors
+of a map do not follow this model, the displacement is estimated less accurately than assumed: the covariance is too
+small.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ from vtbdrake.components.localization.planar import compose, rotation, transform
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# What is in no covariance (bark, lean, roots), and keeps exact landmarks from infinite likelihoods: assumed, in m.
+# Standard deviations in m that are added to those of positions and diameters: assumed, for bark, lean and roots. They
+# also keep the likelihoods of exact landmarks finite.
 _FLOOR = 0.02
 _DIAMETER_FLOOR = 0.01
 
@@ -63,7 +65,7 @@ _VOTED, _FITTED, _JUDGED = 300, 60, 10
 # The number of steps of expectation maximization.
 _STEPS = 8
 
-# The number of landmarks of the map that each local one may be: the nearest.
+# The number of landmarks of the map, the nearest ones, that may match a local one.
 _NEIGHBOURS = 3
 
 # The number of samples from which the likelihood of a right pose is computed.
@@ -74,16 +76,16 @@ _FACTOR, _LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 200.0, 5.0, 0.5, 0.6
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Where on the map the carrier is, as far as the landmarks around it tell. Immutable.
+    """The result of matching local landmarks with a map: a pose of the carrier on it. Immutable.
 
     Attributes:
         pose: The most likely pose X_WH, [x, y, heading] in m and rad, shape (3,).
         covariance: The covariance of the pose, if it is the right one, shape (3, 3).
-        is_sure: Whether it passes the test of uniqueness. If not, pose and covariance are no measurement.
-        log_likelihood: Λ, the logarithm of the likelihood compared with a place that the map does not show.
-        margin: The difference of Λ from that of the best other pose, or of a place that the map does not show (0).
-        fit: Λ as a share of what is expected of a right pose.
-        pairs: Indices of landmarks that are the same, local and on the map, shape (m, 2).
+        is_sure: Whether the pose passes the test of uniqueness. If not, pose and covariance must not be used.
+        log_likelihood: Logarithm Λ of the likelihood ratio against a place that the map does not show.
+        margin: Difference between Λ and that of the best other pose, or of a place off the map (0) if that is larger.
+        fit: Ratio of Λ to its expectation for the right pose.
+        pairs: Matches: indices of the local landmark and of the one on the map, shape (m, 2).
     """
 
     pose: Array
@@ -104,7 +106,7 @@ class Fix:
 
 @dataclass(frozen=True, eq=False)
 class _Local:
-    """Local landmarks in a frame C that has its origin among them, as they are compared with a map.
+    """Local landmarks, prepared for the comparison with a map, in a frame C that has its origin among them.
 
     Attributes:
         places: Positions in C in m, (n, 2).
@@ -113,7 +115,7 @@ class _Local:
         diameter_variances: Variances of the diameters in m², (n,).
         common: Densities of these diameters among those of the map in 1/m, (n,).
         shared: The functions that make up the displacement of the map at the landmarks, (n, f).
-        independent: The share of the map's variance that they leave, (n,).
+        independent: The share of the map's variance that these functions do not contain, (n,).
     """
 
     places: Array
@@ -132,7 +134,7 @@ class _Local:
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """What each local landmark may be on the map: k landmarks near it, for one pose.
+    """The possible matches of each local landmark at one pose: the k nearest landmarks of the map.
 
     Attributes:
         near: Indices on the map, (n, k).
@@ -167,7 +169,7 @@ class _Judged:
 
 
 class ConstellationMap:
-    """A map of landmarks, prepared to be searched for a constellation. Immutable.
+    """A map of landmarks, prepared for the search for a constellation. Immutable.
 
     Attributes:
         landmarks: The map, in W.
@@ -198,27 +200,27 @@ class ConstellationMap:
         self._low, self._high = self._places.min(axis=0), self._places.max(axis=0)
         self._area = float(np.prod(np.maximum(self._high - self._low, 1.0)))
         counts = self._tree.query_ball_point(self._places, _SURROUNDINGS, return_length=True)
-        # A landmark at the edge has fewer around it, though they are as dense.
+        # Near the edge of the map, part of the disc is empty: the mean density is the lower limit.
         self._densities = np.maximum(counts / (pi * _SURROUNDINGS**2), len(landmarks) / self._area)
         self._roots = np.linalg.cholesky(landmarks.covariances + 1e-12 * np.eye(2))
         self._variance = 0.5 * float(np.median(np.trace(landmarks.covariances, axis1=1, axis2=2)))
         self._diameter_variances = landmarks.diameter_deviations**2 + _DIAMETER_FLOOR**2
-        # Some that stand for the diameters of all.
+        # A sample of landmarks that represents the distribution of the diameters.
         self._typical = np.argsort(landmarks.diameters)[np.linspace(0, len(landmarks) - 1, 200).astype(int)]
         self._pairs = PairTable.of(
             self._places, self._tree, diameters=landmarks.diameters, diameter_variances=self._diameter_variances
         )
 
     def locate(self, local: Landmarks) -> Fix:
-        """Return where the carrier is that has these landmarks around it, in its level frame H.
+        """Return the pose of a carrier that detects these landmarks, which are given in its level frame H.
 
-        Their errors are taken as independent.
+        The errors of the local landmarks are assumed to be independent.
         """
         if len(local) < 2:
             return self._unknown()
         p_HoCo_H = local.positions.mean(axis=0)
         here = self._seen(local, local.positions - p_HoCo_H)
-        # The variance about the mean is that part of the map's errors that displaces landmarks against each other.
+        # The part of the map's variance that displaces landmarks relative to each other: the variance about the mean.
         relative = self._variance * (1.0 - float(np.mean(_correlation(here.places, self.correlation))))
         variance = relative + float(np.mean(here.variances)) + _FLOOR**2
         judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
@@ -243,7 +245,7 @@ class ConstellationMap:
         return Fix(pose, covariance, is_sure, best.log_likelihood, margin, fit, best.pairs)
 
     def _unknown(self) -> Fix:
-        """Return that the carrier is anywhere on the map."""
+        """Return the result of a failed search: the carrier may be anywhere on the map."""
         pose = np.array([*(0.5 * (self._low + self._high) + self._p_WoMo_W), 0.0])
         covariance = np.diag([*((self._high - self._low) ** 2 / 12.0 + 1.0), pi**2 / 3.0])
         return Fix(pose, covariance, False, 0.0, 0.0, 0.0, np.zeros((0, 2), dtype=np.intp))
@@ -261,11 +263,11 @@ class ConstellationMap:
         return _normal(delta, variances[:, np.newaxis] + self._diameter_variances[self._typical]).mean(axis=1)
 
     def _expected(self, here: _Local, relative: float) -> float:
-        """Return the Λ that is expected of a right pose, by samples of landmarks that are on the map or not.
+        """Return the expectation of Λ for the right pose, from random samples of landmarks on the map and off it.
 
         Args:
             here: The local landmarks.
-            relative: The share of the map's variance that displaces landmarks against each other.
+            relative: The share of the map's variance that displaces landmarks relative to each other.
         """
         rng = np.random.default_rng(0)
         one = rng.integers(len(here.places), size=_SAMPLES)
@@ -293,7 +295,7 @@ class ConstellationMap:
         return len(here.places) * expected
 
     def _candidates(self, here: _Local, deviation: float) -> Array:
-        """Return the poses X_MC that are to be judged, (k, 3); a landmark here and on the map differ by a deviation."""
+        """Return the poses X_MC to be judged, (k, 3); ``deviation`` (m) is that of local from mapped positions."""
         local = LocalPairs.of(
             here.places,
             here.variances + _FLOOR**2,
@@ -325,10 +327,10 @@ class ConstellationMap:
             places: The local landmarks in C, (n, 2).
             weights: Their weights, (n,).
             poses: Poses X_MC, (k, 3).
-            width: The weights fall to exp(-1/2) at this distance in m.
+            width: The distance in m at which the weights have fallen to exp(-1/2).
 
         Returns:
-            The better poses (k, 3), and the sums of weights (k,).
+            The improved poses (k, 3), and their sums of weights (k,).
         """
         c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
         x = c * places[:, 0] - s * places[:, 1] + poses[:, :1]
@@ -354,8 +356,8 @@ class ConstellationMap:
         Args:
             here: The local landmarks.
             pose: The pose, (3,).
-            mean: The displacement of the map at them as a factor of the root of its covariance, (n, 2).
-            spread: The covariance of this factor, (n, 2, 2).
+            mean: The expected displacement of the map at them, in units of the root of its covariance, (n, 2).
+            spread: The covariance of this displacement, in the same units, (n, 2, 2).
         """
         R_MC = rotation(pose[2])
         seen = transform(pose, here.places)
@@ -371,7 +373,7 @@ class ConstellationMap:
         normal = -0.5 * np.einsum("nki,nkij,nkj->nk", deltas, weights, deltas) - 0.5 * np.log(determinant)
         variances = here.diameter_variances[:, np.newaxis] + self._diameter_variances[near]
         same = _normal(here.diameters[:, np.newaxis] - self.landmarks.diameters[near], variances)
-        # Nothing is gained from a diameter that is not known: both densities are 0.
+        # An unknown diameter carries no information: both densities are 0, and the factor is 1.
         common = np.broadcast_to(here.common[:, np.newaxis], same.shape)
         factor = np.divide(same, common, out=np.ones_like(same), where=common > 0.0)
         diameter = np.log((1.0 - _BAD_DIAMETERS) * factor + _BAD_DIAMETERS)
@@ -404,13 +406,13 @@ class ConstellationMap:
             if np.linalg.cond(information[:3, :3]) > 1e12:
                 return None
             covariance = np.linalg.inv(information)
-            # The displacement is estimated afresh, so the differences are those without it.
+            # The displacement is estimated anew in each step: the differences are taken without the present one.
             deltas = matches.deltas[i, k] + np.einsum("mij,mj->mi", L, mean[i])
             change = covariance @ (weighted.T @ deltas.ravel())
             pose = pose + change[:3]
             mean = here.shared @ change[3:].reshape(functions, 2)
             if functions and step < 2:
-                # At first the displacement is not known well enough to tell neighbours apart by it.
+                # In the first steps the displacement is too uncertain to distinguish neighbours: its covariance counts.
                 block = covariance[3:, 3:].reshape(functions, 2, functions, 2)
                 spread = np.einsum("nf,figj,ng->nij", here.shared, block, here.shared, optimize=True)
                 continue
@@ -420,7 +422,7 @@ class ConstellationMap:
         matches = self._matches(here, pose, mean, spread)
         evidence = float(matches.likelihoods(self.share).sum() - 0.5 * change[3:] @ change[3:])
         evidence -= 0.5 * float(np.linalg.slogdet(information[3:, 3:])[1])
-        # The information that is missing because matches are in doubt: the covariance of the score of each landmark.
+        # The information that is missing because matches are uncertain: the covariance of the score of each landmark.
         scores = np.einsum("mji,mjl,ml->mi", A, matches.weights[i, k], deltas - A @ change)
         p = probable[i, k, np.newaxis]
         means = np.zeros((len(here.places), A.shape[2]))
@@ -440,7 +442,7 @@ def _inverse_of_observed(complete: Array, missing: Array) -> Array:
 
 
 def _one_to_one(near: Indices, probable: Array) -> Indices:
-    """Return the pairs (m, 2) of each landmark with one near it that is more probable than all else, one to one."""
+    """Return the one-to-one matches (m, 2) whose probabilities (n, k) are above one half."""
     best = probable.argmax(axis=1)
     rows = np.flatnonzero(probable.max(axis=1) > 0.5)
     rows = rows[np.argsort(-probable[rows, best[rows]], kind="stable")]
@@ -450,7 +452,7 @@ def _one_to_one(near: Indices, probable: Array) -> Indices:
 
 
 def _is_other(pairs: Indices, best: Indices) -> bool:
-    """Return whether less than half of the matches are the same."""
+    """Return whether two poses with these matches, (m, 2) and (l, 2), have less than half of them in common."""
     common = len({*map(tuple, pairs.tolist())} & {*map(tuple, best.tolist())})
     return common < 0.5 * min(len(pairs), len(best)) or not len(pairs)
 

@@ -1,4 +1,4 @@
-"""Dead reckoning of a carrier on wheels by gyros, accelerometers and wheel speed, and how it corrects scans.
+"""Dead reckoning of a wheeled carrier from gyros, accelerometers and wheel speed, and the de-skewing of scans by it.
 
 Frames: B is the body of the carrier, with x forward, where the IMU measures. H is its level frame: its origin is Bo, z
 is up by gravity, x points in the heading of B. O, the odometry frame, is where H was at the start. L is the frame of
@@ -30,11 +30,11 @@ POSE = 6
 HISTORY_LENGTH = 1.0
 """The time for which poses are remembered, in s."""
 
-# Once the carrier has stood still for so long, its gyros show their bias, in s.
+# After a standstill of this time in s, the gyros' rates are taken for their bias.
 _SETTLING_TIME = 0.5
-# No carrier turns, accelerates or drives as fast, in rad/s, m/s^2 and m/s: such a number is a fault.
+# Readings of at least this size, in rad/s, m/s^2 or m/s, are faults: no carrier turns, accelerates or drives so fast.
 _LARGEST = 1e3
-# Nothing is divided by less.
+# The lower limit of divisors.
 _TINY = 1e-30
 # The standard deviation of the gyros' bias at the start, in rad/s.
 _BIAS_DEVIATION = 0.005
@@ -42,17 +42,17 @@ _BIAS_DEVIATION = 0.005
 
 @dataclass(frozen=True)
 class DriftModel:
-    """Dead reckoning drifts by random walks, whose deviations grow with the roots of distance, time and turn.
+    """The drift of dead reckoning as random walks: deviations grow with the square roots of distance, time and turn.
 
-    Those along and across are calibrated with the simulated carrier of `vtbdrake_diagrams.forest`, which slips on
-    slopes; the others are assumed. Errors that last for longer, of the wheels and of the gyros, are no random walks and
-    not contained: a `Tracker` estimates them.
+    ``along`` and ``across`` are calibrated with the simulated carrier of `vtbdrake_diagrams.forest`, which slips on
+    slopes; the others are assumed. The scale error of the wheels and the bias of the gyros, which last longer, are not
+    part of this model: a `Tracker` estimates them.
 
     Attributes:
-        along: Deviation along the path, in m per root metre.
-        across: Deviation sideways by slip, in m per root metre.
-        heading: Deviation of the heading, in rad per root second.
-        turn: Deviation of the heading in turns, in rad per root radian.
+        along: Standard deviation along the path, in m per root metre.
+        across: Standard deviation sideways by slip, in m per root metre.
+        heading: Standard deviation of the heading, in rad per root second.
+        turn: Standard deviation of the heading in turns, in rad per root radian.
     """
 
     along: float = 0.04
@@ -71,14 +71,14 @@ class DriftModel:
         """Return the covariance (3, 3) of a motion X_AB by dead reckoning, in the order x, y (in A, m), heading (rad).
 
         Args:
-            motion: X_AB = [x, y, heading] from where the carrier was, (3,) in m and rad. It is about an arc.
-            duration: How long it took, in s.
+            motion: The motion X_AB = [x, y, heading], (3,) in m and rad, assumed to follow an arc.
+            duration: The duration of the motion in s.
         """
         x, y, turned = np.asarray(motion, dtype=float).tolist()
         length = hypot(x, y)
         along = self.along**2 * length
         heading = self.heading**2 * abs(duration) + self.turn**2 * abs(turned)
-        # What the heading has drifted halfway leads aside.
+        # The drift of the heading on the way displaces the end sideways.
         across = self.across**2 * length + heading * length**2 / 3.0
         in_chord = np.array(
             [
@@ -113,33 +113,35 @@ class DeadReckoning(LeafSystem):
     `HISTORY_LENGTH`, newest first, each laid out as `POSE` says; before the start, the carrier stood still. x, y and
     heading are those of H in O; the heading is continuous, not wrapped.
 
-    *Levelling.* The reaction g to gravity, which points up in B, is turned by the gyros, and led to what the
-    accelerometers show without the acceleration of Bo, which has the velocity V = [v, -axle w_z, 0] in B:
+    *Levelling.* The reaction g to gravity, expressed in B, points up. It is rotated by the gyros, and corrected towards
+    the specific force f less the acceleration of Bo, whose velocity in B is V = [v, -axle w_z, 0]:
 
         g <- exp(-[w T]x) g,   g <- g + k (a - g),   b <- b + l g x a / g^2,   a = f - dV/dt - w x V,
 
     where w are the rates without the gyros' bias b; V = 0 in samples that show no motion (below). Only the direction
     u = g / |g| is used, so that gravity need not be known. k and l are the gains of a Kalman filter for the errors of
-    u and of b across it, alike in all directions: gyros have the noise ``gyro_noise`` per sample, and b is a random
-    walk with the deviation ``bias_drift``. What the wheels do not tell of the acceleration, as when the carrier sways
-    or slips, is taken as noise with the deviation ``sway`` per sample. In the end, the time constant T / k is about
-    sway / (|g| gyro_noise).
+    u and of the part of b perpendicular to it, the same in all directions: gyros have the noise ``gyro_noise`` per
+    sample, and b is a random walk with the deviation ``bias_drift``. Accelerations that the wheels do not show, as when
+    the carrier sways or slips, count as noise with the deviation ``sway`` per sample. In the steady state, the time
+    constant T / k is about sway / (|g| gyro_noise).
 
-    *Path.* A moves along x_B, and Bo stays ahead of it:
+    *Path.* A moves along x_B, and Bo is ahead of it by -axle:
 
         heading <- heading + T (w_y u_y + w_z u_z) / (u_y^2 + u_z^2),
-        p_A <- p_A + T v cos(pitch) [cos(heading), sin(heading)], halfway,   [x, y] = p_A - axle [cos(heading), ...].
+        p_A <- p_A + T v cos(pitch) [cos(heading), sin(heading)],   [x, y] = p_A - axle [cos(heading), sin(heading)],
 
-    *Bias about the vertical.* Of this, accelerometers tell nothing. But while the carrier stands still, what the gyros
-    measure about the vertical is their bias: another Kalman filter, with the same noise. (About other axes, it is the
-    rocking on the springs, too.) The carrier stands still when for half a second the rates have stayed below
-    ``still_rate``, the mean speed, with a time constant of half a second, below ``still_speed``, and no speed was above
-    four times that: wheel sensors are noisy at rest, too. The accelerometers are a second witness, because a wheel
-    sensor that fails shows no speed either. The root mean square of what they measure beside its mean, with the same
-    time constant for both, is at most twice the least one so far, or ``still_force``, while the carrier stands still.
+    with the heading in the middle of the interval, and the mean of v at its ends, in the step of p_A.
+
+    *Bias about the vertical.* Accelerometers do not show it. But while the carrier stands still, the rate of the gyros
+    about the vertical is their bias, which another Kalman filter with the same noise estimates. (About other axes, the
+    gyros measure the rocking on the springs, too.) The carrier stands still when for half a second the rates have
+    stayed below ``still_rate``, the mean speed, with a time constant of half a second, below ``still_speed``, and no
+    speed was above four times that, as wheel sensors are noisy at rest, too. A failed wheel sensor also shows no speed.
+    Therefore the accelerometers must agree: the root mean square of the difference between specific force and its mean,
+    with the same time constant for both, is at most twice the least one so far, or ``still_force``.
 
     A sample with a number that is not finite, or with one of 1,000 or more, is left out and counted in ``ignored``:
-    speed and turn rate go on.
+    speed and turn rate keep their values.
     """
 
     __slots__ = NO_DICT
@@ -149,7 +151,7 @@ class DeadReckoning(LeafSystem):
 
         Args:
             period: Sample period of both sensors in s.
-            axle: The place on x_B of the point that does not move sideways, in m; behind Bo it is negative.
+            axle: The x coordinate in B, in m, of the point A that does not move sideways; negative behind Bo.
 
         Raises:
             ValueError: The period is not positive.
@@ -169,9 +171,9 @@ class DeadReckoning(LeafSystem):
             "history": past.ravel(),
             # Gravity, velocity, and the gyros' bias.
             "levelling": np.zeros(8),
-            # Of the vertical, with the bias across it, of that, and of the bias about it.
+            # Variance of u, its covariance with the bias across u, variances of that bias and of the one about u.
             "variances": np.array([1.0, 0.0, variance, variance]),
-            # Samples, those at rest, those ignored, mean speed and force, mean square of the shaking, and the least.
+            # Samples, those at rest, those ignored, mean speed and force, mean square of the shaking, its least value.
             "counts": np.array([*[0.0] * 8, _LARGEST**2]),
         }
         groups = {name: self.DeclareDiscreteState(value) for name, value in starts.items()}
@@ -219,7 +221,7 @@ class DeadReckoning(LeafSystem):
         sample = [*self._imu.Eval(context).tolist(), *self._odometry.Eval(context).tolist()]
         axle = float(context.get_numeric_parameter(0).value()[5])
         T, now = self._period, context.get_time() - self._period
-        # The sample before the first interval is about no motion.
+        # The first sample belongs to an interval before the start.
         begun = now > -T / 2.0
         v = v_before
         if not all(abs(number) < _LARGEST for number in sample):
@@ -244,7 +246,7 @@ class DeadReckoning(LeafSystem):
             state.set_value(group, value)
 
     def _counted(self, context: Context, sample: list[float], counts: list[float]) -> list[float]:
-        """Return what is counted after a sample: the samples, those at rest, and the means, as ``counts`` has them."""
+        """Return the counters and means after a sample, in the order of ``counts``, (9,)."""
         _, still_speed, still_rate, _, _, _, still_force = context.get_numeric_parameter(0).value().tolist()
         samples, at_rest, ignored, speed, *force, shaking, least = counts
         gain = max(self._period / _SETTLING_TIME, 1.0 / (samples + 1.0))
@@ -264,11 +266,11 @@ class DeadReckoning(LeafSystem):
         """Return the vertical in B, (3,), the angular velocity without bias (rad/s), (3,), and both states after it.
 
         Args:
-            context: For the parameters.
+            context: The context, for the parameters.
             sample: Angular velocity (rad/s), specific force (m/s^2) and speed (m/s), (7,).
             levelling: Gravity (m/s^2), velocity (m/s) and bias (rad/s) before, (8,).
-            variances: Those before, (4,).
-            counts: Those of `_counted`, with this sample, (9,).
+            variances: The variances before, (4,).
+            counts: The result of `_counted` for this sample, (9,).
         """
         sway, _, _, bias_drift, gyro_noise, axle, _ = context.get_numeric_parameter(0).value().tolist()
         T, gravity, before, bias = self._period, levelling[:3], levelling[3:5], levelling[5:]
@@ -288,7 +290,7 @@ class DeadReckoning(LeafSystem):
         change = [(new - old) / T for old, new in zip(before, velocity, strict=True)]
         inward = _cross(w, [(old + new) / 2.0 for old, new in zip(before, velocity, strict=True)] + [0.0])
         a = [sample[3] - change[0] - inward[0], sample[4] - change[1] - inward[1], sample[5] - inward[2]]
-        # The specific force is that of B halfway.
+        # The mean specific force is expressed in B as it is in the middle of the interval.
         a = _turned_back(a, w, T / 2.0)
         gravity = a if is_first else _turned_back(gravity, w, T)
         square = max(sum(e * e for e in gravity), _TINY)
@@ -304,13 +306,13 @@ class DeadReckoning(LeafSystem):
 
 
 def _direction(u: list[float]) -> list[float]:
-    """Return the direction of a vector in B, (3,); that of z_B if it has none."""
+    """Return the direction of a vector in B, (3,); z_B if its length is 0."""
     length = sqrt(sum(e * e for e in u))
     return [e / length for e in u] if length > _TINY else [0.0, 0.0, 1.0]
 
 
 def _turned_back(u: list[float], w: list[float], duration: float) -> list[float]:
-    """Return exp(-[w duration]x) u, to the second order: a fixed vector, in a body that has turned."""
+    """Return exp(-[w duration]x) u, to the second order: a fixed vector, expressed in a body after its rotation."""
     first = _cross(w, u)
     second = _cross(w, first)
     return [e - duration * a + duration**2 / 2.0 * b for e, a, b in zip(u, first, second, strict=True)]
@@ -353,14 +355,14 @@ def body_rotation(roll: float, pitch: float, heading: float = 0.0) -> Array:
 def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: float) -> Array:
     """Return the points of a scan in the level frame H at one time, (n, 3) in m.
 
-    Each ray is turned and moved by the pose that the carrier had when it was fired, against the pose at ``time``. Poses
-    between those of the history are interpolated linearly. That the carrier rises and sinks is neglected.
+    Each point is transformed from the pose of the carrier when its ray was fired to the pose at ``time``. Poses between
+    those of the history are interpolated linearly. The vertical motion of the carrier is neglected.
 
     Args:
-        scan: What was measured.
+        scan: The scan.
         history: The port ``history`` of a `DeadReckoning`, newest first.
         X_BL: Pose of the scanner in B.
-        time: When the scan was complete, by the clock of the DPS, in s.
+        time: The time when the scan was complete, by the clock of the DPS, in s.
 
     Raises:
         ValueError: The history has fewer than two poses.
@@ -378,7 +380,7 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     turns = np.array([body_rotation(roll, pitch, turned - heading) for _, roll, pitch, _, _, turned in knots.tolist()])
     moves = np.zeros((len(knots), 3))
     moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
-    # Between which knots a ray was fired, and where between them; before the first and after the last, at these.
+    # The segment between two knots in which each ray was fired, and its share of it; beyond the knots, at the nearest.
     place = np.interp(fired, knots[:, 0], np.arange(len(knots)))
     segments = np.minimum(place.astype(int), len(knots) - 2)
     share = (place - segments)[:, np.newaxis]

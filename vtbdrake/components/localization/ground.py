@@ -42,7 +42,7 @@ class Ground:
         return total
 
     def support(self, places: Array) -> Iterator[tuple[NDArray[np.intp], Array]]:
-        """Yield four times which nodes (n,) bear places (n, 2), and with which weights (n,)."""
+        """Yield the four nodes around places (n, 2), one after the other: their indices and weights, (n,) each."""
         m = len(self.heights)
         scaled = np.clip((places - self.corner) / _SPACING, 0.0, m - 1.000001)
         column = scaled.astype(np.intp)
@@ -54,15 +54,15 @@ class Ground:
 
 
 def fit_ground(points: Array, center: Array, *, reach: float) -> Ground:
-    """Fit a surface to the lowest points of a scan, which may be of trunks and undergrowth where no ray meets ground.
+    """Fit a surface to the lowest points of a scan; where no ray reaches the ground, they are of trunks or undergrowth.
 
-    The surface minimizes the weighted squares of the distances of the lowest points of all cells, and those of its own
-    second differences. Points that lie above it lose their weight from stage to stage, while it becomes less stiff:
-    it begins as nearly a plane, and ends as a surface that follows waves of some ten metres.
+    The surface minimizes the sum of the weighted squares of its distances from the lowest points of all cells and of
+    its own second differences. Points above it lose weight from stage to stage, while it becomes less stiff: it begins
+    nearly as a plane, and ends as a surface that follows waves of some ten metres.
 
     Args:
         points: The points of the scan, (n, 3) in m, z up.
-        center: A point on the ground beneath the scanner, (3,) in m, where the scanner sees none.
+        center: The point on the ground beneath the scanner, (3,) in m, where the scanner sees no ground.
         reach: Half of the edge length of the surface around ``center``, in m.
     """
     m = int(2.0 * reach / _SPACING) + 2

@@ -1,4 +1,4 @@
-"""Landmarks in the plane: what a detector sees around the carrier, and what a map has."""
+"""Landmarks in the plane, as detected around the carrier or as taken from a map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Landmarks:
         positions: The axes of the landmarks in m, shape (n, 2).
         covariances: Covariances of the positions in m^2, shape (n, 2, 2).
         diameters: Diameters in m, shape (n,).
-        diameter_deviations: Standard deviations of the diameters in m, shape (n,); infinite where nothing is known.
+        diameter_deviations: Standard deviations of the diameters in m, shape (n,); infinite for unknown diameters.
 
     Raises:
         ValueError: The shapes do not agree, a position, covariance or diameter is not finite, or a deviation or a
@@ -74,7 +74,7 @@ class Landmarks:
         return self
 
     def select(self, rows: ArrayLike) -> Landmarks:
-        """Return those with these indices, or those for which a mask (n,) is true."""
+        """Return the landmarks with these indices, or those for which a mask (n,) is true."""
         chosen = np.asarray(rows)
         return Landmarks(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
@@ -95,13 +95,13 @@ def map_landmarks(model: WorldModel, kind: str = "tree", *, deviation: float = 0
     Args:
         model: The map.
         kind: The class: ``"tree"``, with the attribute ``trunk_diameter``, or ``"rock"``, with ``width``.
-        deviation: Standard deviation in m, per axis, of what the covariances of the map leave out; its square is added
-            to their variances. Of a map of the feet of leaning trunks, it is the deviation of the lean in rad times
-            1.3 m, as trunks are detected at breast height.
+        deviation: Standard deviation in m, per axis, of errors that the covariances of the map do not contain; its
+            square is added to their variances. For a map of the feet of leaning trunks, it is the standard deviation of
+            the lean in rad times 1.3 m, as trunks are detected at breast height.
 
     Raises:
-        ValueError: The class is unknown, there is no such object, one has no diameter in m between 0 and 20 m, or
-            no variance in the plane, or the deviation is none.
+        ValueError: The class is unknown, there is no such object, an object has no diameter between 0 and 20 m or an
+            infinite variance in the plane, or ``deviation`` is negative or not finite.
     """
     if not 0.0 <= deviation < inf:
         raise ValueError(f"deviation is a standard deviation in m, finite and at least 0, not {deviation!r}")

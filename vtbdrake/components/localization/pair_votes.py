@@ -1,8 +1,8 @@
 """Votes of pairs of landmarks for poses on a map: candidates for global localization.
 
 Two local landmarks at a distance ℓ can be any pair of the map with that distance and with diameters like theirs. Each
-such pair is a vote for a pose. The right pose is among the votes of all pairs of which both landmarks are on the map, a
-wrong one among few by chance.
+such pair is a vote for a pose. Each local pair of which both landmarks are on the map votes for the right pose; for a
+wrong pose, few vote by chance.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-# Pairs are this far apart, in m: close ones say little about the heading, and there are too many far ones.
+# The least and the largest distance of a pair in m: close pairs say little about the heading, far ones are too many.
 _NEAREST, _FARTHEST = 3.0, 15.0
 
-# Pairs of the local landmarks vote until there are enough votes, and the right cell stands out by so many standard
-# deviations of the votes in a cell, if the right pose has this share of the pairs (assumed). Memory sets the limit.
+# Local pairs vote until there are enough votes, and until the right cell has so many standard deviations (_CONTRAST)
+# more votes than other cells, if this share (_RIGHT, assumed) of the pairs votes for it. The limit is set by memory.
 _ENOUGH, _LIMIT, _CONTRAST, _RIGHT = 800_000, 20_000_000, 10.0, 0.08
 _FEWEST_PAIRS = 25
 
@@ -31,18 +31,18 @@ _GATE = 1.5
 # The width of a cell in standard deviations of the votes.
 _CELL = 3.0
 
-# Poses this far beyond the landmarks of the map are looked at, in m.
+# Poses are searched up to this distance beyond the landmarks of the map, in m.
 _MARGIN = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class LocalPairs:
-    """Pairs of local landmarks in a frame C, in an order that is random: the first of them involve many landmarks.
+    """Pairs of local landmarks in a frame C, in random order, so that the first ones involve many landmarks.
 
     Attributes:
         distances: Distances of the two landmarks in m, (n,).
         angles: Directions from the first to the second landmark in rad, (n,).
-        middles: Places half way in m, (n, 2).
+        middles: Midpoints in m, (n, 2).
         deviations: Standard deviations of the difference between a distance here and on the map in m, (n,).
         diameters: Diameters of the first and the second landmark in m, (n, 2).
         diameter_variances: Variances of the diameters in m², (n, 2).
@@ -89,16 +89,16 @@ class LocalPairs:
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """All pairs of landmarks of a map that are neither close nor far, sorted by their distance.
+    """All pairs of landmarks of a map that are 3 to 15 m apart, sorted by their distance.
 
-    32 bytes for each pair, of which a stand with 800 trees/ha has 27 per tree.
+    A pair takes 32 bytes; a stand with 800 trees/ha has 27 pairs per tree.
 
     Attributes:
         distances: Distances of the two landmarks in m, (n,).
         angles: Directions from the first to the second landmark in rad, (n,).
-        middles: Places half way in m, (2, n).
+        middles: Midpoints in m, (2, n).
         diameters: Diameters of the first and the second landmark in m, (2, n).
-        reaches: Squares of the differences of diameters within the gate in m², (2, n).
+        reaches: The map's share of the squared gate of each diameter in m², (2, n).
         low: The least coordinates of landmarks of the map in m, (2,).
         high: The largest coordinates in m, (2,).
     """
@@ -137,7 +137,7 @@ class PairTable:
         )
 
     def favourites(self, local: LocalPairs, *, count: int) -> Array:
-        """Return the poses X_MC for which most pairs vote, (k, 3) in m and rad.
+        """Return the poses X_MC with the most votes, (k, 3) in m and rad.
 
         Args:
             local: The pairs of local landmarks, in C.
@@ -154,7 +154,7 @@ class PairTable:
         cell, sectors = float(np.clip(_CELL * shift, 0.6, 3.0)), int(2.0 * pi / np.clip(_CELL * turn, 0.04, 0.4))
         low, high = self.low - _MARGIN, self.high + _MARGIN
         columns, lines = ((high - low) / cell).astype(int) + 2
-        # Of p pairs with v votes each, c cells have p v / c by chance; the right one has p _RIGHT more.
+        # With p pairs of v votes each and c cells, a cell has p v / c votes by chance; the right one has p _RIGHT more.
         sums = 2 * np.cumsum(end - begin)
         density = float(sums[-1]) / len(sums) / (columns * lines * sectors)
         needed = max(_FEWEST_PAIRS, _CONTRAST**2 * density / _RIGHT**2, np.searchsorted(sums, _ENOUGH) + 1)
@@ -192,17 +192,17 @@ class PairTable:
 
 
 def _pairs(places: Array, tree: cKDTree) -> NDArray[np.intp]:
-    """Return the pairs (n, 2) of places that are neither close nor far."""
+    """Return the pairs (n, 2) of places whose distance lies between `_NEAREST` and `_FARTHEST`."""
     pairs: NDArray[np.intp] = tree.query_pairs(_FARTHEST, output_type="ndarray")
     delta = places[pairs[:, 1]] - places[pairs[:, 0]]
     return pairs[(delta**2).sum(axis=1) >= _NEAREST**2]
 
 
 def _crowded(cells: NDArray[np.int64], votes: Singles, count: int) -> Array:
-    """Return the mean votes of the cells that have most, (k, 3), given the cell of each vote (n,)."""
+    """Return the mean votes of the cells with the most votes, (k, 3), given the cell of each vote (n,)."""
     if not len(cells):
         return np.zeros((0, 3))
-    # The number of the vote in the lower bits: sorting numbers is much faster than finding their order.
+    # The index of the vote is in the lower bits, because np.sort is much faster than np.argsort.
     bits = len(cells).bit_length()
     packed = np.sort((cells << bits) | np.arange(len(cells)))
     sorted_cells = packed >> bits

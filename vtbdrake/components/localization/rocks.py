@@ -1,12 +1,12 @@
-"""Rocks on a plain from the points of one scan: where their middles are, and how wide they are.
+"""Rocks on a plain from the points of one scan: the positions of their middles, and their widths.
 
 A rock is a cluster of points that stands out of the ground, bulges towards the scanner as a circle does, and ends on
 both sides where nothing nearer hides it. A scan shows only the side that faces the scanner. If each row of rays meets
 half a circle, the points of a row that is w wide lie w pi / 8 in front of the middle on average, and the variance of
 their places across the view is w^2 / 12. A rock is narrower towards its top, so its widest row would place its middle
-too far: the variance over all points tells how wide their rows are. Rocks are no circles: their outlines are taken to
-be longer or shorter in the other direction by a share of the width, which gives most of the covariance. And what the
-rows meet may be little more than the top, so that a rock may be wider on the ground by about the distance of two rows.
+too far: the width of the rows is computed from the variance over all points. Rocks are not circular: along the view,
+they are assumed to be longer or shorter by a share of the width, which gives most of the covariance. The rows may meet
+little more than the top, so that a rock may be wider on the ground by about the distance of two rows.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RockDetector(ScanDetector):
-    """A detector of rocks has these settings, and those of `ScanDetector`: the angles must be those of the scanner.
+    """Settings of the detector of rocks, beside those of `ScanDetector`.
 
     Attributes:
-        least_height: How far a point must be over the ground to belong to a rock, in m; more than waves of the ground
+        least_height: The least height over the ground of a point of a rock, in m; more than that of waves of the ground
             that are too short for `fit_ground` to follow.
-        least_roundness: How much of the roundness of a circle its outline must have on the visible side.
+        least_roundness: The least bulge of the visible outline, as a share of that of a circle of the same width.
         least_width: The least width of a rock in m.
         largest_width: The largest width of a rock in m.
         least_points: The least number of points of a rock.
-        cell: Edge length in m of the cells in which points are gathered; two rocks closer than this become one.
+        cell: Edge length in m of the cells into which points are sorted; two rocks closer than this become one.
         elongation: Standard deviation of the diameters of a rock's outline, as a share of their mean.
 
     Raises:
-        ValueError: A value that no detector can have.
+        ValueError: A setting is outside of its range.
     """
 
     least_height: float = 0.06
@@ -69,8 +69,8 @@ def detect_rocks(points_H: ArrayLike, detector: RockDetector, *, p_HoLo_H: Array
 
     Args:
         points_H: The points in the level frame H of the carrier, de-skewed, shape (n, 3) in m, in any order.
-        detector: How rocks are found.
-        p_HoLo_H: Where the scanner was at the time of H, shape (3,) in m.
+        detector: The settings.
+        p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
 
     Returns:
         The rocks in H: the middles of their outlines, and their widths as diameters.

@@ -1,4 +1,4 @@
-"""Detectors of landmarks see a scan as points by direction and distance, and as clusters of them."""
+"""The points of a scan as detectors of landmarks use them: by direction and distance, over the ground, in clusters."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from vtbdrake.components.settings import check_settings
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# The share of a cluster's rows that must end before something nearer if its edge counts as hidden.
+# An edge of a cluster is hidden if more than this share of its points are in rows that end at something nearer.
 _HIDDEN = 0.25
 
-# Points less than this distance from the fitted ground lie on it, in m, and the share of such points that a scan of
-# ground has: in scans of simulated forests it is at least 0.2, in mirrored ones less than 0.1 [calibrated].
+# Points within this distance (m) of the fitted ground lie on it. A scan shows the ground if more than this share of its
+# points lie on it: at least 0.2 do in scans of simulated forests, less than 0.1 in mirrored ones [calibrated].
 _ON_GROUND, _GROUND_SHARE = 0.2, 0.15
 
 
 @dataclass(frozen=True)
 class ScanDetector:
-    """All detectors of landmarks in scans have these settings.
+    """Settings that all detectors of landmarks in scans have; angles and noise must be those of the scanner.
 
     Attributes:
         azimuth_step: Angle between neighbouring rays of a row of the scanner in rad.
-        elevation_step: Angle between its neighbouring rows in rad.
-        range_noise: Standard deviation of its ranges in m.
-        reach: Distance in m from the scanner up to which landmarks are looked for.
+        elevation_step: Angle between neighbouring rows of the scanner in rad.
+        range_noise: Standard deviation of the ranges in m.
+        reach: The largest distance in m from the scanner at which landmarks are searched for.
         ground_height: The z in H of the ground under the scanner in m: 0 if the origin of B is on the ground.
-        cell: Edge length in m of the cells in which points are gathered.
+        cell: Edge length in m of the cells into which points are sorted.
 
     Raises:
-        ValueError: A value that no detector can have.
+        ValueError: A setting is outside of its range.
     """
 
     azimuth_step: float = 2.0 * pi / 1250
@@ -81,14 +81,14 @@ class Scene:
     def of(cls, points_H: ArrayLike, p_HoLo_H: ArrayLike, detector: ScanDetector) -> Scene:
         """Return the points within the reach of a detector, as the scanner sees them.
 
-        Of a scan that shows the ground above the scanner there are none: its elevations have the wrong sign, as those
-        of a scanner that hangs upside down and is not told so. Its trunks could be matched, but what levels the scan
-        would displace them.
+        If a scan shows the ground above the scanner, the scene is empty: the elevations have the wrong sign, as when
+        the scanner is mounted upside down and its pose on the carrier says otherwise. Its trunks could be matched, but
+        levelling would turn such a scan the wrong way, and displace them.
 
         Args:
             points_H: The points in the level frame H of the carrier in m, shape (n, 3).
-            p_HoLo_H: Where the scanner is, shape (3,) in m.
-            detector: The reach, and the height of the ground beneath the scanner.
+            p_HoLo_H: The position of the scanner, shape (3,) in m.
+            detector: The settings, for the reach and for the height of the ground beneath the scanner.
 
         Raises:
             ValueError: The points or the place of the scanner have another shape, or are not finite.
@@ -133,7 +133,7 @@ class Cells:
 
     Attributes:
         flat: The cell of each point, (n,), numbered by x and y.
-        side: How many cells there are along each axis; those at the border are empty.
+        side: The number of cells along each axis; those at the border are empty.
     """
 
     flat: Indices
@@ -216,8 +216,8 @@ class Clusters:
         """Return whether something nearer begins where a cluster ends, to the right and to the left, (k, 2).
 
         Args:
-            detector: The angles between rays.
-            gap: By how much it is nearer than the points of the cluster, in m.
+            detector: The settings, for the angles between rays.
+            gap: The least distance in m between the points of the cluster and something nearer in front of them.
         """
         azimuth_step, elevation_step = detector.azimuth_step, detector.elevation_step
         columns, lowest = max(round(2.0 * pi / azimuth_step), 1), self.scene.slopes.min()

@@ -1,13 +1,13 @@
-"""Trunks of trees from the disparities of a pair of cameras: where their axes stand, and how thick they are.
+"""Trunks of trees from the disparities of a pair of cameras: the positions of their axes, and their diameters.
 
 All pixels of a trunk have about the same disparity, and lie above each other. So pixels are counted by column and
 disparity, as a level camera at the same place would see them: a cell with enough of them, one above the other, belongs
 to an upright object. Neighbouring cells are one trunk, whose columns give its direction and its width, and whose mean
-disparity gives its distance. In this space the errors are the same near and far, which they are not in that of the
-points. Ground, which is spread over many disparities, and twigs fall out without being modelled.
+disparity gives its distance. In columns and disparities the errors are the same near and far, unlike those of points.
+Ground, which is spread over many disparities, and twigs need no model: their cells have too few pixels.
 
-The disparities of one trunk do not err independently: the errors of its distance do not vanish with the number of
-pixels. The deviations that the detector states are calibrated, see `StereoTrunkDetector`.
+The errors of the disparities of one trunk are correlated: that of its distance does not vanish with the number of
+pixels. The standard deviations in `StereoTrunkDetector` are calibrated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 _CELLS = 2
 # Empty cells on either side of all disparities.
 _MARGIN = 2
-# How many columns beside a trunk are looked at.
+# The number of columns on either side of a trunk that belong to its profile.
 _BESIDE = 2
 # The face of a cylinder lies before its axis by pi / 4 of its radius, as a mean over the columns that show it.
 _FACE = pi / 4.0
@@ -38,23 +38,23 @@ _FACE = pi / 4.0
 
 @dataclass(frozen=True)
 class StereoTrunkDetector:
-    """How trunks are found in disparities.
+    """Settings of the detector of trunks in disparities.
 
     Attributes:
-        heights: The lower and the upper end of the slice that is looked at, in m above the camera.
+        heights: The lower and the upper end of the slice that is searched, in m above the camera.
         extent: The least height in m of the part of an object that is seen within the slice.
-        reach: Distance in m up to which trunks are looked for.
+        reach: The largest distance in m at which trunks are searched for.
         least_diameter: The least diameter of a trunk in m.
-        largest_diameter: Its largest diameter in m.
+        largest_diameter: The largest diameter of a trunk in m.
         disparity_deviation: Standard deviation of the mean disparity of a trunk, in pixels.
-        disparity_bias: What all disparities may be wrong by in common, in pixels: cameras are never quite aligned.
+        disparity_bias: Standard deviation of the common error of all disparities, in pixels: cameras are misaligned.
         middle_deviation: Standard deviation of the column of the middle of a trunk, in pixels.
-        width_deviation: Standard deviation of its width, in pixels.
-        fattening: By how much trunks seem too wide, in pixels: matching spreads what is near.
-        floor: Standard deviation in m, per axis, that nothing improves: trunks are neither round nor upright.
+        width_deviation: Standard deviation of the width of a trunk, in pixels.
+        fattening: Number of pixels by which trunks appear too wide, as matching widens near objects.
+        floor: Standard deviation in m added to positions, per axis, and diameters: trunks are not round, nor upright.
 
     Raises:
-        ValueError: A value that no detector can have.
+        ValueError: A setting is outside of its range.
     """
 
     heights: tuple[float, float] = (-1.3, 1.5)
@@ -95,12 +95,11 @@ def detect_stereo_trunks(
     Args:
         disparity: The disparity of each pixel of the left image, (h, w), NaN where it is unknown.
         camera: The pair of cameras.
-        detector: How trunks are found.
+        detector: The settings.
         X_HC: The pose of the left camera in the level frame H of the carrier. Its optical axis is about horizontal.
 
     Returns:
-        The trunks in H, with the deviations that the detector states. Of a trunk that is partly hidden, the diameter is
-        not known.
+        The trunks in H, with the deviations of the settings. The diameter of a partly hidden trunk is unknown.
     """
     ahead, right, heading = _level(disparity, camera, detector, X_HC)
     if not len(ahead):
@@ -212,7 +211,7 @@ def _landmarks(
     disparity_deviation = np.hypot(detector.disparity_deviation, detector.disparity_bias)
     range_variance = camera.depth_deviation(distance, disparity_deviation=disparity_deviation) ** 2
     pixel = distance / camera.focal_length
-    # The hidden part of a trunk is between nothing and another half of it.
+    # A hidden part displaces the middle by up to half of the diameter.
     cross_variance = (detector.middle_deviation * pixel) ** 2 + np.where(is_whole, 0.0, (0.5 * diameter) ** 2)
     covariances = detector.floor**2 * np.eye(2) + sum(
         variance[:, None, None] * axis[:, :, None] * axis[:, None, :]

@@ -1,4 +1,4 @@
-"""The local map: landmarks gathered along the odometry, as a carrier without a pose sees its surroundings."""
+"""The local map of a carrier without a pose: landmarks that are gathered along the odometry."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ Array = NDArray[np.float64]
 # The share of right pairs that the gate of the association lets pass.
 _GATE = 0.997
 
-# Standard deviation in m that is added to that of each position, per axis: a trunk is no point.
+# Standard deviation in m that is added to that of each position, per axis: a trunk is not a point.
 _LEAST_DEVIATION = 0.02
 
-# What was in view so often is a landmark only if it was seen twice at least.
+# What was in view of at least so many scans is a landmark only if it was detected at least twice.
 _CHANCES = 3
 
-# Beyond this share of the farthest detection, landmarks come and go.
+# A place is in view up to this share of the distance of the farthest detection: beyond, detections are unreliable.
 _IN_VIEW = 0.7
 
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """Landmarks seen so far, relative to the carrier. Immutable, with read-only arrays.
+    """Landmarks detected so far, relative to the carrier. Immutable, with read-only arrays.
 
-    The covariances are those of the positions relative to the present carrier: they grow with each motion by its
-    covariance, also by the lever arm of the heading. What neighbours have in common of it is not kept.
+    The covariances are those of the positions relative to the present carrier: they grow with the covariance of each
+    motion, including that of the heading times the lever arm. Correlations between landmarks are not kept.
 
     Attributes:
-        X_OH: The carrier in the frame of the odometry, shape (3,) in m and rad.
+        X_OH: The pose of the carrier in the odometry frame, shape (3,) in m and rad.
         distance: The distance travelled in m.
-        positions: In O, shape (n, 2) in m.
-        covariances: In the axes of O, shape (n, 2, 2) in m^2.
-        diameters: Shape (n,) in m.
-        diameter_deviations: Shape (n,) in m.
-        seen: How often each was seen, shape (n,).
-        chances: How many scans had it in view, shape (n,).
-        last: The distance travelled when it was seen last, shape (n,) in m.
+        positions: Positions in O, shape (n, 2) in m.
+        covariances: Covariances of the positions in the axes of O, shape (n, 2, 2) in m^2.
+        diameters: Diameters, shape (n,) in m.
+        diameter_deviations: Standard deviations of the diameters, shape (n,) in m.
+        seen: The number of scans in which each landmark was detected, shape (n,).
+        chances: The number of scans that had each landmark in view, shape (n,).
+        last: The distance travelled at the last detection of each landmark, shape (n,) in m.
     """
 
     X_OH: Array
@@ -79,9 +79,9 @@ class Submap:
         """Return the map after a motion.
 
         Args:
-            X_OH: The pose afterwards, shape (3,).
-            covariance: Of the motion, in the axes of H before, shape (3, 3).
-            length: Landmarks that were last seen longer ago than this distance travelled, in m, are dropped.
+            X_OH: The pose after the motion, shape (3,).
+            covariance: The covariance of the motion, in the axes of H before it, shape (3, 3).
+            length: The distance travelled since its last detection, in m, after which a landmark is dropped.
         """
         pose = np.asarray(X_OH, dtype=float)
         C_O = np.array(covariance, dtype=float)
@@ -96,7 +96,7 @@ class Submap:
         return replace(self, X_OH=pose, distance=distance, covariances=grown)._select(distance - self.last <= length)
 
     def with_scan(self, landmarks: Landmarks) -> Submap:
-        """Return the map with what is detected at its pose, in H: merged with what is known, or new."""
+        """Return the map after a scan at its pose: detections, in H, are merged with known landmarks, or added."""
         if not len(landmarks):
             return self
         scan = landmarks.seen_from(self.X_OH)

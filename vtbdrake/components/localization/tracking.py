@@ -1,36 +1,36 @@
 """Tracking of a carrier among landmarks of a map, from a first pose on: simultaneous localization and map refinement.
 
 The state x = [X_WH; b; e; g; l_1; ...; l_n] holds the planar pose of the carrier, the range bias b of the detector,
-two errors of dead reckoning that last, and the true positions l_i (in W) of those landmarks of the map that have
-been seen. Each of them enters once, with its place in the map and the map's own error as the prior; from then on it is
-refined by detections, and correlated with the pose. A filter that takes the map's error afresh from every scan would
-become overconfident, because that error is the same in every scan. A detection z of landmark l in the level frame H is
+two lasting errors e and g of dead reckoning, and the true positions l_i (in W) of those landmarks of the map that have
+been seen. Each landmark enters the state once, with its position on the map and the error of the map as the prior; from
+then on it is refined by detections, and correlated with the pose. A filter that takes the map's error as independent in
+each scan would become overconfident, because it is the same error. A detection z of landmark l in the level frame H is
 
     z = d + b (d - s) / |d - s| + noise,    d = R_WHᵀ (l - p_WoHo_W),    s = p_HoLo_H,
 
-where s is the place of the scanner. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous localization
-and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
+where s is the position of the scanner. This is EKF-SLAM with a map (Durrant-Whyte and Bailey, "Simultaneous
+localization and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006). Landmarks far behind are marginalized.
 
-A plain extended Kalman filter becomes too sure of its heading. Scans show the places of landmarks relative to the
-carrier, and therefore nothing of a common turn of both; but derivatives at estimates that change from scan to scan do
-not agree on what such a turn is (Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent
-EKF SLAM estimators", International Journal of Robotics Research 29, 2010). So the errors here are those of the
+The heading of a plain extended Kalman filter becomes overconfident. Scans show the positions of landmarks relative to
+the carrier, so that a common rotation of both is not observable; but with derivatives at estimates that change from
+scan to scan, it seems to be (Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF
+SLAM estimators", International Journal of Robotics Research 29, 2010). Therefore the errors here are those of the
 right-invariant filter (Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", arXiv:1510.06263,
-2015): an error θ of the heading displaces the carrier and each landmark, at a point p, by θ J p, where J turns by a
-right angle.
+2015): an error θ of the heading displaces the carrier and each landmark, at a point p, by θ J p, where J is the
+rotation by a right angle.
 
-Dead reckoning tells a motion [t; turn] in the time T. Its share e is too far, and its gyros turn too fast by g:
+Dead reckoning measures a motion [t; turn] in the time T. It is too long by its share e, and its gyros have the bias g:
 
     true motion = [(1 - e) R(-g T / 2) t; turn - g T] + noise.
 
-e changes with the way as slopes do, on which wheels slip (a first-order Gauss-Markov process), g slowly with time (a
-random walk). Noise alone, independent from step to step, would be too small after a minute without landmarks. While
-landmarks are seen, e and g are learned.
+e is a first-order Gauss-Markov process over the distance travelled, because the slip of wheels depends on the slope; g
+is a random walk in time. Noise alone, independent from step to step, would be too small after a minute without
+landmarks. e and g are estimated while landmarks are seen.
 
 Errors of a map may be correlated: neighbours are displaced alike. With K_ij = c σ_i σ_j exp(-r_ij² / (2 L²)) +
 (1 - c) σ_i² δ_ij for the errors of the landmarks, per axis, the prior of a landmark that is seen for the first time is
-its distribution given the errors of those in the state (simple kriging). So displacements that the state has learned
-are expected of new landmarks, too.
+its distribution given the errors of those in the state (simple kriging). So a new landmark is expected to be displaced
+like its neighbours.
 """
 
 from __future__ import annotations
@@ -53,35 +53,36 @@ from vtbdrake.components.world_model.association import chi_square_quantile
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Where b, e and g are in x, up to where it says what is seen of a landmark, and from where on it has landmarks.
+# Indices of b, e and g in x; the number of leading elements on which a detection depends; the index of the first
+# landmark.
 _BIAS, _ODOMETRY, _RATE = 3, 4, 5
 _SEEN, _FIXED = 4, 6
 
-# Standard deviations in m and rad of a pose of which nothing is to be known.
+# Standard deviations in m and rad of a pose without information.
 _LOOSE = np.array([5.0, 5.0, 0.2])
 
 # Hypotheses that are tried in the association of a scan.
 _HYPOTHESES = 40
 
-# What competes with a first match: the density of all detections times the odds that a detection is of something that
-# the map does not show. Assumed, on the safe side for a map that lacks a third of the trees. A first match is one from
-# this probability on.
+# The density that competes with a first match is that of all detections times the odds that a detection shows something
+# that is not on the map: assumed, on the safe side for a map that lacks a third of the trees. The second number is the
+# least probability of a first match.
 _OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
 _FIRST_GATE = 0.95
 
-# An innovation of a diameter counts no more than that of three deviations: trunks are no cylinders.
+# The largest squared innovation of a diameter, that of three deviations: trunks are not cylinders.
 _DIAMETER_CAP = 9.0
 
-# A diameter with a larger deviation, in m, is not known.
+# Larger standard deviations of a diameter, in m, are cut to this one: the diameter is unknown.
 _NO_DIAMETER = 10.0
 
-# Shares of what is expected under which a scan is taken not to show the place where the carrier is believed to be.
+# A scan fails if it matches a smaller share of its detections, or of the landmarks that should be seen again.
 _LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
 
-# Detections, or landmarks to be seen again, from which on that is judged.
+# The least number of detections, or of landmarks that should be seen again, for this test.
 _JUDGED_FROM = 6
 
-# With a larger standard deviation of the heading in rad, the track is lost: derivatives are those of small errors.
+# With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
 _LARGEST_TURN = 0.2
 
 # The share of first matches that are assumed to be by chance although the pose is right.
@@ -95,10 +96,10 @@ class TrackState:
     Attributes:
         mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
         covariance: Its covariance, shape (6 + 2 n, 6 + 2 n).
-        indices: Which landmarks of the map are in x, shape (n,).
-        is_recent: Which of them the last scan that was fused showed, shape (n,).
-        evidence: How well first matches agree with the map, see `Tracker`.
-        failures: Scans in succession that did not show the place.
+        indices: Indices on the map of the landmarks in x, shape (n,).
+        is_recent: Whether each of them was seen in the last scan that was fused, shape (n,).
+        evidence: Cumulative log-likelihood ratio of first matches, see `Tracker`.
+        failures: The number of scans in succession that failed, see `Tracker`.
     """
 
     mean: Array
@@ -147,16 +148,16 @@ class TrackState:
 
     @property
     def range_bias(self) -> float:
-        """How much too far the detector sees landmarks, in m."""
+        """The estimated range bias b of the detector in m."""
         return float(self.mean[_BIAS])
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """What a scan had in common with the map.
+    """The matches of a scan with the map.
 
     Attributes:
-        pairs: Detection and landmark of the map, by index, shape (k, 2).
+        pairs: Indices of the detection and of the landmark on the map, shape (k, 2).
         nis: The normalized innovation squared of the pairs: chi-square distributed with 2 k degrees of freedom.
         is_fused: Whether the scan changed the estimate.
     """
@@ -191,46 +192,47 @@ class Tracker:
     Association: pairs of detection and landmark within a gate on the Mahalanobis distance are hypotheses. The one that
     agrees with most others, after the state has been conditioned on it, decides which pairs are possible; the best
     one-to-one assignment among them is taken, and its worst pairs are dropped until the joint innovation is
-    probable. Diameters count in the assignment. A landmark that is seen for the first time may be another one, or none:
-    its match has the probability p of its density among those of its rivals, and of all that the map does not show. It
-    must be at least 0.8, and the prior covariance of the landmark (given its neighbours) is divided by p².
+    probable. Diameters count in the assignment. The first match of a landmark, which is not in the state yet, may be
+    wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs that exclude
+    it, and of what the map does not show. It must be at least 0.8, and the prior covariance of the landmark (given its
+    neighbours) is divided by p².
 
-    Health: a scan fails if too few of its detections match, or too few of the landmarks that the last one showed. It is
-    not fused. The track is lost after ``patience`` failures in succession, when the position is uncertain by more
-    than ``largest_deviation`` or the heading by more than 0.2 rad, or when first matches of landmarks speak against
-    the pose: the d² of a right match is chi-square distributed, that of a match by chance is uniform within the gate
-    (of 0.95 for first matches). The logarithm of this ratio is summed up to at most ``credit``; below 0, the track is
+    Health: a scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
+    last fused scan showed. The track is lost after ``patience`` failures in succession, when the position is uncertain
+    by more than ``largest_deviation`` or the heading by more than 0.2 rad, or when first matches contradict the pose:
+    the d² of a right match is chi-square distributed, that of a match by chance is uniform within the gate (of 0.95 for
+    first matches). The log-likelihood ratio of right matches is summed up to at most ``credit``; below 0, the track is
     lost (the cumulative sum of Page, Biometrika 41, 1954).
 
     Landmarks that were marginalized enter anew if the carrier comes back, and their map error is then used twice:
-    ``horizon`` and ``most`` must be so large that a closed route is in the state as a whole. Landmarks of which the map
-    is less certain than ``largest_deviation`` are left out.
+    ``horizon`` and ``most`` must be so large that the state holds the landmarks of a whole closed route. Landmarks of
+    which the map is less certain than ``largest_deviation`` are not used.
 
     Attributes:
         landmarks: The map, in W.
-        sensor: s = p_HoLo_H in the plane, in m.
-        field_of_view: The angle in rad in which the detector sees landmarks: how dense its detections are.
+        sensor: The position s = p_HoLo_H of the scanner in the plane, in m.
+        field_of_view: The horizontal field of view in rad, for the density of detections.
         bias_deviation: Standard deviation of the range bias, in m; assumed.
-        odometry_deviation: Standard deviation of e, by which share odometry tells too far; assumed.
-        odometry_length: The way in m on which e loses two thirds of its correlation; assumed.
-        rate_deviation: Standard deviation of g, the bias that dead reckoning leaves of its gyros, in rad/s; assumed.
-        rate_walk: By how much g changes, in rad/s per root second; assumed.
+        odometry_deviation: Standard deviation of e; assumed.
+        odometry_length: The distance in m over which e loses two thirds of its correlation; assumed.
+        rate_deviation: Standard deviation of g, the residual bias of the gyros in dead reckoning, in rad/s; assumed.
+        rate_walk: Random walk of g in rad/s per root second; assumed.
         least_deviation: Standard deviation in m that is added to those of detections, per axis; calibrated with
             simulated scans of `vtbdrake_diagrams.forest` and an exact map.
-        scan_deviation: Standard deviation in m, per axis, by which all detections of a scan are displaced together;
+        scan_deviation: Standard deviation in m, per axis, of the common displacement of all detections of a scan;
             assumed.
-        correlation: L in m, 0 if the map's errors are independent.
-        correlated_share: c, of the variance; assumed.
+        correlation: Correlation length L of the map's errors in m; 0 if they are independent.
+        correlated_share: The share c of the variance of the map that is correlated; assumed.
         gate: The share of right pairs that the gate lets pass.
         horizon: Distance from the carrier in m beyond which landmarks are marginalized.
         most: The largest number of landmarks in the state; the farthest are marginalized.
-        patience: Failures in succession until the track is lost.
-        credit: The largest evidence.
-        first_credit: The evidence at the start: a wrong start ends sooner.
-        largest_deviation: Of the position per axis, in m, until the track is lost.
+        patience: The number of failures in succession after which the track is lost.
+        credit: The upper limit of the evidence.
+        first_credit: The evidence at the start; it is less than ``credit``, so that a wrong start ends sooner.
+        largest_deviation: The largest standard deviation of the position in m, per axis, with which a track goes on.
 
     Raises:
-        ValueError: The map is empty, or a value that no tracker can have.
+        ValueError: The map is empty, or a setting is outside of its range.
     """
 
     landmarks: Landmarks
@@ -288,7 +290,7 @@ class Tracker:
             )
         object.__setattr__(self, "_usable", usable)
         object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions[usable]))
-        # Of a detection beside that of the pose: of each landmark of the map, the bias and the scan.
+        # Variances of a predicted detection, apart from that of the pose: of the landmark, of the bias and of the scan.
         deviations = (self.bias_deviation, self.least_deviation, self.scan_deviation)
         object.__setattr__(self, "_variances", variances[usable] + float(np.sum(np.square(deviations))))
 
@@ -297,12 +299,12 @@ class Tracker:
     ) -> tuple[TrackState, Matches]:
         """Return the state at a first pose, and the matches of what is seen there.
 
-        With landmarks, the pose is taken to come from the same map. Its errors must not be used twice: the covariance
-        serves to associate, and the estimate then has its information from the matched pairs alone.
+        With landmarks, the pose is assumed to come from the same map, whose errors must not be used twice: the
+        covariance serves for the association only, and the estimate is computed from the matched pairs alone.
 
         Args:
             X_WH: The pose, shape (3,).
-            covariance: Its covariance, shape (3, 3).
+            covariance: The covariance of the pose, shape (3, 3).
             landmarks: Detections in H at that pose; None starts with the given covariance.
         """
         pose = np.array(X_WH, dtype=float)
@@ -320,13 +322,13 @@ class Tracker:
             state: The state before.
             motion: The pose of the carrier afterwards in its frame before, by dead reckoning, shape (3,).
             covariance: The covariance of its noise, shape (3, 3).
-            duration: How long it took, in s.
+            duration: The duration of the motion in s.
         """
-        told = np.asarray(motion, dtype=float)
+        measured = np.asarray(motion, dtype=float)
         mean, P, heading = state.mean.copy(), state.covariance.copy(), state.mean[2]
         turned = mean[_RATE] * duration
-        way = rotation(-turned / 2.0) @ told[:2]
-        move = np.array([*((1.0 - mean[_ODOMETRY]) * way), told[2] - turned])
+        way = rotation(-turned / 2.0) @ measured[:2]
+        move = np.array([*((1.0 - mean[_ODOMETRY]) * way), measured[2] - turned])
         F, G = np.eye(3), block_diag(rotation(heading), 1.0)
         F[:2, 2] = rotation(heading + np.pi / 2.0) @ move[:2]
         aside = 0.5 * duration * move[:2]
@@ -337,7 +339,7 @@ class Tracker:
         P[:, :3] = P[:, :3] @ F.T + P[:, _ODOMETRY:_FIXED] @ B.T
         P[:3, :3] += G @ np.asarray(covariance, dtype=float) @ G.T
         P[_RATE, _RATE] += self.rate_walk**2 * duration
-        kept = float(np.exp(-np.hypot(*told[:2]) / self.odometry_length))
+        kept = float(np.exp(-np.hypot(*measured[:2]) / self.odometry_length))
         mean[_ODOMETRY] *= kept
         P[_ODOMETRY] *= kept
         P[:, _ODOMETRY] *= kept
@@ -363,14 +365,14 @@ class Tracker:
         new = found.select(~is_known)
         extended = self._extended(state, new.pairs[:, 1], new.probability)
         fused, matches = self._fused(extended, landmarks, np.vstack([found.pairs[is_known], new.pairs]))
-        # What is left of the pairs may be too few.
+        # Too few of the pairs may be left.
         if self._is_elsewhere(state, landmarks, matches.pairs):
             return failed, Matches(matches.pairs)
         evidence = min(self.credit, state.evidence + self._evidence(new.squares))
         return replace(fused, evidence=evidence, failures=0), matches
 
     def is_lost(self, state: TrackState) -> bool:
-        """Return whether the pose must not be believed any more."""
+        """Return whether the track is lost, so that its pose must not be used any more."""
         limits = np.array([self.largest_deviation, self.largest_deviation, _LARGEST_TURN])
         is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
         return state.failures >= self.patience or state.evidence < 0.0 or is_vague
@@ -387,8 +389,8 @@ class Tracker:
 
         Args:
             state: The state.
-            indices: Which landmarks.
-            probability: That they are the ones that are seen, (m,); by default 1.
+            indices: The indices of these landmarks on the map.
+            probability: The probabilities of their matches, (m,); by default 1.
         """
         places, variances = self.landmarks.positions, self.landmarks.covariances
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
@@ -401,7 +403,7 @@ class Tracker:
             weights = np.linalg.solve(K[:n, :n], K[:n, n:])
             rest = K[n:, n:] - K[n:, :n] @ weights
             if probability is not None:
-                # The part of its error that the other landmarks do not tell.
+                # The variance of the error of each landmark, given those of all others, times the factor.
                 rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(K))[n:])
             prior, J = np.kron(rest, np.eye(2)), np.kron(weights.T, np.eye(2))
             added = places[indices] + weights.T @ (mean[_FIXED:].reshape(-1, 2) - places[state.indices])
@@ -426,8 +428,8 @@ class Tracker:
         return K
 
     def _fused(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> tuple[TrackState, Matches]:
-        """Return the state with the matched detections, of landmarks that it has."""
-        # A pair that makes the whole improbable is no pair, but the landmark stays.
+        """Return the state after the fusion of matched detections, of landmarks in the state."""
+        # The worst pairs are dropped until the joint innovation is probable; their landmarks stay in the state.
         while len(pairs):
             rows = _rows_of(state.indices, pairs[:, 1])
             expected, H = self._expected(state, rows)
@@ -455,7 +457,7 @@ class Tracker:
         return landmarks.covariances + self.least_deviation**2 * np.eye(2)
 
     def _expected(self, state: TrackState, rows: Indices) -> tuple[Array, Array]:
-        """Return where landmarks of the state are to be seen in H, (m, 2), and the derivatives (m, 2, 6).
+        """Return the expected detections of landmarks of the state in H, (m, 2), and the derivatives (m, 2, 6).
 
         The derivatives are those with respect to the pose, the bias, and the landmark itself.
         """
@@ -535,24 +537,24 @@ class Tracker:
         own = np.minimum(self.landmarks.diameter_deviations[indices], _NO_DIAMETER) ** 2 + noise
         other = all_diameters.var() + noise
         ratio = (measured - all_diameters[indices]) ** 2 / own + np.log(own / other)
-        # A diameter that is known no better than those of all says nothing.
+        # A diameter that is known no better than those of all carries no information.
         cost = np.where(own < other, ratio - (measured - all_diameters.mean()) ** 2 / other, 0.0)
         return np.minimum(cost, _DIAMETER_CAP)
 
     # -- health
 
     def _is_elsewhere(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> bool:
-        """Return whether a scan with these pairs of detection and landmark does not show the place."""
+        """Return whether a scan with these pairs of detection and landmark fails, see `Tracker`."""
         matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
         recent = state.mean[_FIXED:].reshape(-1, 2)[state.is_recent]
-        # At the edge of what is seen, landmarks come and go.
+        # Near the largest distance of detections, landmarks are not seen reliably.
         reach = 0.7 * np.hypot(*landmarks.positions.T).max()
         expected = int((np.hypot(*(recent - state.mean[:2]).T) < reach).sum())
         few = len(landmarks) >= _JUDGED_FROM and matched < _LEAST_SHARE * len(landmarks)
         return few or (expected >= _JUDGED_FROM and again < _LEAST_AGAIN * expected)
 
     def _evidence(self, squares: Array) -> float:
-        """Return the log-likelihood ratio of d² (k,) of first matches, right against by chance."""
+        """Return the log-likelihood ratio of first matches, right against by chance, from their d² (k,)."""
         ratio = 0.5 * chi_square_quantile(_FIRST_GATE, 2) * np.exp(-0.5 * squares)
         return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
 
@@ -560,7 +562,7 @@ class Tracker:
 def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> tuple[Array, Array]:
     """Return the d² (k,) of pairs after conditioning on the one with which most others agree.
 
-    Also returned are the determinants, (k,) in m^4, of the covariances that remain; of that pair, all remains.
+    Also returned are the determinants, (k,) in m^4, of the conditional covariances; that pair keeps its own.
 
     Args:
         i: The detections of the pairs, (k,).
@@ -568,7 +570,7 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
         nu: Their innovations, (k, 2).
         S: The covariances of those, (k, 2, 2).
         joint: The covariances of all expected detections with each other, (m, m, 2, 2).
-        threshold: Up to which d² pairs agree.
+        threshold: The largest d² of pairs that agree.
     """
     chosen = np.unique(np.linspace(0, len(i) - 1, _HYPOTHESES).astype(int))
     C = joint[j[:, None], j[chosen]]

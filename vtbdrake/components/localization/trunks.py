@@ -1,7 +1,7 @@
-"""Trunks of trees from the points of one scan: where their axes stand, and how thick they are.
+"""Trunks of trees from the points of one scan: the positions of their axes, and their diameters.
 
-A trunk is what stands above one place in most of the rows of rays that pass there, within a slice of heights over the
-ground, is as wide as a trunk, and has a surface as smooth as a cylinder's. Each is fitted as a cylinder with a lean:
+A trunk is an object that returns most of the rows of rays that pass its place within a slice of heights over the
+ground, is as wide as a trunk, and has a surface as smooth as that of a cylinder. It is fitted as a leaning cylinder:
 horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0) with z0 at
 breast height.
 
@@ -10,13 +10,13 @@ to the left of it, meets a circle with the centre c at the horizontal distance
 
     c·e - r cos i,    cos i = sqrt(1 - (c·n / r)²)
 
-under the angle i of incidence. Circles that are fitted to points by algebra come out too small, because the errors are
-not normal to the circle. So does the most likely circle, though less, because the distance is far from linear in r
-where rays graze the trunk: so ranges are weighted by cos² i. Beyond some metres the angular width says more of r. The
-azimuths of rays in steps s that hit a trunk are spread evenly over its angular width w, so w² = 12 var + s², and each
-of its edges is known to s / sqrt(12). The directions of both edges are measurements, asin(r / |c|) to either side of
-the axis, if no nearer object hides them. The lean l has a normal prior, and the slope of the azimuths over the heights
-for a measurement beside the ranges. Covariances are those of the weighted least squares, plus floors.
+under the angle i of incidence. Algebraic fits of circles to points give too small radii, because the errors are not
+normal to the circle. So does the most likely circle, though less, because the distance is far from linear in r where
+rays graze the trunk; therefore ranges are weighted by cos² i. Beyond some metres, the angular width tells more about r.
+The azimuths of rays in steps s that hit a trunk are spread evenly over its angular width w, so w² = 12 var + s², and
+each of its edges is known to s / sqrt(12). The directions of both edges are measurements, asin(r / |c|) to either side
+of the axis, if no nearer object hides them. The lean l has a normal prior; beside the ranges, the slope of the azimuths
+over the heights measures it. Covariances are those of the weighted least squares, plus floors.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ _LAYERS = 8
 _ITERATIONS = (3, 4)
 # A point lies on a trunk if the error of its range is at most so many standard deviations.
 _GATE = 4.0
-# The distance from the axis, as a share of r, up to which the range of a ray that hits a trunk is predicted as it is.
+# The largest sine of the angle of incidence with which ranges are predicted.
 _GRAZING = 0.98
-# The gate of a range is that of its noise and of an error with this standard deviation, as a share of r.
+# The gate of a range contains its noise and an error of the model with this standard deviation, as a share of r.
 _DEPTH = 0.2
-# The share of the most hits of any column of rays that a column must have: branches beside a trunk are hit in few rows.
+# A column of rays counts if it has at least this share of the hits of the fullest one: branches are hit in few rows.
 _PERSISTENCE = 0.35
-# An edge that is off by more standard deviations than this counts less and less: it may be a branch.
+# The more the error of an edge exceeds this number of standard deviations, the less it counts: it may be a branch.
 _DOUBT = 4.0
-# Information in 1/m^2 that says nothing, but makes matrices regular where no point is left.
+# A negligible information in 1/m^2, which keeps matrices regular where no point is left.
 _NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
 class TrunkDetector(ScanDetector):
-    """A detector of trunks has these settings, and those of `ScanDetector`: the angles must be those of the scanner.
+    """Settings of the detector of trunks, beside those of `ScanDetector`.
 
-    Trunks whose bark is less than two cells apart are one object, which is mostly refused.
+    Trunks whose bark is less than two cells apart become one object, which is mostly rejected.
 
     Attributes:
         roughness: Standard deviation of the surface of a trunk from a cylinder in m: bark, ovality.
@@ -65,17 +65,17 @@ class TrunkDetector(ScanDetector):
         reference_height: Height over the ground in m of the point of the axis that is the position of the landmark.
         least_diameter: The least diameter of a trunk in m.
         largest_diameter: The largest diameter of a trunk in m.
-        upright_share: The share of the rows passing a place that must be returned from there.
-        typical_diameter: Mean in m of the diameters to be expected before anything is measured.
-        diameter_spread: Standard deviation in m of these diameters.
-        lean: Standard deviation of the lean in rad, per axis, before anything is measured.
+        upright_share: The least share of the rows of rays passing a place that a trunk there returns.
+        typical_diameter: Mean of the prior of the diameters in m.
+        diameter_spread: Standard deviation of the prior of the diameters in m.
+        lean: Standard deviation of the prior of the lean in rad, per axis.
         largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
-        position_floor: Standard deviation in m, per axis, that no fit improves: the axis is not straight, and the foot
-            of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad below breast height.
-        diameter_floor: Standard deviation in m of the diameter that no fit improves: taper, ovality.
+        position_floor: Standard deviation in m, per axis, that is added to that of the fit: the axis is not straight,
+            and the foot of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad.
+        diameter_floor: Standard deviation in m that is added to that of the fitted diameter, for taper and ovality.
 
     Raises:
-        ValueError: A value that no detector can have.
+        ValueError: A setting is outside of its range.
     """
 
     roughness: float = 0.005
@@ -116,8 +116,8 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: Arr
 
     Args:
         points_H: The points in the level frame H of the carrier, de-skewed, shape (n, 3) in m, in any order.
-        detector: How trunks are found.
-        p_HoLo_H: Where the scanner was at the time of H, shape (3,) in m.
+        detector: The settings.
+        p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
 
     Returns:
         The trunks in H, each at its reference height, with the covariances of the fit and the floors.
@@ -165,7 +165,7 @@ class _Fit:
 
     def __init__(self, clusters: Clusters, detector: TrunkDetector) -> None:
         self._clusters, self._detector = clusters, detector
-        # Over the reference height.
+        # Heights over the reference height.
         self._heights = clusters.scene.heights[clusters.rows] - detector.reference_height
         self._variance = detector.range_noise**2 + detector.roughness**2
         self._cosines, self._sines = np.cos(clusters.azimuths), np.sin(clusters.azimuths)
@@ -186,7 +186,7 @@ class _Fit:
         diameters, covariances = 2.0 * cylinders[:, 2], self._covariances(cylinders, on)
         good = (count >= 3) & (count >= 0.5 * clusters.counts) & (misfit < detector.largest_misfit)
         good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
-        # Without enough points on it, a fit says where the trunk is no better than the cluster does.
+        # A fit to too few points locates the trunk no better than the cluster does.
         good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (0.5 * detector.largest_diameter) ** 2
         good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
         R = rotations(clusters.bearings[good])
@@ -222,7 +222,7 @@ class _Fit:
     def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
         """Return which points are on the cylinders (n,), and their weighted squared errors (n,).
 
-        A point is not where its range is wrong, or its direction: branches lie beside a trunk at the same distance.
+        A point on a cylinder agrees with it in range and direction: branches lie beside a trunk at the same distance.
         """
         errors, weights, _ = self._errors(cylinders)
         x, y, r, lx, ly = cylinders[self._clusters.owners].T
@@ -246,12 +246,12 @@ class _Fit:
         return errors, cosine**2 / self._variance, np.stack([dx, dy, -1.0 / cosine, dx * z, dy * z], axis=1)
 
     def _edges(self, lean: Array, distance: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array, Array]:
-        """Return what the azimuths of the points say of the k trunks.
+        """Return what the azimuths of the points measure of the k trunks.
 
         Args:
             lean: The leans of the trunks to the left in rad, (k,).
             distance: The distances of their axes in m, (k,).
-            on: The points that count, (n,).
+            on: Which points are used, (n,).
 
         Returns:
             The azimuth of the middle (rad), the angular width (rad), the mean height (m), the slope of the azimuth over
@@ -269,7 +269,7 @@ class _Fit:
         return mean_a, width, mean_z, za / zz, step / np.sqrt(24.0 * rows * zz)
 
     def _improved(self, cylinders: Array, on: NDArray[np.bool_]) -> Array:
-        """Return the cylinders after one step of Gauss and Newton."""
+        """Return the cylinders after one Gauss-Newton step."""
         errors, weights, derivatives = self._errors(cylinders)
         weighted = derivatives * (weights * on)[:, None]
         error, J, weight = self._constraints(cylinders, on)
@@ -293,10 +293,10 @@ class _Fit:
         return covariances
 
     def _constraints(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-        """Return errors (k, 7), derivatives (k, 7, 5) and weights (k, 7) of what is known beside the ranges.
+        """Return errors (k, 7), derivatives (k, 7, 5) and weights (k, 7) of all measurements and priors but the ranges.
 
-        That is the directions of both edges and the slope, where they are not hidden; that the axis is behind the
-        points; and what is expected of the radius and of the lean.
+        They are the directions of both edges and the slope, where these are not hidden, a weak prior that the axis is
+        behind the points, and the priors of the radius and of the lean.
         """
         detector = self._detector
         x, y, r, lx, ly = cylinders.T

@@ -1,7 +1,7 @@
-"""The localization unit: where a carrier is on a map of landmarks, from what it detects and its odometry.
+"""The localization unit: the pose of a carrier on a map of landmarks, from detections and odometry.
 
 Without a pose, it gathers a local map along the odometry and matches it with the map, without a guess. Once a match is
-sure, it tracks. When the tracker's health fails, it says so, and searches again with what it has seen since.
+sure, it tracks. When the track is lost, it reports this, and searches again with the landmarks detected from then on.
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ from vtbdrake.state.codecs import codec_of
 Array = NDArray[np.float64]
 
 SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
-"""A `Localization` says: no pose yet; a pose; no pose any more; or that the last scan does not show the place where the
-carrier should be. Searching goes on after a loss, too, and tracking while the pose is doubtful."""
+"""The values of `Localization.status`: no pose yet; a pose; the pose was lost, and the unit searches again; the last
+scan does not show the place where the carrier should be, and the tracker waits for the next one."""
 
-STATUS_NAMES = ("searching", "tracking", "lost", "doubtful")
-
-# A pose by odometry with a larger number, in m or rad, is a fault.
+# A pose by odometry with a number of this size or more, in m or rad, is a fault.
 _LARGEST = 1e9
 
 # The fewest matched detections with which a track begins.
@@ -39,7 +37,7 @@ _FEWEST = 4
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """Where the carrier is: what a `LocalizationUnit` answers to one scan.
+    """The answer of a `LocalizationUnit` to one scan: the pose of the carrier.
 
     Attributes:
         time: The time of the scan, in s; -inf before the first one.
@@ -48,7 +46,7 @@ class Localization:
         covariance: Its covariance in the order x, y, heading, shape (3, 3); infinite variances without a pose.
         status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`. Only with `TRACKING` is there a pose.
         detected: The number of detections.
-        matched: How many of them were fused. If none, the scan has not confirmed the pose: it is dead reckoning since.
+        matched: The number of detections that were fused. If 0, the scan has not confirmed the pose by dead reckoning.
         nis: Normalized innovation squared of the scan, of 2 ``matched`` degrees of freedom.
         range_bias: The estimated bias of detections along the ray, in m; 0 without a pose.
     """
@@ -73,7 +71,7 @@ class Localization:
     def unknown(
         cls, status: int = SEARCHING, *, time: float = -inf, X_OH: ArrayLike = (0.0, 0.0, 0.0), detected: int = 0
     ) -> Localization:
-        """Return the answer without a pose."""
+        """Return an answer without a pose."""
         return cls(time, np.asarray(X_OH), np.full(3, nan), np.diag(np.full(3, inf)), status, detected)
 
     def __deepcopy__(self, memo: object) -> Localization:
@@ -82,15 +80,15 @@ class Localization:
 
 @dataclass(frozen=True, eq=False)
 class UnitState:
-    """The memory of a `LocalizationUnit`, an immutable value; `UNIT_STATE_CODEC` makes arrays of it.
+    """The memory of a `LocalizationUnit`, an immutable value; `UNIT_STATE_CODEC` converts it to arrays.
 
     Attributes:
         answer: The last answer.
-        track: The state of the tracker; none while there is no pose.
-        submap: What was gathered since there is no pose; empty while there is one.
-        tried_at: Distance travelled in m and time in s of the last match without a guess, shape (2,).
-        ignored: Calls with a number that is not finite, or a time that was not after the last one.
-        losses: How often the track was lost.
+        track: The state of the tracker; `TrackState.none` without a pose.
+        submap: The landmarks gathered since the start or the last loss; empty while there is a pose.
+        tried_at: Distance travelled in m and time in s at the last attempt of global localization, shape (2,).
+        ignored: The number of calls that were ignored, see `LocalizationUnit.step`.
+        losses: The number of times that the track was lost.
     """
 
     answer: Localization = field(default_factory=Localization.unknown)
@@ -106,16 +104,16 @@ class UnitState:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationUnit:
-    """The unit for one map; a function of its arguments, without memory of its own.
+    """The localization unit for one map. It is immutable: `step` takes the memory, and returns the new one.
 
     Attributes:
-        locator: The map, prepared for matching without a guess.
+        locator: The map, prepared for global localization.
         tracker: The filter, with the same map.
-        drift: How the odometry drifts.
-        submap_length: Over how many metres landmarks are gathered.
-        try_every: Metres travelled or seconds, whichever comes first, between matches without a guess.
-        begins_with_submap: Whether tracking begins with all landmarks that were gathered, not with those of the last
-            scan: for sensors of which one sample shows too few for a pose. Their errors are then taken as independent.
+        drift: The drift of the odometry.
+        submap_length: The distance in m over which landmarks are gathered.
+        try_every: Distance (m) and time (s) between attempts of global localization, whichever comes first.
+        begins_with_submap: Whether tracking begins with all gathered landmarks instead of those of the last scan, for
+            sensors of which one sample shows too few for a pose. Their errors are then assumed to be independent.
 
     Raises:
         ValueError: The length of the submap is not positive, or a distance or time between matches is negative.
@@ -146,16 +144,16 @@ class LocalizationUnit:
         """Return the answer to a scan, and the memory after it.
 
         A call with a pose or a time that is not finite, a pose of 1e9 m or more, or a time that is not after the last
-        one, is ignored and counted. The answer is then the last one, which says for which time it holds.
+        one, is ignored and counted. It returns the last answer, with the time of that answer.
 
         Args:
             state: The memory before.
-            landmarks: What was detected, in H.
+            landmarks: The detected landmarks, in H.
             X_OH: The pose of the carrier by odometry at the time of the scan, shape (3,).
-            time: That time, in s.
+            time: The time of the scan, in s.
 
         Raises:
-            ValueError: X_OH is no array of 3 numbers.
+            ValueError: X_OH does not have the shape (3,).
         """
         pose = np.asarray(X_OH, dtype=float)
         if pose.shape != (3,):
@@ -185,7 +183,7 @@ class LocalizationUnit:
     def _searched(
         self, state: UnitState, landmarks: Landmarks, X_OH: Array, C: Array, time: float
     ) -> tuple[Localization, UnitState]:
-        """Return the answer and the memory after a scan without a pose before it."""
+        """Return the answer and the memory after a scan that follows an answer without a pose."""
         submap = state.submap.moved(X_OH, C, length=self.submap_length).with_scan(landmarks)
         none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
         state = replace(state, answer=none, submap=submap)
@@ -238,4 +236,4 @@ def _decode(arrays: Mapping[str, np.ndarray]) -> UnitState:
 
 
 UNIT_STATE_CODEC = Codec(_encode, _decode)
-"""How a `UnitState` becomes arrays, and back: for the ``codecs`` of a `SlowPart`."""
+"""The codec of a `UnitState`, for the ``codecs`` of a `SlowPart`."""

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Of two instants that are equal but for rounding, in s.
+# The largest difference in s of two instants that are equal but for rounding.
 _ROUNDING = 1e-9
 # The fields of an `ErrorModel` that ranges have.
 _ERRORS = ("noise", "outlier_probability", "outlier_size", "bias", "quantization", "dropout", "seed")
@@ -76,13 +76,13 @@ class LaserScannerConfig:
     divergence: float = 0.0
 
     def check(self, slice_period: float) -> None:
-        """Raise a ValueError if no scanner can scan like this.
+        """Check that all values are possible.
 
         Args:
             slice_period: Length of the scanner's slices, in s.
 
         Raises:
-            ValueError: A value that no scanner can have.
+            ValueError: A value is outside of its range.
         """
         most = 1.0 / slice_period + _ROUNDING
         checks = {
@@ -153,24 +153,25 @@ class LaserScanner(LeafSystem):
 
     ``scan`` is the last complete `Scan`, in the scanner's frame L (x forward, z up), stamped with the time of its end;
     before the first, an empty one, stamped 0. A scan has n rays at equal intervals of 1 / (n frequency), row by row
-    from the top, each row from the right, where rows and columns have about the same angular distance. With ``rows``
-    given, there are so many beams, which scan column by column from the right, each column from the top. L starts where
-    ``frame`` is on its body B; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of L in B, moves it.
+    from the top, each row from the right, where rows and columns have about the same angular distance. If ``rows`` is
+    not 0, it is the number of beams, which scan column by column from the right, each column from the top. At first, L
+    is ``frame`` on its body B; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of L in B, moves it.
 
-    Time goes in slices. At the end of a slice all rays are cast that were fired during it, each at the poses at its own
-    firing time: these follow from poses and velocities at the end of the slice, which are taken as constant. So a
-    moving target is distorted as in reality, up to a h^2 / 2 at an acceleration a in slices of length h. A scan is
-    shown at the end of the slice in which it ends. A reader that is updated at the same instant by an unrestricted
-    update (a `SlowPart`) sees it one slice later. The frequency need not divide that of the slices. Frequency, rays
-    per second and rows may be changed at any time, and take effect with the next scan.
+    The scanner is updated in slices of time. At the end of a slice, all rays are cast that were fired during it, each
+    at the poses at its own firing time, which follow from poses and velocities at the end of the slice; velocities are
+    assumed to be constant during it. So a moving target is distorted as in reality, with an error of up to a h^2 / 2 at
+    an acceleration a in slices of length h. A scan is shown at the end of the slice in which it ends. A reader that is
+    updated at the same instant by an unrestricted update (a `SlowPart`) sees it one slice later. The frequency need not
+    divide that of the slices. Frequency, rays per second and rows may be changed at any time, and take effect with the
+    next scan.
 
-    A beam returns from a Lambertian surface that it hits at the distance r under the angle a of incidence. It is
-    detected if the received power (Hoefle and Pfeifer, "Correction of laser scanning intensity data: data and
+    A beam is reflected by a Lambertian surface at the distance r under the angle a of incidence. It is detected if the
+    received power (Hoefle and Pfeifer, "Correction of laser scanning intensity data: data and
     model-driven approaches", 2007) reaches that of a white, perpendicular surface at the largest range:
 
         reflectivity cos(a) exp(-2 b r) / r^2 >= 1 / max_range^2        (b: extinction of the haze)
 
-    So it drops out at grazing incidence, the sooner the farther away. Haze adds false returns, see
+    So a beam drops out at grazing incidence, the sooner the farther away the surface is. Haze adds false returns, see
     `false_return_ranges`. The return may come from anywhere in the beam's footprint: the beam is cast in a direction
     that differs from the reported one by normal errors of a quarter of the divergence about both axes (Lichti and
     Gordon, "Error propagation in directly georeferenced terrestrial laser scanner point clouds for cultural heritage
@@ -202,7 +203,7 @@ class LaserScanner(LeafSystem):
 
         Args:
             plant: The plant, whose bodies move.
-            frame: A frame of the plant, at which the scanner begins.
+            frame: A frame of the plant: the initial frame L of the scanner.
             caster: The geometry that rays are cast at; several scanners can share it.
             config: Initial values of the parameters.
             slice_period: Length of a slice in s. It limits the frequency; shorter ones cost time.
@@ -210,7 +211,7 @@ class LaserScanner(LeafSystem):
             errors: Errors of the ranges, and the seed; None for exact ranges.
 
         Raises:
-            ValueError: A value that no scanner can have, or an error that scans do not have.
+            ValueError: A value is outside of its range, or ``errors`` has a drift or a latency.
         """
         super().__init__()
         config, errors = config or LaserScannerConfig(), errors or ErrorModel()
@@ -272,7 +273,7 @@ class LaserScanner(LeafSystem):
         self._scan: AbstractStateIndex = self.DeclareAbstractState(Value(Scan.empty()))
         self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
         self.codecs = {int(self._progress): _PROGRESS_CODEC}
-        # Of the present scan; without rows, none has begun.
+        # The state of the present scan; with 0 rows, none has begun.
         names = dict.fromkeys(("scan_start", "scan_period"), "s")
         names |= dict.fromkeys(("scan_rows", "scan_columns", "scan_by_columns", "fired"), "1")
         self._present = int(self.DeclareDiscreteState(len(names)))
@@ -287,7 +288,7 @@ class LaserScanner(LeafSystem):
         return self._slice_period
 
     def resume(self, context: Context, scan: Scan) -> None:
-        """Go on where a scanner stands that has shown ``scan`` last; the present scan begins anew."""
+        """Set the last complete scan to ``scan``, and begin a new one."""
         context.SetAbstractState(self._scan, scan)
         context.SetAbstractState(self._progress, ScanInProgress())
         context.SetDiscreteState(self._present, np.zeros(6))
