@@ -1,8 +1,7 @@
-"""Row C2 of the table of answers: how well the localization unit knows where it is, in simulation and over LCM."""
+"""Row C2 of the table of answers: the accuracy of the localization unit, in simulation and over LCM."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,15 +24,15 @@ PATIENCE = 60.0
 LARGEST_DIFFERENCE = 1e-3
 """The largest difference of the pose over LCM from the simulated one, in m and rad: points travel with 32 bits."""
 JUDGED = ("accurate", "remote")
-"""The maps by which the row holds. The goal of the third is below what can be reached: see `least_error_along`."""
+"""The maps whose goals the row must meet. The goal of the third map cannot be met: see `least_error_along`."""
 
 
 @dataclass(frozen=True)
 class OverLcm:
-    """What the unit says beside a machine, and in simulation at the same time.
+    """The comparison of the unit beside a machine with the simulated unit at the same time.
 
     Attributes:
-        is_tracking: Whether it tracks beside the machine.
+        is_tracking: Whether the unit tracks beside the machine.
         difference: The largest difference of the two poses, in m or rad.
     """
 
@@ -76,7 +75,7 @@ def over_lcm(scenario: ForestScenario, *, cycles: int = CYCLES) -> OverLcm:
 
 
 def localization(full: bool) -> Answer:
-    """Answer C2: how well does the unit know where it is?
+    """Answer C2: how accurately does the unit localize itself?
 
     The short version drives 25 m in each of 4 forests, the long one 500 m in each of 20.
     """
@@ -94,21 +93,18 @@ def localization(full: bool) -> Answer:
         unit="(RMS)",
         interval=None,
         paper="done on a harvester; no figures",
-        holds=machine.agrees and all(GOALS[name].is_met(found[name]) for name in JUDGED) and _is_careful(found),
+        holds=machine.agrees
+        and all(GOALS[name].is_met(found[name]) for name in JUDGED)
+        and not any(one.wrong for one in found.values()),
         note=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess. "
-        + "; ".join(_told(name, one) for name, one in found.items())
+        + "; ".join(_summary(name, one) for name, one in found.items())
         + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
         f"trees within {REACH:g} m of these drives errs by {least:.2f} m (RMS). Over LCM, fed by another process, "
         + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
     )
 
 
-def _is_careful(found: Mapping[str, Score]) -> bool:
-    """Return whether no claim was wrong, with any map."""
-    return not any(one.wrong for one in found.values())
-
-
-def _told(name: str, one: Score) -> str:
+def _summary(name: str, one: Score) -> str:
     goal = "reached" if GOALS[name].is_met(one) else "NOT reached"
     return (
         f"{name}: {one.position:.3f} m (goal {GOALS[name].position:g} m), {np.degrees(one.heading):.2f} deg, NEES "

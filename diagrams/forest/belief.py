@@ -1,4 +1,4 @@
-"""What the localization unit believes of the simulated world: where its carrier is and moves, and on which route."""
+"""The belief of the localization unit about the simulated world: pose, motion and route of its carrier."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ADVICE = "dps.impl.route.discrete_state_0[0]"
 
 # A carrier that is farther from the advised route than this is on another one, in m.
 _OFF = 1.5
-# Below this speed in m/s, the turning tells nothing of the steering.
+# Below this speed in m/s, the turn rate does not show the steering.
 _SLOW = 0.05
 
 
@@ -32,25 +32,25 @@ def declare_belief(
 ) -> None:
     """Declare how the estimates of the DPS set the state of the carrier and of its driver.
 
-    The carrier is where the DPS has localized it, at the height at which it stands there, tilted as it measures it; it
-    rolls without slip. The driver is on the advised route, or else on the nearest one.
+    The carrier stands at the place where the DPS has localized it, with the measured roll and pitch, and rolls without
+    slip. The driver is on the advised route, or else on the nearest one.
 
-    All of it is as old as the motion that the DPS has measured. The pose, which the DPS has for the present, is moved
+    The belief holds for the time of the measured motion. The pose of the DPS, which is that of the present, is moved
     back by this motion.
 
+    A carrier that is not localized has no belief: asking for it raises a ValueError.
+
     Args:
-        builder: Of the testbed.
+        builder: The builder of the testbed.
         carrier: The carrier.
         ground: The elevation map of the DPS: that of the simulated ground.
         routes: The routes by number.
-        age: Of the measured motion, in s.
-
-    A carrier that is not localized has no belief: whoever asks for it gets a ValueError.
+        age: The age of the measured motion in s.
     """
     rear = carrier.wheel_base / 2.0
 
     def axle(position: Array, heading: float, speed: float, turn_rate: float) -> Array:
-        """Return where the middle of the rear axle was, which moves along x_B, and the heading then, (3,)."""
+        """Return the past pose [x, y, heading] of the middle of the rear axle, which moves along x_B, (3,)."""
         if not np.isfinite(position).all():
             raise ValueError(
                 "the carrier is not localized, so that there is no belief of where it is: ask when dps.env.pose.status "

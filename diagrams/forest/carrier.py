@@ -20,8 +20,7 @@ C sigma; at rest, the tyre is a spring, and holds the machine on a slope. F is a
 
 Drive and steering are ideal but not instantaneous: treads run at the speeds that the machine's geometry prescribes
 (Ackermann: the front wheels steer, and their axes meet that of the rear ones), while speed and curvature follow the
-driver's commands at limited rates. So wheels slip as forces demand, and what the wheels tell of the motion is wrong by
-this slip.
+driver's commands at limited rates. So wheels slip as forces demand, and the wheel odometry is wrong by this slip.
 """
 
 from __future__ import annotations
@@ -72,10 +71,10 @@ class Carrier:
         length: Length of the body in m.
         width: Width over the wheels in m.
         height: Height of the body's upper side over the ground in m.
-        clearance: Height of its lower side over the ground in m.
+        clearance: Height of the body's lower side over the ground in m.
         wheel_base: Distance of the axles in m.
         track: Distance of the wheels of an axle in m.
-        wheel_radius: Radius of the wheels in m; it is only drawn.
+        wheel_radius: Radius of the wheels in m, for the illustration only.
         mass: Mass in kg, without the scanner.
         centre_height: Height of the centre of mass over the ground in m.
         sag: Static deflection of springs and tyres under the weight in m.
@@ -112,7 +111,7 @@ class Carrier:
 
     @property
     def p_BoC_B(self) -> Array:
-        """The places of the wheels in B in m, (4, 3): front left, front right, rear left, rear right."""
+        """The positions of the wheels in B in m, (4, 3): front left, front right, rear left, rear right."""
         x, y = self.wheel_base / 2.0, self.track / 2.0
         return np.array([(x, y, 0.0), (x, -y, 0.0), (-x, y, 0.0), (-x, -y, 0.0)])
 
@@ -131,8 +130,8 @@ def add_carrier(plant: MultibodyPlant, carrier: Carrier, X_BL: RigidTransform) -
 
     Args:
         plant: A plant that is registered with a SceneGraph, and not finalized.
-        carrier: What is added.
-        X_BL: The pose of the scanner on its mast, which stands below it.
+        carrier: The carrier.
+        X_BL: The pose of the scanner, which is on top of a mast.
     """
     instance = plant.AddModelInstance(INSTANCE)
     base = plant.AddRigidBody("base", instance, carrier.inertia)
@@ -161,8 +160,8 @@ def standing_pose(
 
     Args:
         carrier: The carrier.
-        ground: What it stands on.
-        position: x and y of Bo in W in m, shape (2,).
+        ground: The ground.
+        position: Position (x, y) of Bo in W in m, shape (2,).
         heading: The direction of B's x axis in the plane, in rad.
     """
     across = RotationMatrix.MakeZRotation(heading) @ carrier.p_BoC_B.T
@@ -175,7 +174,7 @@ def standing_pose(
 
 
 class Wheels(LeafSystem):
-    """The forces of the ground on the wheels of a `Carrier`, see the module, and the state of drive and steering.
+    """The forces of the ground on the wheels of a `Carrier` (equations in the module), and its drive and steering.
 
     .. pydrake_system::
 
@@ -188,8 +187,8 @@ class Wheels(LeafSystem):
         - speed
 
     ``state`` is the plant's [q; v], ``controls`` the speed of the middle of the rear axle (m/s) and the curvature of
-    its path (1/m, to the left) as the driver wants them. ``spatial_force`` is what the ground does to the carrier, as
-    one spatial force at Bo. ``speed`` is the present speed of the treads of the rear wheels, in the mean (m/s).
+    its path (1/m, to the left) as the driver wants them. ``spatial_force`` is the force of the ground on the carrier,
+    as one spatial force at Bo. ``speed`` is the present mean speed of the treads of the rear wheels (m/s).
 
     The system is stepped with the plant's period. A force is computed from the deflection at the end of the step, which
     makes the spring of a tyre as stable as the plant's own semi-implicit step.
@@ -203,8 +202,8 @@ class Wheels(LeafSystem):
         Args:
             plant: The finalized plant: discrete, as the wheels are stepped with it.
             body: The carrier's body B, see `add_carrier`.
-            carrier: Dimensions and tyres.
-            ground: What the wheels stand on.
+            carrier: The carrier, for its dimensions and tyres.
+            ground: The ground.
         """
         super().__init__()
         self._ground, self._step = ground, float(plant.time_step())
@@ -271,7 +270,7 @@ class Wheels(LeafSystem):
         places = p_WBo + arms
         heights, slopes = self._ground.height_and_slope(places[:, 0], places[:, 1])
         normals = np.column_stack([-slopes, np.ones(4)]) / np.sqrt(1.0 + (slopes**2).sum(axis=1))[:, np.newaxis]
-        # The wheel touches the ground where the ground is.
+        # The contact point lies on the ground.
         arms[:, 2] += heights - places[:, 2]
         velocities = v_WBo + _cross(w_WB, arms)
         approach = (heights - places[:, 2]) * normals[:, 2]
@@ -290,14 +289,14 @@ class Wheels(LeafSystem):
         size = np.sqrt((F**2).sum(axis=1))
         share = np.minimum(1.0, friction * N / np.maximum(size, 1e-9))[:, np.newaxis]
         F *= share
-        # A tyre that slides is deflected as far as its force tells.
+        # A sliding tyre is deflected as far as its force, which is limited by friction, deflects it.
         u = np.where(share < 1.0, -F / tyre, u)
         forces = N[:, np.newaxis] * normals + F[:, :1] * along + F[:, 1:] * left
         output.set_value((u, forces.sum(axis=0), _cross(arms, forces).sum(axis=0), N))  # type: ignore[attr-defined]
 
     def _rolling(self, R_WB: Array, speed: float, curvature: float) -> tuple[Array, Array]:
-        """Return in which directions the wheels roll, in W, (4, 3), and how fast their treads run (m/s), (4,)."""
-        # Where the wheels are from the middle of the rear axle, which moves at the given speed along the curve.
+        """Return the directions in which the wheels roll, in W, (4, 3), and the speeds of their treads (m/s), (4,)."""
+        # Positions relative to the middle of the rear axle, which moves at the given speed along the curve.
         x, y = self._p_BoC_B[:, 0] + self._wheel_base / 2.0, self._p_BoC_B[:, 1]
         ways = np.column_stack([1.0 - curvature * y, curvature * x])
         lengths = np.sqrt((ways**2).sum(axis=1))
@@ -369,7 +368,7 @@ class WheelOdometer(SampledSensor):
 
         Args:
             period: Sample period in s.
-            scale: The factor by which the measured speed is wrong.
+            scale: The initial value of the parameter ``scale``: measured over true speed of the treads.
             stream: The number of the stream of noise.
             errors: The errors of the sensor in m/s; none by default.
         """

@@ -1,8 +1,8 @@
-"""Simulated detections: what a detector of trunks would report at a place in a stand, without a scanner.
+"""Simulated detections of trunks at a place in a stand, without a scanner.
 
-For trials by the thousand, and as an independent check of matching and tracking. Things that look like trunks and are
-none (bushes, boulders, snags) stand in the forest like trees do: they are seen again from the next place, and no map
-has them. All rates and deviations are assumed; real detections come from the simulated scanner.
+They serve for thousands of trials, and as an independent check of matching and tracking. False trunks (bushes,
+boulders, snags) stand at fixed places like trees: they are detected again from the next place, but no map has them. All
+rates and deviations are assumed; more realistic detections come from the simulated scanner.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from vtbdrake_diagrams.forest.stand import Stand
 
 Array = NDArray[np.float64]
 
-# Rays across each trunk by which it is decided how much of it is hidden.
+# The number of rays across each trunk that determine how much of it is visible.
 _RAYS = 9
 
-# A trunk is seen if this share of its width is.
+# A trunk is detected if at least this share of its width is visible.
 _LEAST_VISIBLE = 0.5
 
 
@@ -33,11 +33,11 @@ class Detector:
     Attributes:
         reach: The largest distance of a detection in m.
         missed: The share of the visible trunks that are not detected.
-        false: The share of the detections that are no trees, from 0 to below 1.
+        false: The share of the trunks in a stand that are no trees, from 0 to below 1.
         along: Standard deviation of a position along the ray in m.
         across: Standard deviation of a position across the ray in m, at any distance.
         diameter: Standard deviation of a diameter in m.
-        range_bias: A constant error of the positions along the ray in m, of which the covariances say nothing.
+        range_bias: A constant error of the positions along the ray in m, which the covariances do not contain.
     """
 
     reach: float = 20.0
@@ -60,7 +60,7 @@ class Odometry:
     """The assumed drift of dead reckoning.
 
     Attributes:
-        scale: Standard deviation of the factor by which a distance travelled is wrong, the same for a whole drive.
+        scale: Standard deviation of the factor of the distance travelled, which is constant during a drive.
         position: Random walk of the position in m per square root of a metre travelled, per axis.
         heading: Random walk of the heading in rad per square root of a metre travelled.
     """
@@ -72,7 +72,7 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Wood:
-    """What a detector sees when it stands in a stand: its trees, and what only looks like trees.
+    """The trunks of a stand: its trees, and false trunks.
 
     Attributes:
         trunks: True positions and diameters in W, without covariances.
@@ -94,7 +94,7 @@ class Wood:
         return cls(Landmarks(places, np.zeros((n, 2, 2)), diameters, np.zeros(n)), np.arange(n) < len(trees))
 
     def detected(self, X_WH: ArrayLike, detector: Detector, rng: np.random.Generator) -> tuple[Landmarks, Array]:
-        """Return what is detected from a pose (3,), as landmarks in H, and which of the trunks they are (indices)."""
+        """Return the detections from a pose (3,), as landmarks in H, and the indices of their trunks."""
         found = visible(self.trunks, np.asarray(X_WH)[:2], reach=detector.reach)
         found = found[rng.random(len(found)) >= detector.missed]
         places = transform(inverse(X_WH), self.trunks.positions[found])
@@ -116,7 +116,7 @@ def visible(trunks: Landmarks, place: ArrayLike, *, reach: float) -> Array:
 
     Args:
         trunks: The trunks, in W.
-        place: The scanner in W, in m, shape (2,).
+        place: The position of the scanner in W in m, shape (2,).
         reach: The largest distance to an axis in m.
     """
     offsets = trunks.positions - np.asarray(place)
@@ -139,9 +139,9 @@ def arc(X_WH: ArrayLike, *, length: float, curvature: float, step: float) -> Arr
 
     Args:
         X_WH: The first pose, shape (3,).
-        length: In m.
-        curvature: In 1/m; positive to the left.
-        step: Distance of two poses in m.
+        length: The length of the arc in m.
+        curvature: The curvature in 1/m; positive to the left.
+        step: The distance of successive poses along the arc in m.
     """
     poses = [np.asarray(X_WH, dtype=float)]
     turn = curvature * step
@@ -153,7 +153,7 @@ def arc(X_WH: ArrayLike, *, length: float, curvature: float, step: float) -> Arr
 
 
 def dead_reckoned(poses: Array, odometry: Odometry, rng: np.random.Generator) -> Array:
-    """Return X_OH (n, 3) as dead reckoning has it along true poses X_WH (n, 3); O is H at the first one."""
+    """Return the poses X_OH (n, 3) by dead reckoning along true poses X_WH (n, 3); O is H at the first one."""
     factor = 1.0 + odometry.scale * rng.normal()
     reckoned = [np.zeros(3)]
     for before, after in pairwise(poses):
@@ -167,17 +167,17 @@ def dead_reckoned(poses: Array, odometry: Odometry, rng: np.random.Generator) ->
 def gathered(
     wood: Wood, poses: Array, detector: Detector, odometry: Odometry, rng: np.random.Generator
 ) -> tuple[Landmarks, Array]:
-    """Return what is detected along a drive, as landmarks in the last H, and which of the trunks they are (indices).
+    """Return the detections along a drive, merged to landmarks in the last H, and the indices of their trunks.
 
-    Each trunk is one landmark, at the mean of where dead reckoning put it: detections are told apart without fail.
+    Each trunk gives one landmark, at the mean of its positions by dead reckoning: the association is assumed perfect.
     Its covariance is that of one detection plus the drift since the trunk was seen.
 
     Args:
-        wood: What can be seen.
+        wood: The trunks.
         poses: The true poses X_WH of the carrier at its detections, shape (n, 3).
-        detector: How trunks are detected.
-        odometry: How dead reckoning drifts.
-        rng: The random numbers.
+        detector: The performance of the detector.
+        odometry: The drift of the dead reckoning.
+        rng: The generator of the random numbers.
     """
     reckoned = dead_reckoned(poses, odometry, rng)
     steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)

@@ -1,7 +1,7 @@
 """The driver's display: map, pose, covariance, landmarks and status of a running localization unit, live in Meshcat.
 
 ``python -m vtbdrake_diagrams.forest.display SCENARIO --url URL`` is a process of its own. It watches the live values of
-a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and has the map from the scenario.
+a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and takes the map from the scenario.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS)
 DEVIATIONS = 3.0
 """The size of the ellipse of the position, in standard deviations."""
 
-# What is written over the carrier, and its colour (of Okabe and Ito's palette), by status.
+# The text over the carrier, and its colour (of Okabe and Ito's palette), by status.
 _LOOKS = {
     SEARCHING: ("searching", Rgba(0.94, 0.89, 0.26, 1.0)),
     TRACKING: ("tracking", Rgba(0.0, 0.62, 0.45, 1.0)),
@@ -48,16 +48,16 @@ _LOOKS = {
 _TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.8)
 _TRUNK_HEIGHT, _LETTERS, _MARKER = 1.5, 1.0, 0.25
 _ROOF = 1.0
-# Where the carrier is seen from, in m, and how bright all is.
+# The position of the view relative to the carrier in m, and the intensity of the ambient light.
 _VIEW, _AMBIENT = (0.0, -14.0, 26.0), 3.0
 
 
 class DriverDisplay:
-    """Draws what a localization unit knows into Meshcat, under ``display``.
+    """Draws map, pose and status of a localization unit into Meshcat, under ``display``.
 
-    The carrier stands where the pose says, with the ellipse of its position (`DEVIATIONS`) on its roof, and the
-    landmarks of the last scan as cylinders. Beside the status stands the larger semi-axis of the ellipse. Without a
-    pose there is none of them: the status stands where the last pose was, or in the middle of the map. All is moved so
+    The carrier is drawn at its pose, with the ellipse of its position (`DEVIATIONS`) on its roof, and the landmarks of
+    the last scan as cylinders. The larger semi-axis of the ellipse is written beside the status. Without a pose, only
+    the map and the status are drawn, the latter at the last pose, or in the middle of the map. The drawing is moved so
     that this place stays in the middle of the view, north up.
     """
 
@@ -65,11 +65,11 @@ class DriverDisplay:
         """Draw the map.
 
         Args:
-            meshcat: The server that shows it.
+            meshcat: The Meshcat to draw into.
             world_map: The map of the unit.
         """
         self._meshcat = meshcat
-        self._told = ""
+        self._text = ""
         self._landmarks = self._shown = 0
         show_world_model(meshcat, world_map, prefix="display/map", marker=_MARKER, deviations=0.0, label_height=0.0)
         self._place = world_map.positions().mean(axis=0)
@@ -120,15 +120,20 @@ class DriverDisplay:
         self._shown = len(seen)
 
     def _show_status(self, status: int, covariance: Array) -> None:
-        text = told(status, covariance)
-        if text != self._told:
+        text = status_text(status, covariance)
+        if text != self._text:
             self._meshcat.SetLineSegments("display/status", *text_strokes(text, _LETTERS), 2.0, _LOOKS[status][1])
-            self._told = text
+            self._text = text
         self._meshcat.SetTransform("display/status", RigidTransform(self._place + np.array([0.0, 0.0, 3.0])))
 
 
-def told(status: int, covariance: Array) -> str:
-    """Return the status in words, and with a pose how well the position (covariance (2, 2) in m^2) is known."""
+def status_text(status: int, covariance: Array) -> str:
+    """Return the status in words, and with a pose the larger semi-axis of the ellipse of the position.
+
+    Args:
+        status: The status of the unit.
+        covariance: The covariance of the position, (2, 2) in m^2; infinite without a pose.
+    """
     words = _LOOKS[status][0]
     if not np.isfinite(covariance).all():
         return words
@@ -136,10 +141,10 @@ def told(status: int, covariance: Array) -> str:
 
 
 def ellipse(place: Array, covariance: Array) -> Array:
-    """Return the matrix (4, 4) that turns the unit sphere into the ellipse of a position, as high as the roof.
+    """Return the transform (4, 4) of the unit sphere to the ellipse of a position, just above the roof.
 
     Args:
-        place: The middle, (2,) in m.
+        place: The middle of the ellipse, (2,) in m.
         covariance: The covariance of the position, (2, 2) in m^2.
     """
     variances, axes = np.linalg.eigh(covariance)
@@ -174,7 +179,7 @@ def main(scenario: Scenario, url: str, every: int, timeout: float) -> None:
 
 
 def program() -> None:
-    """Run `main`; arguments that describe no scenario are one line of text, too."""
+    """Run `main`, with one line of text for arguments that describe no scenario, too."""
     try:
         main()
     except (ValueError, OSError) as error:

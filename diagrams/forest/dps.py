@@ -1,4 +1,4 @@
-"""The data processing system of the localization unit: one function builds it for testbed, copies and carrier."""
+"""The data processing system of the localization unit, the same for the testbed, its copies and the carrier."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from typing import Any
 from drake import lcmt_scope
 from pydrake.common.value import Value
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import (
-    ConstantValueSource,
-    ZeroOrderHold,
-)
+from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 
 from vtbdrake.components.localization.dead_reckoning import DeadReckoning, DriftModel
 from vtbdrake.components.sensors.calibration import make_calibration
@@ -25,16 +22,16 @@ from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_loca
 PERIOD = 0.02
 """The period of the DPS, of its IMU and of its wheel odometry, in s."""
 AXLE = -0.8
-"""The place of the rear axle, which is not steered, on x_B, in m."""
+"""The x coordinate in B of the rear axle, which is not steered, in m."""
 
 
 def make_deployment(scans: LcmMap, *, period: float) -> Deployment:
-    """Return how the localization unit runs on its carrier: after a fault, the advised route stays.
+    """Return the deployment of the localization unit on its carrier: after a fault, the advised route stays.
 
-    Signals of numbers travel as ``lcmt_scope``; scans or images leave before them in the cycle of the carrier.
+    Signals of numbers are sent as ``lcmt_scope``; scans or images are sent before them in the cycle of the carrier.
 
     Args:
-        scans: How scans or images travel.
+        scans: The map of the messages of scans or images.
         period: Time from scan to scan, or from image to image, in s.
     """
     return Deployment(
@@ -65,11 +62,11 @@ def make_dps(
     Every part is sampled and shows its own state: no input feeds through.
 
     Args:
-        world_map: What the carrier knows of the world, as the localizer uses it.
-        localizer: How scans are evaluated.
+        world_map: The map that the localizer uses.
+        localizer: The localization from scans to the pose.
         signals: A value of each of the signals in which the localizer detects landmarks, by name.
         latency: The time from the sample of a scan to its pose, in s.
-        drift: How the dead reckoning drifts.
+        drift: The drift of the dead reckoning.
     """
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", make_calibration({"imu": 6, "odometry": 1}))
@@ -90,7 +87,7 @@ def make_dps(
 def _make_env(
     world_map: WorldModel, localizer: Localizer, signals: Mapping[str, Any], *, latency: float, drift: DriftModel
 ) -> Diagram:
-    """Return the perceived environment: the map, and where the carrier is on it."""
+    """Return the perceived environment: the map, and the pose of the carrier on it."""
     builder = DiagramBuilder()
     builder.AddNamedSystem("map", ConstantValueSource(Value(world_map)))
     reckoning = builder.AddNamedSystem("dead_reckoning", DeadReckoning(period=PERIOD, axle=AXLE))

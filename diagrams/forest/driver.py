@@ -22,7 +22,7 @@ _SAME_ROAD = 0.2
 
 
 class Driver(LeafSystem):
-    """A driver who follows the advised route as a human does who sees the road: by the true pose.
+    """A driver who follows the advised route by the true pose, as a human does who sees the road.
 
     .. pydrake_system::
 
@@ -33,15 +33,15 @@ class Driver(LeafSystem):
         output_ports:
         - controls
 
-    ``state`` is the plant's [q; v], ``route`` the number of the advised route. ``controls``, the speed (m/s) and the
-    curvature (1/m, to the left) of the path of the middle of the rear axle, are those of pure pursuit: of the circle
-    through a point some metres ahead on the route (Coulter, "Implementation of the pure pursuit path tracking
-    algorithm", CMU-RI-TR-92-01, 1992).
+    ``state`` is the plant's [q; v], ``route`` the number of the advised route. ``controls`` are the speed (m/s) and the
+    curvature (1/m, to the left) of the path of the middle of the rear axle. The curvature is that of pure pursuit: of
+    the circle through a point some metres ahead on the route (Coulter, "Implementation of the pure pursuit path
+    tracking algorithm", CMU-RI-TR-92-01, 1992).
 
-    The driver takes the advised route at once if it is the same road here as the present one, and otherwise when it is
-    (all `strip_roads` begin alike). After ``laps`` rounds, the driver stops.
+    The driver changes to the advised route where both routes are the same road (the routes of `strip_roads` begin
+    alike). After ``laps`` laps, the driver stops.
 
-    The driver is sampled. State: ``route``, the way ``along`` it (m), ``lap``, and the controls.
+    The driver is sampled. State: ``route``, the distance ``along`` it (m), ``lap``, and the controls.
     """
 
     __slots__ = NO_DICT
@@ -68,9 +68,9 @@ class Driver(LeafSystem):
             wheel_base: Distance of the carrier's axles in m.
             period: Sample period in s.
             speed: The speed at which the driver drives, in m/s.
-            laps: The number of rounds after which the driver stops.
+            laps: The number of laps after which the driver stops.
             route: The number of the route on which the drive begins.
-            along: How far along this route it begins, in m.
+            along: The distance from the beginning of this route at which the drive begins, in m.
         """
         super().__init__()
         self._routes, self._laps, self._rear = tuple(routes), int(laps), wheel_base / 2.0

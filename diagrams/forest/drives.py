@@ -1,18 +1,19 @@
-"""Drives through many forests: how well the localization unit knows where it is, with each of the three maps.
+"""Drives through many forests: the errors of the localization unit with each of the three maps.
 
 ``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each forest
 once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
 map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the scanner,
 ``--simulated`` takes simulated detections (`detections`), ``--plain`` drives among rocks instead of trees.
 
-What counts, fixed before any of the forests from `SEED` on was driven:
+The criteria, fixed before any of the forests from `SEED` on was driven:
 
-* Errors of position and heading are those of all scans at which the unit says that it is tracking, from the first fix
-  to the end, over all forests; nothing is left out.
-* NEES is of 3 degrees of freedom. Its mean is compared with its 95 % bounds at places `INDEPENDENT` m of path apart,
-  the last one of each drive among them: nearer ones share trees, and with them the errors of the map.
-* Where there is no pose, there is no error: the share of the scans with a pose is told beside it.
-* A claim is wrong if the pose is farther from the true one than 0.5 m plus four standard deviations of the map.
+* Errors of position and heading are those of all scans at which the unit is tracking, from the first fix to the end,
+  over all forests; nothing is left out.
+* The normalized estimation error squared (NEES) has 3 degrees of freedom. Its mean is compared with its 95 % bounds at
+  places `INDEPENDENT` m of path apart, the last one of each drive among them: nearer ones share trees, and with them
+  the errors of the map.
+* A scan without a pose has no error; the share of the scans with a pose is therefore printed, too.
+* A pose is a wrong claim if it is farther from the true one than 0.5 m plus four standard deviations of the map.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ INDEPENDENT = 100.0
 REACH = 20.0
 """Trees within this distance of the path count as seen, in m; see `least_error_along`. Assumed."""
 LATE = 10.0
-"""From when on the errors of the vertical are told apart from those of the start, in s."""
+"""The time in s after which errors of the vertical do not belong to the start any more."""
 STANDING = 2.0
-"""How long the carrier stands before it drives, in s: the gyros show their bias, and the attitude settles."""
+"""The time in s for which the carrier stands before it drives: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
 _POSE = "sim.sys.carrier.base.pose"
 _ARRIVAL = "dps.env.{signal}_arrival"
@@ -68,9 +69,9 @@ SOURCES = {
     "simulated": "simulated detections instead of a scanner",
     "plain": "a scanner on a plain with rocks, instead of a forest",
 }
-"""What units localize by, and what it is."""
+"""The sources of the detections, and their descriptions."""
 SEED = 600_000
-"""The seed of the first forest. No constant of the localization may be chosen by forests from this seed on.
+"""The seed of the first forest. No constant of the localization may be chosen with forests from this seed on.
 
 Forests from 200,000 and from 500,000 on were driven before, and do not count any more: the duration of the errors of
 the vertical was not considered in the first ones, and the noise of the sensors was the same in all.
@@ -79,14 +80,14 @@ the vertical was not considered in the first ones, and the noise of the sensors 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What a unit gets along a drive, and where it was in truth.
+    """The inputs of a unit along a drive, and the true poses.
 
     Attributes:
         times: The times of the scans in s, shape (n,).
         truth: The true poses X_WH, shape (n, 3).
-        reckoned: Those of the odometry, X_OH, shape (n, 3).
-        landmarks: What was detected in each scan, in H; n of them.
-        tilts: Errors of roll and pitch by the dead reckoning in rad, shape (n, 2); none if the drive is simulated.
+        reckoned: The poses X_OH by dead reckoning, shape (n, 3).
+        landmarks: The detections of each scan, in H; n of them.
+        tilts: Errors of roll and pitch by the dead reckoning in rad, shape (n, 2); (0, 2) for a simulated drive.
     """
 
     times: Array
@@ -97,18 +98,18 @@ class Drive:
 
     @property
     def travelled(self) -> Array:
-        """How far the carrier has come at each scan, in m, shape (n,)."""
+        """The distance travelled at each scan, in m, shape (n,)."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.truth[:, :2], axis=0).T))])
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What a unit says along a drive.
+    """The answers of a unit along a drive.
 
     Attributes:
         drive: The drive.
-        poses: X_WH, shape (n, 3); NaN without a pose.
-        covariances: Their covariances, shape (n, 3, 3).
+        poses: The poses X_WH, shape (n, 3); NaN without a pose.
+        covariances: The covariances of the poses, shape (n, 3, 3).
         status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`, shape (n,).
     """
 
@@ -146,7 +147,7 @@ class Track:
 
     @property
     def first_fix(self) -> tuple[float, float]:
-        """How long (s) and how far (m) the unit has searched before its first pose; infinite if it never had one."""
+        """The time (s) and the distance travelled (m) until the first pose; infinite if there was none."""
         if not self.is_localized.any():
             return np.inf, np.inf
         first = int(np.argmax(self.is_localized))
@@ -154,12 +155,12 @@ class Track:
 
     @property
     def losses(self) -> int:
-        """How often the unit lost its pose."""
+        """The number of times that the unit lost its pose."""
         return int(((self.status[:-1] != LOST) & (self.status[1:] == LOST)).sum())
 
 
 def localize(drive: Drive, unit: LocalizationUnit) -> Track:
-    """Return what a unit says along a drive that begins without a guess."""
+    """Return the answers of a unit along a drive that begins without a guess."""
     state, answers = unit.start(), []
     for landmarks, X_OH, time in zip(drive.landmarks, drive.reckoned, drive.times, strict=True):
         answer, state = unit.step(state, landmarks, X_OH=X_OH, time=float(time))
@@ -179,10 +180,10 @@ def simulated_drive(
 
     Args:
         stand: The stand, in which the circle has a radius of a third of its smaller extent.
-        seed: Determines where the drive begins, false trunks, detections and drift.
-        length: Its length in m.
-        detector: How trunks are detected.
-        odometry: How dead reckoning drifts.
+        seed: Determines the start of the drive, false trunks, detections and drift.
+        length: The length of the drive in m.
+        detector: The performance of the detector; by default that of `Detector`.
+        odometry: The drift of the dead reckoning; by default that of `Odometry`.
     """
     detector, odometry = detector or Detector(), odometry or Odometry()
     rng = np.random.default_rng([seed, 8])
@@ -204,10 +205,10 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
 
     Args:
         scenario: The carrier in its world; its map does not matter.
-        length: How far it drives, in m.
+        length: The length of the drive in m.
 
     Raises:
-        RuntimeError: The carrier does not get there in twice the time that it should take.
+        RuntimeError: The drive takes more than twice the time that it should.
     """
     testbed, detect = scenario.build(), scenario.detector()
     arrivals = [_ARRIVAL.format(signal=signal.name) for signal in scenario.perception_signals()]
@@ -216,7 +217,7 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
     simulator = testbed.simulator()
     context = simulator.get_mutable_context()
     testbed.write(context, {_SPEED: 0.0})
-    period = scenario.eye_period
+    period = scenario.perception_period
     limit = STANDING + 2.0 * length / scenario.speed + 10.0
     rows: list[tuple[float, Array, Array, Array]] = []
     landmarks: list[Landmarks] = []
@@ -245,20 +246,20 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
 
 @dataclass(frozen=True)
 class Score:
-    """What came of drives with one map.
+    """The results of drives with one map.
 
     Attributes:
         forests: The number of drives.
-        path: Their length together, in m.
+        path: The total length of the drives in m.
         position: Root mean square error of the position in m, in the plane.
         heading: Root mean square error of the heading in rad.
         wrong: The number of scans with a wrong claim.
         nees: Mean of all NEES.
         independent_nees: Mean of the NEES at independent places.
-        bounds: Its 95 % bounds.
+        bounds: The 95 % bounds of `independent_nees`.
         first_fix: Median and largest time to the first fix in s.
         localized: The share of the scans with a pose.
-        losses: How often a pose was lost.
+        losses: The number of times that a pose was lost.
     """
 
     forests: int
@@ -280,10 +281,10 @@ class Score:
 
 
 def score(tracks: Sequence[Track], *, deviation: float) -> Score:
-    """Return what came of drives.
+    """Return the results of drives.
 
     Args:
-        tracks: One per forest.
+        tracks: The tracks, one per forest.
         deviation: Standard deviation of the positions on the map in m, per axis.
     """
     errors = np.concatenate([track.errors for track in tracks])
@@ -317,15 +318,15 @@ def nees_bounds(count: int) -> tuple[float, float]:
 def least_error(errors: MapErrors, places: Array, *, noise: float = 0.02) -> float:
     """Return the least RMS error in m, in the plane, of an unbiased estimate of the position by trees on a map.
 
-    It is that of an estimate that knows the heading, and where the trees are around it, up to independent errors. What
-    the errors of the map have in common shows only in how they vary from place to place: with the covariances
-    C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis, where s is the standard deviation of the map, the
-    best linear estimate (Gauss and Markov) has the error sqrt(2 / (1' C^-1 1)).
+    The heading is known to this estimate, and the relative position of each tree, up to independent errors. The common
+    error of the trees on the map can then be inferred only from how their errors vary from place to place. With the
+    covariances C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis, where s is the standard deviation of the
+    map, the best linear unbiased estimate (Gauss and Markov) has the error sqrt(2 / (1' C^-1 1)).
 
     Args:
-        errors: Those of the map.
-        places: Where the trees are in m, shape (n, 2).
-        noise: Standard deviation in m, per axis, by which it is known where each tree is around the carrier [assumed].
+        errors: The errors of the map.
+        places: The positions of the trees in m, shape (n, 2).
+        noise: Standard deviation in m, per axis, of the position of each tree relative to the carrier [assumed].
     """
     squares = ((places[:, np.newaxis] - places) ** 2).sum(axis=2)
     shared = np.exp(-0.5 * squares / errors.correlation**2) if errors.correlation > 0.0 else np.eye(len(places))
@@ -336,12 +337,12 @@ def least_error(errors: MapErrors, places: Array, *, noise: float = 0.02) -> flo
 def least_error_along(
     drives: Mapping[int, Drive], errors: MapErrors, *, scenario: Callable[[int], CarrierScenario] | None = None
 ) -> float:
-    """Return the RMS of `least_error` over drives, by the landmarks within `REACH` of each; no map lacks any of them.
+    """Return the RMS of `least_error` over drives, by all landmarks within `REACH` of each, as if all were on the map.
 
     Args:
-        drives: By the seed of the scenario.
-        errors: Those of the map.
-        scenario: Returns the scenario of a seed; by default that of `forest`.
+        drives: The drives by the seed of their scenario.
+        errors: The errors of the map.
+        scenario: The function that returns the scenario of a seed; by default `forest`.
     """
     least = []
     for seed, drive in drives.items():
@@ -358,7 +359,7 @@ def _rms(values: ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class Goal:
-    """What is to be reached with a map.
+    """The goal with a map.
 
     Attributes:
         position: Largest root mean square error of the position in m.
@@ -371,7 +372,7 @@ class Goal:
     is_consistent: bool = False
 
     def is_met(self, found: Score) -> bool:
-        """Return whether the goal is reached, without a wrong claim."""
+        """Return whether a score meets the goal, without a wrong claim."""
         return (
             found.position <= self.position
             and not found.heading > self.heading
@@ -413,9 +414,9 @@ def forest(seed: int, *, range_bias: float = 0.0, perception: str = "scanner") -
     """Return the scenario of a drive: a stand as dense as published plots, every third one clustered.
 
     Args:
-        seed: Determines stand, route, where on it the drive begins, and the noise of all sensors.
-        range_bias: Of the scanner, in m.
-        perception: ``scanner`` or ``stereo``.
+        seed: Determines stand, route, the start on it, and the noise of all sensors.
+        range_bias: The bias of the scanner's ranges in m.
+        perception: The sensor, ``scanner`` or ``stereo``.
     """
     rng = np.random.default_rng([seed, 9])
     scenario = ForestScenario(
@@ -454,9 +455,9 @@ class Drives:
     """The drives of the command, one per forest.
 
     Attributes:
-        length: Of each, in m.
-        range_bias: Of the scanner, in m.
-        source: What the unit localizes by, one of `SOURCES`.
+        length: The length of each drive in m.
+        range_bias: The bias of the scanner's ranges in m.
+        source: The source of the detections, one of `SOURCES`.
     """
 
     length: float = 50.0
@@ -470,7 +471,7 @@ class Drives:
         return forest(seed, range_bias=self.range_bias, perception="stereo" if self.source == "stereo" else "scanner")
 
     def __call__(self, seed: int) -> dict[str, Track]:
-        """Return what units with each of the maps say in the scenario of a seed."""
+        """Return the tracks of units with each of the maps in the scenario of a seed, by map."""
         scenario = self.scenario(seed)
         # One thread: matrices are small, and threads that wait for each other take most of the time.
         with threadpool_limits(1):
@@ -502,8 +503,8 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
     parser.set_defaults(source="scanner")
     source = parser.add_mutually_exclusive_group()
-    for name, told in SOURCES.items():
-        source.add_argument(f"--{name}", dest="source", action="store_const", const=name, help=told)
+    for name, description in SOURCES.items():
+        source.add_argument(f"--{name}", dest="source", action="store_const", const=name, help=description)
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     if chosen.source == "stereo" and chosen.bias:
@@ -512,8 +513,8 @@ def main() -> None:
     found, seeds = [], range(chosen.seed, chosen.seed + chosen.forests)
     for tracks in drives.through(seeds, workers=chosen.workers):
         found.append(tracks)
-        told = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
-        print(f"drive {len(found)}: {told}", flush=True)
+        errors = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
+        print(f"drive {len(found)}: {errors}", flush=True)
     results = scores(found)
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
@@ -523,7 +524,7 @@ def main() -> None:
     if len(tilts):
         late = np.concatenate([drive.times for drive in driven.values()]) > LATE
         for when, rows in (("", slice(None)), (f", later than {LATE:g} s after the start", late)):
-            roll, pitch = (_rms(errors) for errors in tilts[rows].T)
+            roll, pitch = (_rms(angles) for angles in tilts[rows].T)
             print(f"the vertical is off by {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
     least = least_error_along(driven, MAPS["poor"], scenario=drives.scenario)
     print(f"least error of an unbiased estimate on a poor map, by all landmarks within {REACH:g} m: {least:.2f} m")

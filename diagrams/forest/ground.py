@@ -13,15 +13,15 @@ from vtbdrake.components.meshes import Surface
 
 Array = NDArray[np.float64]
 
-# Wave lengths in m of hills and of bumps, and how many waves there are of each.
+# Wave lengths in m of hills and of bumps, and the numbers of their waves.
 _HILLS, _BUMPS = (40.0, 150.0), (2.5, 8.0)
 _HILL_WAVES, _BUMP_WAVES = 16, 48
 
-# Stream of random numbers, beside those of `stand`.
+# The stream of random numbers; `stand` has others.
 _GROUND = 2
 
-MESH_CELL = 0.6
-"""The distance of the vertices of the ground's mesh, in m."""
+# The largest distance of the vertices of the ground's mesh, in m.
+_MESH_CELL = 0.6
 
 
 @dataclass(frozen=True)
@@ -59,33 +59,21 @@ class Ground:
         height: Array = np.cos(np.multiply.outer(x, k_x) + np.multiply.outer(y, k_y) + phases) @ amplitudes
         return height
 
-    def slope(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return the gradient (dz/dx, dz/dy) of the height, shape (..., 2); x and y as for `height`."""
-        return self.height_and_slope(x, y)[1]
-
     def height_and_slope(self, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
-        """Return `height` and `slope`, which cost little more together than alone."""
+        """Return the height, and its gradient (dz/dx, dz/dy), shape (..., 2); x and y as for `height`."""
         k_x, k_y, phases, amplitudes = self._waves
         angles = np.multiply.outer(x, k_x) + np.multiply.outer(y, k_y) + phases
         return np.cos(angles) @ amplitudes, -np.sin(angles) @ self._steepness
 
-    def normal(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return the unit normals of the ground, which point up, shape (..., 3)."""
-        slope = self.slope(x, y)
-        normal = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
-        unit: Array = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        return unit
-
-    def mesh(self, lower: ArrayLike, upper: ArrayLike, *, cell: float = MESH_CELL) -> Surface:
+    def mesh(self, lower: ArrayLike, upper: ArrayLike) -> Surface:
         """Return the ground of a rectangle as triangles whose vertices lie on it.
 
         Args:
             lower: The least x and y in m, shape (2,).
             upper: The largest x and y in m, shape (2,).
-            cell: Distance of the vertices in m, at most.
         """
         low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
-        nx, ny = (np.ceil((high - low) / cell).astype(int) + 1).tolist()
+        nx, ny = (np.ceil((high - low) / _MESH_CELL).astype(int) + 1).tolist()
         x, y = np.linspace(low[0], high[0], nx), np.linspace(low[1], high[1], ny)
         # cos(u + v) = cos u cos v - sin u sin v: each wave is a product, so that a grid is a product of two matrices.
         k_x, k_y, phases, amplitudes = self._waves

@@ -1,25 +1,25 @@
-"""Where should the carrier drive next to be localized best? It asks its own testbed, and the true forest answers.
+"""Where should the carrier drive next to be localized best? It decides with its own testbed; true drives check this.
 
-A storm has left gaps in a stand: there the carrier sees no tree, and has its odometry only. The unit has found itself
-on a remote map, and chooses among the routes: the reasoner simulates each in a mental copy, whose forest is the map of
-the DPS, and takes the one along which the DPS would know its position best.
+A storm has left gaps in a stand, where the carrier detects no trees and has its odometry only. The unit is localized on
+a remote map, and chooses among the routes: the reasoner simulates each in a mental copy, whose forest is the map of the
+DPS, and takes the one along which the expected error of the position is least.
 
-The true forest tells whether the choice was good. Every route is driven there once, and what the DPS detects is
-recorded, with the odometry. On these drives, units localize with many surveys of the same forest: with the map in use,
-by which the carrier has chosen, and with `SURVEYS` others, of which the choice knows nothing.
+To check the choice, every route is driven in the true forest once, and the detections of the DPS are recorded, with the
+odometry. On these drives, units localize with many surveys of the same forest: with the map in use, by which the
+carrier has chosen, and with `SURVEYS` others, which the choice did not use.
 
-``python -m vtbdrake_diagrams.forest.next_route [--forests N]`` prints, for each forest, the expected and the real
-errors of all routes, and in the end what the choices have gained. What counts was fixed before any forest from `SEED`
-on was driven:
+``python -m vtbdrake_diagrams.forest.next_route [--forests N]`` prints, for each forest, the expected and the true
+errors of all routes, and in the end the gains of the choices. The criteria were fixed before any forest from `SEED` on
+was driven:
 
 * The error of a route is the root mean square of the error of the position over the last `COUNTED` s of its drive and
   over the other surveys. With one map, it is a single draw of that map's errors, and draws differ by more than routes.
-  The choice cannot profit from what only the map in use has, such as the trees that this map lacks by chance. Its gain
-  with the map in use, one draw per forest, is told beside.
-* A scan without a pose counts as `UNKNOWN` off, and so does a pose that is farther off.
+  The choice cannot profit from properties of the map in use alone, such as the trees that this map lacks by chance. Its
+  gain with the map in use, one draw per forest, is printed, too.
+* The error of a scan is at most `UNKNOWN`, and `UNKNOWN` without a pose.
 * The gain of a forest is the error of the route in use, or the mean error of all routes, less that of the chosen one.
   Its standard error is that over the forests.
-* A carrier that has not found itself after `FOUND` s cannot choose. Its forest is named, and left out.
+* A carrier that is not localized after `FOUND` s cannot choose. Its forest is printed, and left out.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ SEED = 410_000
 ROUTE = "u.route"
 COVARIANCE = "dps.env.pose.covariance"
 FOUND = 3.0
-"""The time in s at which the carrier is asked: it has found itself by then."""
+"""The time of the decision in s: most carriers are localized by then."""
 HORIZON = 40.0
 """The horizon of the mental rollouts, in s."""
 COUNTED = 25.0
-"""The quality counts in so many seconds at the end of the horizon: the routes have parted by then."""
+"""The time in s at the end of the horizon in which the quality counts: the routes have parted by then."""
 SURVEYS = 8
-"""The number of surveys of the forest by which routes are judged, beside the map in use."""
+"""The number of surveys of the forest by which routes are compared, beside the map in use."""
 SAMPLE_PERIOD = 0.5
 TIME_LIMIT = 600.0
 """The longest time that one rollout may take, in s: on an idle core, it takes about a third of the horizon."""
@@ -64,7 +64,7 @@ UNKNOWN = 2.0
 
 @dataclass(frozen=True)
 class MappedStand(Stand):
-    """A stand as a map shows it: the trees are where the map has them.
+    """A stand as a map shows it: the trees have the positions and sizes of the map.
 
     Attributes:
         errors: The name of the errors of the map, see `MAPS`.
@@ -81,13 +81,13 @@ class MappedStand(Stand):
 
 @dataclass
 class RouteScenario(ForestScenario):
-    """A carrier in a stand with gaps of a storm that may think about where to drive next."""
+    """A carrier in a stand with gaps of a storm that can decide where to drive next."""
 
     stand_kind: str = "windthrown"
     density: float = 600.0
     map: str = "remote"
     speed: float = 2.0
-    # Whether the simulated forest is that of the map, without clutter: what the carrier imagines.
+    # Whether the simulated forest is that of the map, without clutter, as in a mental copy.
     is_imagined: bool = field(default=False, kw_only=True)
 
     def validate(self) -> None:
@@ -95,7 +95,7 @@ class RouteScenario(ForestScenario):
         self.require(map_file=(not self.map_file, "empty: what the carrier imagines is grown from the seed"))
 
     def mental(self) -> RouteScenario:
-        """Return what the carrier simulates when it reasons."""
+        """Return the scenario that the carrier simulates when it reasons."""
         own = {item.name: getattr(self, item.name) for item in fields(self)}
         return RouteScenario(**{**own, "is_imagined": True, "undergrowth": 0.0, "branches": 0.0, "lean": 0.0})
 
@@ -114,8 +114,8 @@ def variance(time: float, covariance: Array) -> float:
     """Return the expected square of the error of the position in m^2, in the plane; 0 before the time that counts.
 
     Args:
-        time: In s.
-        covariance: Of the pose, (3, 3); infinite without a pose.
+        time: The time in s.
+        covariance: The covariance of the pose, (3, 3); infinite without a pose.
     """
     return min(float(covariance[0, 0] + covariance[1, 1]), UNKNOWN**2) if time >= FOUND + HORIZON - COUNTED else 0.0
 
@@ -138,12 +138,12 @@ def route_reasoner(scenario: RouteScenario, **options: Any) -> Reasoner:
 
 @dataclass(frozen=True)
 class RouteAnswer:
-    """A decision, and what came of every route.
+    """A decision, and the errors along every route.
 
     Attributes:
-        decision: The carrier's.
-        expected: The error along each route in its mind, in m, root mean square, shape (n,).
-        by_map: That in the true forest, with the map in use first, and with each of the other surveys, shape (k, n).
+        decision: The decision of the carrier.
+        expected: The expected error along each route in the mental copy, in m, root mean square, shape (n,).
+        by_map: The errors in the true forest in m, with the map in use first, and with each other survey, shape (k, n).
         in_use: The number of the route that was in use.
     """
 
@@ -160,12 +160,12 @@ class RouteAnswer:
 
     @property
     def chosen(self) -> int:
-        """The number of the route that was chosen; that in use if nothing is set."""
+        """The number of the route that was chosen; that of the route in use if the decision sets none."""
         return round(float(self.decision.values.get(ROUTE, self.in_use)))
 
     @property
     def rank(self) -> int:
-        """How many routes have a smaller error than the one that was chosen."""
+        """The number of routes with a smaller error than the chosen one."""
         return int((self.errors < self.errors[self.chosen]).sum())
 
 
@@ -178,7 +178,7 @@ def route_scenario(seed: int) -> RouteScenario:
 
 
 def decide_and_drive(seed: int) -> RouteAnswer | None:
-    """Let the carrier decide in the forest of a seed, and drive every route there; None if it has not found itself."""
+    """Let the carrier decide in the forest of a seed, and drive every route there; None if it is not localized."""
     scenario = route_scenario(seed)
     testbed = scenario.build()
     context = testbed.default_context()
@@ -216,7 +216,7 @@ def late_error(track: Track) -> float:
 
 
 def summary(answers: dict[int, RouteAnswer]) -> str:
-    """Return what the choices have gained in the forests of these seeds, as text: a table, gains and spreads."""
+    """Return the gains of the choices in the forests of these seeds, as text: a table, gains and standard errors."""
     heads = ("forest", "expected m", "chosen m", "in use m", "all m", "best m", "better routes")
     rows = np.array([
         [one.expected[one.chosen], one.errors[one.chosen], one.errors[one.in_use], one.errors.mean(), one.errors.min()]
@@ -244,7 +244,7 @@ def _mean(values: Array) -> str:
 
 
 def main() -> None:
-    """Decide in some forests, and print what was expected and what came."""
+    """Decide in some forests, and print the expected and the true errors."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--forests", type=int, default=12)
     parser.add_argument("--seed", type=int, default=SEED)
@@ -253,7 +253,7 @@ def main() -> None:
     for seed in range(chosen.seed, chosen.seed + chosen.forests):
         found = decide_and_drive(seed)
         if found is None:
-            print(f"forest {seed}: the carrier has not found itself after {FOUND:g} s\n", flush=True)
+            print(f"forest {seed}: the carrier is not localized after {FOUND:g} s\n", flush=True)
             continue
         answers[seed] = found
         rows = [

@@ -46,11 +46,11 @@ from vtbdrake.testbed.slow_part import SlowPart
 
 Array = NDArray[np.float64]
 
-# The time for which dead reckoning alone is trusted to know the place, in s; assumed.
+# The time in s for which dead reckoning alone gives a valid pose; assumed.
 _PATIENCE = 10.0
 
 SETTLED = 0.5
-"""Before this time in s nothing is seen: the vertical, which levels scans and images, must be known first."""
+"""The time in s before which nothing is detected: the vertical, which levels scans and images, must be known first."""
 
 SHOWN = 64
 """The largest number of landmarks that the port ``landmarks`` of the localizer shows: the nearest."""
@@ -63,7 +63,7 @@ class ScanLandmarks:
     Attributes:
         detect: The detector, such as `detect_trunks`.
         settings: The second argument of ``detect``, such as a `TrunkDetector`.
-        X_BL: Pose of the scanner, as the DPS knows it.
+        X_BL: Pose of the scanner in the DPS.
     """
 
     detect: Callable[..., Landmarks]
@@ -73,13 +73,13 @@ class ScanLandmarks:
     def __call__(self, scan: Scan, history: Array, time: float) -> Landmarks:
         """Return the landmarks in the level frame H at the time of the scan.
 
-        In a scan with rays that were fired before the history begins, nothing is seen: its times are wrong, such as
+        A scan with rays that were fired before the history begins has no landmarks: its times are wrong, such as
         milliseconds for seconds.
 
         Args:
-            scan: What was measured.
+            scan: The scan.
             history: The port ``history`` of the `DeadReckoning`, also as rows of poses.
-            time: When the scan was complete, by the clock of the DPS, in s.
+            time: The time when the scan was complete, by the clock of the DPS, in s.
         """
         if len(scan.times) and time + scan.times.min() < np.ravel(history)[-POSE]:
             return Landmarks.empty()
@@ -94,7 +94,7 @@ class Localizer:
     """The localization from landmarks to the pose: the function of the slow part ``localizer``.
 
     Attributes:
-        detect: Returns the landmarks in a scan or in images, such as `ScanLandmarks`.
+        detect: The function that returns the landmarks in a scan or in images, such as `ScanLandmarks`.
         unit: The localization on the map.
         signals: The signals that ``detect`` takes, before the history and the time.
     """
@@ -104,7 +104,7 @@ class Localizer:
     signals: tuple[str, ...] = ("scan",)
 
     def prepare(self) -> None:
-        """Look for the libraries of linear algebra, and load what ``detect`` needs."""
+        """Find the libraries of linear algebra, and load what ``detect`` needs."""
         _blas()
         getattr(self.detect, "prepare", lambda: None)()
 
@@ -139,9 +139,9 @@ class Localizer:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """Return what sets the number of threads of linear algebra.
+    """Return the controller of the threads of linear algebra.
 
-    With several, small matrices take longer, much longer on a busy computer, and their last bits differ.
+    With several threads, small matrices take longer, much longer on a busy computer, and their last bits differ.
     """
     return ThreadpoolController()
 
@@ -156,7 +156,7 @@ def shown(landmarks: Landmarks) -> Array:
 
 
 class PresentPose(LeafSystem):
-    r"""The pose of the carrier on the map at present: what the localizer found, and the way since then.
+    r"""The present pose of the carrier on the map: the last pose of the localizer, continued by dead reckoning.
 
     .. pydrake_system::
 
@@ -178,8 +178,8 @@ class PresentPose(LeafSystem):
         X_WH(now) = X_WH X_OH^-1 X_OH(now),
 
     and the covariance grows as the `DriftModel` says. ``pose_estimate`` is [time (s), x, y (m), heading (rad),
-    covariance (9,), status]. Without a pose on the map, the pose is NaN and its variances are infinite, as the
-    localizer says. If it has said nothing for longer than the parameter ``patience`` (s), the status is `LOST`.
+    covariance (9,), status]. Without a pose of the localizer, the pose is NaN and its variances are infinite. If the
+    last pose is older than the parameter ``patience`` (s), the status is `LOST`.
     """
 
     __slots__ = NO_DICT
@@ -188,9 +188,9 @@ class PresentPose(LeafSystem):
         """Declare the system.
 
         Args:
-            period: That of its updates in s.
-            drift: How the dead reckoning drifts.
-            axle: Where on x_B the point is that does not move sideways, in m, as in `DeadReckoning`.
+            period: The period of the updates in s.
+            drift: The drift of the dead reckoning.
+            axle: The x coordinate in B of the point that does not move sideways, in m, as in `DeadReckoning`.
         """
         super().__init__()
         self._drift, self._axle = drift, axle
@@ -235,8 +235,8 @@ def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, dura
         X_WH: The pose before, (3,) in m and rad.
         covariance: The covariance of this pose, (3, 3).
         motion: The pose after the motion in the frame of the pose before, (3,) in m and rad.
-        drift: How the dead reckoning drifts.
-        duration: How long the motion took, in s.
+        drift: The drift of the dead reckoning.
+        duration: The duration of the motion in s.
     """
     pose = compose(X_WH, motion)
     by_pose, by_motion = np.eye(3), np.eye(3)
@@ -258,8 +258,8 @@ def add_localizer(
 
     Args:
         builder: The builder of the Diagram ``env`` of the DPS.
-        reckoning: Remembers the poses of the carrier.
-        localizer: What is computed.
+        reckoning: The dead reckoning, whose history the part reads.
+        localizer: The function of the part.
         signals: A value of each of the signals that the localizer takes, by name.
         period: The period of the DPS, in s.
         latency: The time from the sample of a scan to its pose, in s.
@@ -303,7 +303,7 @@ def add_localizer(
         builder.Connect(arrival.GetOutputPort("sample"), part.GetInputPort(name))
         builder.Connect(arrival.GetOutputPort("time"), part.GetInputPort(f"{name}_time"))
         builder.ExportInput(arrival.GetInputPort("signal"), name)
-    # The last one, as all of them arrive together or in this order.
+    # The number of the last signal is the request, as all signals arrive together or in this order.
     builder.Connect(arrival.GetOutputPort("number"), part.GetInputPort("request"))
     builder.Connect(reckoning.GetOutputPort("history"), part.GetInputPort("history"))
     return part

@@ -1,4 +1,4 @@
-"""The picture of docs/forest.md: the carrier in its forest, what its scanner sees, and where it knows itself to be.
+"""The picture of docs/forest.md: the carrier in its forest, its scan on the map, and the errors of its position.
 
 ``python -m vtbdrake_diagrams.forest.picture`` draws it.
 """
@@ -31,9 +31,9 @@ INSTANTS = np.arange(0.95, 7.0, 1.0)
 DEVIATIONS = 3.0
 """The size of the ellipses in standard deviations."""
 
-# Where the camera is on the carrier in m, and by how much it looks down in rad.
+# The position of the camera in B in m, and the angle in rad by which it looks down.
 _PLACE, _DOWN = (-5.5, 0.0, 4.0), 0.35
-# What is drawn around the carrier, in m.
+# Half of the edge length of the area that is drawn around the carrier, in m.
 _REACH = 16.0
 # Colours of Okabe and Ito's palette.
 _SEEN, _POSE = "#0072b2", "#d55e00"
@@ -41,7 +41,7 @@ _SEEN, _POSE = "#0072b2", "#d55e00"
 
 @dataclass(frozen=True, eq=False)
 class DriveRecord:
-    """Poses and covariances that the localization unit tells along a drive, at n instants, beside the true poses.
+    """True poses, and poses and covariances by the localization unit, at n instants of a drive.
 
     Attributes:
         truth: The true poses of the carrier, (n, 6), as ``sim.sys.carrier.base.pose`` gives them.
@@ -49,7 +49,7 @@ class DriveRecord:
         covariances: Their covariances, (n, 2, 2) in m^2.
         X_WH: The estimated pose at the time of the last scan, (3,) in m and rad.
         points_H: The points of this scan, (m, 3) in m.
-        landmarks_H: The trunks that were detected in it: rows of x, y and diameter in m, (k, 3).
+        landmarks_H: The trunks that were detected in this scan: rows of x, y and diameter in m, (k, 3).
     """
 
     truth: Array
@@ -61,7 +61,7 @@ class DriveRecord:
 
 
 def simulated(scenario: ForestScenario, instants: Array = INSTANTS) -> DriveRecord:
-    """Return what the unit says at some instants of a drive, (n,) in s."""
+    """Return the record of a drive at some instants, (n,) in s."""
     testbed = scenario.build()
     context = testbed.default_context()
     simulator = testbed.simulator(context)
@@ -153,7 +153,7 @@ def plot(scenario: ForestScenario, drive: DriveRecord) -> Picture:
 @click.command()
 @click.option("--figure", default="forest.png", show_default=True, help="File of the picture.")
 def main(figure: str) -> None:
-    """Draw the carrier in its forest, what its scanner sees, and where it knows itself to be."""
+    """Draw the carrier in its forest, its scan on the map, and the errors of its position."""
     buffer = BytesIO()
     plot(SCENARIO, simulated(SCENARIO)).savefig(buffer, dpi=100, bbox_inches="tight")
     # 256 colours make the file a third as large.

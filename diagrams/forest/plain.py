@@ -25,7 +25,7 @@ from vtbdrake_diagrams.forest.stand import MapErrors, surveyed
 
 Array = NDArray[np.float64]
 
-# Streams of random numbers, beside those of the forest.
+# Streams of random numbers; the forest has others.
 _ROCKS, _MAP = 6, 7
 
 # Length over width, and height over diameter of the whole rock, of which the upper half sticks out.
@@ -41,7 +41,7 @@ class RockField:
         length: Extent along x in m.
         width: Extent along y in m.
         abundance: The share k of the ground that rocks of all sizes cover.
-        least_diameter: The diameter in m of the smallest rocks that are there; smaller ones are left out.
+        least_diameter: The diameter in m of the smallest rocks; smaller ones are left out.
         largest_diameter: The diameter in m of the largest rocks.
         track_width: Width of the tracks in m, which are free of rocks; 0 for a plain without tracks.
         track_spacing: Distance of the tracks in m, see `strip_roads`.
@@ -69,7 +69,7 @@ class RockField:
             raise ValueError(f"tracks are at most 8 m wide (0: no tracks), not {self.track_width:g} m")
 
     def density(self) -> float:
-        """Return how many rocks there are per m^2, before tracks are cleared."""
+        """Return the number of rocks per m^2, before tracks are cleared."""
         return float(self._cumulative()[1][-1])
 
     def diameters(self, uniform: Array) -> Array:
@@ -85,7 +85,7 @@ class RockField:
         return strip_roads(self.length, self.width, spacing=self.track_spacing, seed=self.seed)
 
     def rocks(self) -> WorldModel:
-        """Return the rocks as they are: exact poses, and ``length``, ``width`` and ``height`` of ellipsoids in m.
+        """Return the true rocks: exact poses, and ``length``, ``width`` and ``height`` of ellipsoids in m.
 
         Their middles lie at the height 0, so that the upper half of ``height`` sticks out of level ground.
         """
@@ -111,7 +111,7 @@ class RockField:
         """Return a map of the rocks with errors, as `Stand.map` does: positions and ``width``, in random order.
 
         Args:
-            errors: What is wrong with it.
+            errors: The errors of the map.
             seed: Determines the errors, together with the seed of the plain.
         """
         truth = tuple(self.rocks())
@@ -136,7 +136,7 @@ class RockField:
         )
 
     def _cumulative(self) -> tuple[Array, Array]:
-        """Return diameters in m, and how many rocks per m^2 are smaller, (n,) each.
+        """Return diameters in m, and the numbers of rocks per m^2 that are smaller, (n,) each.
 
         The covered share falls by pi D^2 / 4 per rock and m^2, so that the number density of the diameters is
         4 k q exp(-q D) / (pi D^2).
@@ -149,7 +149,7 @@ class RockField:
         return diameters, np.concatenate([[0.0], np.cumsum(steps)])
 
     def _places(self, rng: np.random.Generator, diameters: Array) -> Array:
-        """Return places of rocks that do not touch, the largest first, (n, 2)."""
+        """Return positions of rocks that do not touch, the largest first, (n, 2)."""
         places = np.empty((len(diameters), 2))
         radii = 0.5 * diameters * max(_ELONGATION)
         for k, radius in enumerate(radii):

@@ -12,14 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-# Stream of random numbers, beside those of `stand` and `ground`.
+# The stream of random numbers; `stand` and `ground` have others.
 _ROADS = 3
 
 # The distance of the points of a route, and the radius of its bends, in m.
 _STEP, _BEND = 0.25, 6.0
 # The distance of the outer roads from the border of the stand, in m.
 _BORDER = 8.0
-# Roads wind: waves of this length in m push them aside by this much, as a standard deviation in m.
+# Roads wind: the length of the waves that displace them in m, the standard deviation of the displacement in m, and the
+# number of waves.
 _WINDING, _ASIDE, _WAVES = 60.0, 0.8, 6
 
 
@@ -59,7 +60,7 @@ class Route:
         return atan2(y, x)
 
     def nearest(self, point: ArrayLike) -> float:
-        """Return how far along the route, in m, the point of it is that is next to a point (2,) in W."""
+        """Return the distance along the route, in m, at which it is nearest to a point (2,) in W."""
         distances = np.sum((self.points - np.asarray(point, dtype=float)) ** 2, axis=1)
         return float(self._marks[int(np.argmin(distances))])
 
@@ -68,14 +69,14 @@ class Route:
         return distances([self], places)
 
     def _segment(self, along: float) -> tuple[int, float]:
-        """Return the index of the point before a place on the route, and which share of the way to the next it is."""
+        """Return the index of the point before a place on the route, and its share of the way to the next point."""
         along %= self.length
         k = min(int(np.searchsorted(self._marks, along, side="right")) - 1, len(self.points) - 1)
         return k, (along - self._marks.item(k)) / (self._marks.item(k + 1) - self._marks.item(k))
 
     @cached_property
     def _marks(self) -> Array:
-        """How far along the route each point is, and last the length, (n + 1,)."""
+        """The distance of each point from the beginning along the route, and last its length, in m, (n + 1,)."""
         gaps = np.linalg.norm(np.diff(self.points, axis=0, append=self.points[:1]), axis=1)
         return np.concatenate([[0.0], np.cumsum(gaps)])
 
@@ -97,7 +98,7 @@ def strip_roads(length: float, width: float, *, spacing: float = 28.0, seed: int
     A main road crosses the stand along x in the middle. Side roads leave it to the left and to the right, about
     ``spacing`` apart; along the border, all of them lead back to where the main road begins. Each route begins there,
     follows the main road, takes one of the side roads and comes back. Routes 0, 2, ... turn left, and 1, 3, ... right,
-    from the nearest side road to the farthest. So routes are the same up to where they part. All roads wind a little.
+    from the nearest side road to the farthest. Routes are the same until they part. All roads wind a little.
 
     Strip roads are 3 to 5 m wide and 20 to 70 m apart in Swedish calculations of 1981 ("Profitability of Thinning:
     Short- and Long-Term Considerations", Logging Research Foundation, Stockholm); the pattern is assumed.
@@ -156,7 +157,7 @@ def _resampled(points: Array) -> Array:
 
 
 class _Winding:
-    """A smooth map of the plane, which pushes places aside: roads that share a place still do."""
+    """A smooth displacement of the plane, so that roads that share a place still share it afterwards."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, _ROADS])

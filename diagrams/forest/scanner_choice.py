@@ -1,12 +1,12 @@
-"""Which height of the scanner and which number of beams let the carrier know best where it is?
+"""Which height of the scanner and which number of beams give the least error of the position?
 
-``python -m vtbdrake_diagrams.forest.scanner_choice [--full]`` asks the finished testbed: the same forests, the same
-drives, as many rays per second; the error of the present pose counts. It prints the grid, and draws it.
+``python -m vtbdrake_diagrams.forest.scanner_choice [--full]`` compares them in the finished testbed: in the same
+forests, on the same drives, with as many rays per second. It prints the errors over the grid, and draws them.
 
-What could bend the answer was fixed before the first result was seen: the grid, the forests, whose seeds begin at
-`SEED`, the time (`HORIZON`), and what counts: the error of the position, averaged over time and forests. A carrier
-without a pose counts as `UNKNOWN` off. The map is exact: the errors of a map would be the same for all scanners, and
-larger than the differences between them.
+To avoid bias, these were fixed before the first result was seen: the grid; the forests, whose seeds begin at `SEED`;
+the duration of a drive (`HORIZON`); and the criterion, the error of the present position, averaged over time and
+forests. Without a pose, the error is `UNKNOWN`. The map is exact: the errors of a map would be the same for all
+scanners, and larger than the differences between them.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ HEIGHTS = (1.5, 2.0, 3.0, 4.5)
 """The heights of the scanner over the ground that are compared, in m."""
 BEAMS = (4, 8, 16, 32)
 """The numbers of beams that are compared, with the same field of view and number of rays per second."""
-
-
 COMPARED = (
     "time",
     "dps.env.pose.position",
@@ -50,27 +48,22 @@ COMPARED = (
 """The addresses of the arguments of `position_error`."""
 
 
-def distance_off(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
-    """Return how far the position that the DPS tells is from the true one at that time, in m; NaN without a pose.
+def position_error(time: float, position: Array, stamp: float, truth: Array, velocity: Array) -> float:
+    """Return the error of the position of the DPS in m: 0 before `SETTLING`, at most `UNKNOWN`, also without a pose.
 
-    The DPS told it up to one of its periods ago. How far the carrier has come since then is no error.
+    The position is up to one period of the DPS old. The motion of the carrier since then does not count.
 
     Args:
-        time: In s.
-        position: Of the DPS, (2,) in m; NaN without a pose.
-        told: The time for which it holds, in s.
+        time: The time in s.
+        position: The position by the DPS, (2,) in m; NaN without a pose.
+        stamp: The time in s for which this position holds.
         truth: The true pose of the carrier, (6,) in m and rad.
-        velocity: Its true velocity, angular (rad/s) and linear (m/s), (6,).
+        velocity: The true velocity of the carrier, angular (rad/s) and linear (m/s), (6,).
     """
-    place = np.asarray(truth)[:2] - (time - float(told)) * np.asarray(velocity)[3:5]
-    return float(np.hypot(*(np.asarray(position) - place)))
-
-
-def position_error(time: float, position: Array, told: float, truth: Array, velocity: Array) -> float:
-    """Return `distance_off`, but 0 before `SETTLING`, and `UNKNOWN` if it is larger or if there is no pose."""
     if time < SETTLING:
         return 0.0
-    error = distance_off(time, position, told, truth, velocity)
+    place = np.asarray(truth)[:2] - (time - float(stamp)) * np.asarray(velocity)[3:5]
+    error = float(np.hypot(*(np.asarray(position) - place)))
     return min(error, UNKNOWN) if np.isfinite(error) else UNKNOWN
 
 
@@ -79,7 +72,7 @@ def scanner_problem(beams: int, *, seeds: Sequence[int]) -> vtb.Problem:
 
     Args:
         beams: The number of beams.
-        seeds: Those of the forests.
+        seeds: The seeds of the forests.
     """
     scenario = ForestScenario(map="exact")
     scenario.scanner.rows = beams

@@ -41,17 +41,17 @@ Array = NDArray[np.float64]
 
 PERCEPTIONS = ("scanner", "stereo")
 
-# What a detector assumes of a scanner whose ranges are exact, in m.
+# The least standard deviation of ranges, in m, that a detector assumes, also of a scanner with exact ranges.
 _LEAST_RANGE_NOISE = 0.005
 
-# How far the vertical is off, in rad, per axis, which displaces what a high sensor sees. It is about the larger one of
-# both that `drives` prints, for later than ten seconds after the start: the first seconds are worse. What lasts all
-# drive, as of a scanner that is mounted askew, is not simulated, and not contained.
+# Standard deviation of the error of the vertical in rad, per axis, which displaces the detections of a high sensor. It
+# is about the larger one of roll and pitch that `drives` prints for later than ten seconds after the start; the first
+# seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not contained.
 _LEVELLING = 0.001
 
 
 def plant_config() -> MultibodyPlantConfig:
-    """Return the configuration of the plant: discrete, as the wheels are stepped with it."""
+    """Return the configuration of the plant: discrete, as the wheels are updated with its time step."""
     return MultibodyPlantConfig(time_step=0.01, discrete_contact_approximation="sap", use_sampled_output_ports=False)
 
 
@@ -118,16 +118,16 @@ class CarrierScenario(Scenario):
     scanner_tilt_deg: float = 0.0
     # Errors of the IMU: noise, bias and drift are those of gyros (rad/s) and accelerometers (m/s^2) alike.
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=2e-3, bias=5e-4, drift=1e-5))
-    # Errors of the wheels' speed in m/s, and by which factor it is wrong.
+    # Errors of the measured speed of the wheels in m/s, and its factor: measured over true speed.
     odometry_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
     odometry_scale: float = 1.01
-    # The drive: speed in m/s, the route on which it begins and that is advised at first, how far along it in m, and the
-    # number of rounds after which the driver stops.
+    # The drive: speed in m/s, the number of the first route, which is also advised at first, the distance along it in m
+    # at which the drive begins, and the number of laps after which the driver stops.
     speed: float = 1.0
     route: int = 0
     start: float = 0.0
     laps: int = 100
-    # From the sample of a scan in the DPS to its pose, in s.
+    # Time from the sample of a scan in the DPS to its pose, in s.
     localizer_latency: float = 0.1
 
     def validate(self) -> None:
@@ -173,7 +173,7 @@ class CarrierScenario(Scenario):
 
     @abstractmethod
     def truth(self) -> WorldModel:
-        """Return the landmarks as they are."""
+        """Return the true landmarks."""
 
     @abstractmethod
     def surveyed_map(self) -> WorldModel:
@@ -204,13 +204,13 @@ class CarrierScenario(Scenario):
         return found
 
     def check_perception(self) -> None:
-        """Raise a ValueError if the DPS cannot see landmarks with its scanner.
+        """Check the configuration of the sensor that detects landmarks.
 
         Raises:
-            ValueError: A value that no scanner can have, or a scan that takes too long.
+            ValueError: A value of the scanner is outside of its range, or a scan takes too long.
         """
         self.scanner.check(PERIOD)
-        # Half of what the DPS remembers, as a scan may wait for the one before it.
+        # A scan takes at most half of the history, as it may have to wait for the one before it.
         least = 2.0 / HISTORY_LENGTH
         if self.scanner.frequency < least:
             raise ValueError(
@@ -219,13 +219,13 @@ class CarrierScenario(Scenario):
             )
 
     @property
-    def eye_period(self) -> float:
-        """The time from one sample of what the DPS sees landmarks with to the next, in s."""
+    def perception_period(self) -> float:
+        """The period of the sensor that detects landmarks, in s."""
         return 1.0 / self.scanner.frequency
 
     def perception_signals(self) -> list[Signal]:
-        """Return the signals of what the DPS sees landmarks with."""
-        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.eye_period)]
+        """Return the signals of the sensor that detects landmarks."""
+        return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.perception_period)]
 
     def interface(self) -> Interface:
         last = len(self.routes()) - 1.0
@@ -241,7 +241,7 @@ class CarrierScenario(Scenario):
 
     @abstractmethod
     def detector(self) -> Callable[..., Landmarks]:
-        """Return how the DPS finds landmarks in scans or images, see `Localizer`."""
+        """Return the function that detects landmarks in scans or images, see `Localizer`."""
 
     def scanner_accuracy(self) -> dict[str, float]:
         """Return the angles between rays (rad) and the noise of ranges (m), named as detectors name them."""
@@ -253,7 +253,7 @@ class CarrierScenario(Scenario):
         }
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
-        """Return how the DPS localizes itself on a map, which has errors as ``map`` says."""
+        """Return the localization unit for a map, which has the errors of ``map``."""
         landmarks, correlation = map_landmarks(world_map, self.landmark), MAPS[self.map].correlation
         x, y, z = self.X_BL.translation().tolist()
         tracker = Tracker(
@@ -278,7 +278,7 @@ class CarrierScenario(Scenario):
         return make_dps(world_map, localizer, signals, latency=self.localizer_latency, drift=DriftModel())
 
     def deployment(self) -> Deployment:
-        return make_deployment(scan_map("SCAN", "scan"), period=self.eye_period)
+        return make_deployment(scan_map("SCAN", "scan"), period=self.perception_period)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
@@ -322,11 +322,11 @@ class CarrierScenario(Scenario):
         builder.connect(wheels.GetOutputPort("speed"), odometer.GetInputPort("speed"))
         builder.sim_sensor("odometry", odometer.get_output_port())
         self.add_perception(builder)
-        # So old are the samples of IMU and odometry.
+        # The samples of IMU and odometry are one period old.
         declare_belief(builder, carrier, ground, routes, age=PERIOD)
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
-        """Add what the DPS sees landmarks with to the simulated world: the scanner."""
+        """Add the sensor that detects landmarks to the simulated world: the scanner."""
         from vtbdrake.components.ray_casting import RayCaster
         from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
 
@@ -348,7 +348,7 @@ class ForestScenario(CarrierScenario):
 
     landmark: ClassVar[str] = "tree"
 
-    # What the unit sees with: scanner or stereo; and the pair of cameras.
+    # The sensor that detects trees, scanner or stereo; and the pair of cameras.
     perception: str = "scanner"
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
@@ -414,8 +414,8 @@ class ForestScenario(CarrierScenario):
             self.stereo.check()
 
     @property
-    def eye_period(self) -> float:
-        return super().eye_period if self.perception == "scanner" else 1.0 / self.stereo.rate
+    def perception_period(self) -> float:
+        return super().perception_period if self.perception == "scanner" else 1.0 / self.stereo.rate
 
     def perception_signals(self) -> list[Signal]:
         if self.perception == "scanner":
@@ -423,7 +423,7 @@ class ForestScenario(CarrierScenario):
         from pydrake.systems.sensors import ImageRgba8U
 
         image = ImageRgba8U(self.stereo.width, self.stereo.height)
-        return [Signal(name, model_value=image, max_age=5.0 * self.eye_period) for name in IMAGES]
+        return [Signal(name, model_value=image, max_age=5.0 * self.perception_period) for name in IMAGES]
 
     def detector(self) -> Callable[..., Landmarks]:
         if self.perception == "scanner":
@@ -442,7 +442,7 @@ class ForestScenario(CarrierScenario):
         if self.perception == "scanner":
             return super().deployment()
         images = image_array_map("IMAGES", {name: name for name in IMAGES})
-        return make_deployment(images, period=self.eye_period)
+        return make_deployment(images, period=self.perception_period)
 
     def add_perception(self, builder: VirtualTestbedBuilder) -> None:
         if self.perception == "scanner":
@@ -461,7 +461,7 @@ class PlainScenario(CarrierScenario):
     relief: float = 0.5
     bumps: float = 0.02
     scanner: LaserScannerConfig = field(default_factory=plain_scanner_config)
-    # The share of the ground that rocks cover, and the diameter of the least rocks in m, see `RockField`.
+    # The share of the ground that rocks cover, and the diameter of the smallest rocks in m, see `RockField`.
     abundance: float = 0.05
     least_diameter: float = 0.3
     # Width of the tracks and distance between them, in m.

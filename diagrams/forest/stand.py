@@ -29,7 +29,7 @@ _TREES, _MAP, _STORM = 0, 1, 10
 # Coefficients of Näslund's curve h = 1.3 m + d² / (a + b d)² with d in cm, assumed: 20 m at 30 cm.
 _NAESLUND = (1.2, 0.19)
 
-# Random sequential placement of discs ends at a coverage of 0.547; the last per cent take ever more attempts.
+# Random sequential placement of discs ends at a coverage of 0.547; near it, the number of attempts grows.
 _LARGEST_COVERAGE = 0.45
 
 KINDS = ("natural", "clustered", "plantation", "windthrown")
@@ -54,7 +54,7 @@ class MapErrors:
 
     Attributes:
         position: Standard deviation of the positions in m, per axis.
-        missing: The share of the trees that the map does not have.
+        missing: The share of the trees that are missing on the map.
         wrong: The share of the map's entries that are no trees, from 0 to below 1.
         diameter: Standard deviation of the diameters as a share of the diameter.
         correlation: Length L in m over which errors of position are correlated, as exp(-r² / (2 L²)) at the distance r;
@@ -77,7 +77,7 @@ class MapErrors:
             )
 
 
-# The maps by which localization is judged. The diameters of the accurate map are assumed to be 5 % off.
+# The diameters of the accurate map are assumed to have a standard deviation of 5 %.
 ACCURATE = MapErrors(position=0.10)
 REMOTE = MapErrors(position=0.35, missing=0.3, wrong=0.1, diameter=0.2)
 POOR = MapErrors(position=0.7, missing=0.3, wrong=0.1, diameter=0.2, correlation=40.0)
@@ -177,7 +177,7 @@ class Stand:
         return quantiles
 
     def trees(self) -> WorldModel:
-        """Return the trees as they are: exact positions, trunk diameters and heights in m."""
+        """Return the true trees: exact positions, trunk diameters and heights in m."""
         rng = np.random.default_rng([self.seed, _TREES])
         places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
         diameters = self.diameters(rng.random(self.count))
@@ -189,13 +189,12 @@ class Stand:
         return WorldModel(objects)
 
     def map(self, errors: MapErrors, *, seed: int = 0) -> WorldModel:
-        """Return a map of the trees with errors; its identities tell nothing about which tree is meant.
+        """Return a map of the trees with errors; its identities do not show which tree is meant.
 
-        Its covariances are those of the errors of position, per tree: that errors of neighbours are correlated is
-        nothing that a world model could say.
+        Its covariances are those of the errors of position, per tree: a world model cannot contain correlations.
 
         Args:
-            errors: What is wrong with it.
+            errors: The errors of the map.
             seed: Determines the errors, together with the seed of the stand.
         """
         rng = np.random.default_rng([self.seed, _MAP, seed])
@@ -218,7 +217,7 @@ class Stand:
         size = np.array([self.length, self.width])
         clusters = round(_CLUSTERS * self.length * self.width / HECTARE) if self.kind == "clustered" else 0
         parents = rng.random((clusters, 2)) * size
-        # The places by cells that are as wide as the spacing: trees that are too close lie in one of nine cells.
+        # Places by cells as wide as the spacing: trees that are too close lie in the same or in neighbouring cells.
         cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
         places: list[tuple[float, float]] = []
         attempts = 0
@@ -287,15 +286,15 @@ def surveyed(
     area: tuple[float, float],
     false_diameters: Callable[[Array], Array],
 ) -> tuple[Array, Array]:
-    """Return places (m, 2) and diameters (m,) as a survey with errors gives them, in random order.
+    """Return the surveyed positions (m, 2) and diameters (m,) of objects, with errors and in random order.
 
     Args:
-        rng: The random numbers of the survey.
-        places: x and y of what is there in m, shape (n, 2).
-        diameters: The diameters in m, shape (n,).
-        errors: What is wrong with the survey.
-        area: Extents in x and y in m, from 0 on, in which there are entries for nothing.
-        false_diameters: Gives the diameters of those in m from numbers that are uniform in [0, 1).
+        rng: The generator of the random numbers.
+        places: The true positions (x, y) in m, shape (n, 2).
+        diameters: The true diameters in m, shape (n,).
+        errors: The errors of the survey.
+        area: The extents in x and y in m, from 0 on, in which wrong entries are placed.
+        false_diameters: Returns diameters of wrong entries in m for numbers that are uniform in [0, 1).
     """
     kept = rng.permutation(len(places))[: len(places) - round(errors.missing * len(places))]
     false = round(len(kept) * errors.wrong / (1.0 - errors.wrong))
@@ -316,7 +315,7 @@ def tree_height(diameter: float) -> float:
 
 
 def _tree(identity: str, place: Array, diameter: float, *, errors: MapErrors | None = None, source: str) -> WorldObject:
-    """Return a tree that stands at a place (2,); without errors, it is exactly there."""
+    """Return a tree at a place (2,), with the covariance of these errors; without errors, its position is exact."""
     position, share = (errors.position, errors.diameter) if errors else (0.0, 0.0)
     return WorldObject(
         identity,

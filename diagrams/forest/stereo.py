@@ -1,4 +1,4 @@
-"""The pair of cameras that may take the place of the laser scanner: what it is, and how the DPS sees trunks with it."""
+"""The pair of cameras that can replace the laser scanner: its configuration, and the detection of trunks with it."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Array = NDArray[np.float64]
 IMAGES = ("left_image", "right_image")
 """The names of the signals of the left and the right camera."""
 
-# A camera's x is to the right and its y down; the frame L has x ahead and z up.
+# In the frame of a camera, x points to the right and y down; in L, x points forward and z up.
 _R_LC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
 @dataclass
 class StereoConfig:
-    """Two cameras side by side, which look along x of the frame L, and how their images are compared."""
+    """Two cameras side by side, which look along x of the frame L, and the matching of their images."""
 
     # Pairs of images per second.
     rate: float = 2.0
@@ -46,14 +46,14 @@ class StereoConfig:
     noise: float = 1.5
     # Determines the noise.
     seed: int = 0
-    # The largest disparity in pixels, a multiple of 16: what is nearer is not seen.
+    # The largest disparity in pixels, a multiple of 16: nearer objects are not detected.
     largest_disparity: int = 32
 
     def check(self) -> None:
-        """Raise a ValueError if there is no such pair.
+        """Check that all values are possible.
 
         Raises:
-            ValueError: A value that no pair of cameras can have.
+            ValueError: A value is outside of its range.
         """
         if not (self.rate > 0.0 and 0.0 < self.field_of_view < np.pi and self.noise >= 0.0):
             raise ValueError(
@@ -76,7 +76,7 @@ class StereoConfig:
         return StereoCamera.of(self.info(), baseline=self.baseline)
 
     def matcher(self) -> StereoMatcher:
-        """Return how the images are compared."""
+        """Return the matcher of the images."""
         return StereoMatcher(largest_disparity=self.largest_disparity)
 
     def poses(self) -> dict[str, RigidTransform]:
@@ -91,9 +91,9 @@ class StereoLandmarks:
 
     Attributes:
         camera: The geometry of the pair.
-        matcher: How disparities are found.
-        detector: How trunks are found in them.
-        X_BC: Pose of the left camera, as the DPS knows it.
+        matcher: The matcher that computes disparities.
+        detector: The settings of the detector of trunks.
+        X_BC: Pose of the left camera in the DPS.
     """
 
     camera: StereoCamera
@@ -111,9 +111,9 @@ class StereoLandmarks:
 
         Args:
             left: The image of the left camera.
-            right: The image of the right one, of the same time.
+            right: The image of the right camera, of the same time.
             history: The port ``history`` of the `DeadReckoning`.
-            time: When they were taken, by the clock of the DPS, in s.
+            time: The time of the images by the clock of the DPS, in s.
         """
         _, roll, pitch, *_ = carrier_pose_at(history, time)
         X_HB = RigidTransform(RotationMatrix(body_rotation(roll, pitch)), np.zeros(3))
@@ -125,9 +125,9 @@ def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfi
     """Add the cameras ``left_camera`` and ``right_camera`` with the ``light`` to a simulated world.
 
     Args:
-        builder: With a finalized plant.
+        builder: The builder of the testbed, with a finalized plant.
         frame: The frame L of the pair.
-        config: What the pair is like.
+        config: The configuration of the pair.
     """
     from vtbdrake.components.environment.light import Light, LightConfig
     from vtbdrake.components.sensors import ErrorModel
@@ -136,7 +136,7 @@ def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfi
     light = LightConfig(
         direction=[0.6, 0.4, -0.7],
         intensity=1.6,
-        # The sky from the other side, with the exposure of a camera that sees no white.
+        # Light of the sky from the other side, such that no pixel of an image is saturated.
         earth_direction=[-0.7, -0.5, -0.5],
         earth_shine=0.9,
         background=[0.6, 0.7, 0.8],

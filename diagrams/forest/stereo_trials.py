@@ -1,9 +1,10 @@
-"""Trials of the detection of trunks by stereo: by how many pixels it errs, and whether its covariances say so.
+"""Trials of the detection of trunks by stereo: its errors in pixels, and their consistency with the covariances.
 
 ``python -m vtbdrake_diagrams.forest.stereo_trials [--forests N] [--views N] [--seed S]`` takes pairs of images along
-the routes of forests, finds trunks in them, compares each with the tree that fits best by its own covariance, and
-prints a table by distance. A detection with a squared error of more than 25 (of 2 degrees of freedom) is called false:
-one of a crown, or of several trees. The constants of `StereoTrunkDetector` were calibrated with forests of other seeds.
+the routes of forests, detects trunks in them, compares each with the tree that fits best by the covariance of the
+detection, and prints a table by distance. A detection with a squared error of more than 25 (of 2 degrees of freedom)
+counts as false: it shows a crown, or several trees. The constants of `StereoTrunkDetector` were calibrated with forests
+of other seeds.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ Array = NDArray[np.float64]
 
 SEED = 200_000
 FALSE = 25.0
-"""A detection is false if its squared normalized error is larger."""
+"""The largest squared normalized error of a detection that does not count as false."""
 BANDS = ((0.0, 6.0), (6.0, 9.0), (9.0, 12.0), (12.0, 16.5))
 """The limits of the distances by which errors are listed, in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoTrials:
-    """What was detected, one row per detection.
+    """The errors of all detections, one element per detection.
 
     Attributes:
-        distance: Of the tree that fits best from the camera, in m, shape (n,).
-        disparity: By how much the disparity is wrong, in pixels, shape (n,).
-        middle: By how much the column of the middle is wrong, in pixels, shape (n,).
-        width: By how much the width is wrong, in pixels, shape (n,).
+        distance: Distance of the tree that fits best from the camera in m, shape (n,).
+        disparity: Errors of the disparity in pixels, shape (n,).
+        middle: Errors of the column of the middle in pixels, shape (n,).
+        width: Errors of the width in pixels, shape (n,).
         squares: Squared errors of the position, normalized by the covariance, shape (n,).
         seconds: Processor time per pair of images in s.
     """
@@ -75,7 +76,7 @@ def errors(found: Landmarks, trees: Landmarks, eye: Array, camera: StereoCamera)
 
 
 def run(*, forests: int = 4, views: int = 12, seed: int = SEED) -> StereoTrials:
-    """Return what is detected in ``forests`` forests, in ``views`` views of each."""
+    """Return the detections in ``forests`` forests, in ``views`` views of each."""
     rows, seconds = [], 0.0
     for number in range(seed, seed + forests):
         scenario = ForestScenario(seed=number, perception="stereo")
@@ -112,17 +113,14 @@ def report(trials: StereoTrials) -> str:
     for nearest, farthest in BANDS:
         band = (trials.distance >= nearest) & (trials.distance < farthest)
         right = band & (trials.squares < FALSE)
-        spread = [f"{values[right].mean():+.2f} +- {values[right].std():.2f}" for values in _pixels(trials)]
+        pixels = (trials.disparity, trials.middle, trials.width)
+        spread = [f"{values[right].mean():+.2f} +- {values[right].std():.2f}" for values in pixels]
         false = f"{100.0 * (1.0 - right.sum() / max(band.sum(), 1)):.0f} %"
         rows.append(
             [f"{nearest:g} to {farthest:g}", f"{band.sum()}", false, *spread, f"{trials.squares[right].mean():.2f}"]
         )
     head = ["m", "trunks", "false", "disparity", "middle", "width", "NEES (2)"]
     return f"{table(head, rows)}\nprocessor time per pair of images: {1e3 * trials.seconds:.1f} ms"
-
-
-def _pixels(trials: StereoTrials) -> tuple[Array, Array, Array]:
-    return trials.disparity, trials.middle, trials.width
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -4,16 +4,16 @@
 simulates the detections (`detections`), and prints a table: how often the matching of constellations was sure and
 right, sure and wrong, or not sure, with its errors, consistency and time.
 
-What counts, fixed before any result was seen:
+The criteria, fixed before any result was seen:
 
 * Places and headings are uniform in a stand of 1 ha; in the cases ``inside``, at least `MARGIN` from its edge, and in
-  the cases ``edge`` nearer, where much of what could be seen is missing. Where a stand ends, there are no trees.
-* A place ``outside`` lies in another stand of the same kind, which the map does not show: what is sure there is wrong.
+  the cases ``edge`` nearer, where fewer trees are within reach: there are none outside of the stand.
+* A place ``outside`` lies in another stand of the same kind, which the map does not show: each sure pose is wrong.
 * A pose is right if it is nearer to the true one than 0.2 m plus four standard deviations of the map's positions, and
   turned by less than `LARGEST_TURN`.
 * With the poor map, landmarks are gathered along a drive of 40 m; in a plantation also with the remote one, beside the
   trials from one place.
-* Seeds begin at 100,000. No constant of the matching may be chosen by these trials.
+* Seeds begin at 100,000. No constant of the matching may be chosen with these trials.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ DENSITIES = (300.0, 600.0, 1000.0)
 GOALS = {"accurate": 0.97, "remote": 0.95, "poor": 0.90}
 """The least share of the places inside that must be recognized: right and sure."""
 LARGEST_WRONG = 1e-3
-"""The share of the trials that are wrong and sure must be less."""
+"""The limit below which the share of the trials that are wrong and sure must be."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class Case:
     """A kind of trial.
 
     Attributes:
-        stand: ``natural`` or ``plantation``.
+        stand: The kind of stand, ``natural`` or ``plantation``.
         density: Trees per hectare.
-        map: ``accurate``, ``remote`` or ``poor``.
-        place: ``inside``, ``edge`` or ``outside``.
+        map: The map, ``accurate``, ``remote`` or ``poor``.
+        place: The place of the carrier, ``inside``, ``edge`` or ``outside``.
         is_driven: Whether landmarks are gathered along a drive; with the poor map, they always are.
     """
 
@@ -68,7 +68,7 @@ class Case:
 
     @property
     def way(self) -> float:
-        """Along how many metres landmarks are gathered."""
+        """The distance in m along which landmarks are gathered."""
         return DRIVE if self.is_driven or self.map == "poor" else 0.0
 
     @property
@@ -79,13 +79,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one trial.
+    """The result of one trial.
 
     Attributes:
-        is_sure: Whether the pose was claimed.
-        is_right: Whether it is the true one.
-        position: Distance of the pose from the true one in m.
-        heading: Its error of heading in rad.
+        is_sure: Whether the pose is sure.
+        is_right: Whether the pose is sure and right.
+        position: Error of the position in m.
+        heading: Error of the heading in rad.
         nees: Normalized estimation error squared, of 3 degrees of freedom.
         seconds: CPU time of the matching, the table of the map not included.
     """
@@ -115,10 +115,10 @@ def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Od
     """Run one trial.
 
     Args:
-        case: Its kind.
+        case: The kind of trial.
         seed: Determines stand, map, place and detections.
-        detector: Its performance; by default that of `Detector`, with a share of false trunks from 0.3 to 0.4.
-        odometry: The drift over a drive.
+        detector: The detector; by default that of `Detector`, with a share of false trunks from 0.3 to 0.4.
+        odometry: The drift of the dead reckoning; by default that of `Odometry`.
     """
     rng = np.random.default_rng([seed, 7])
     stand = _stand(case, seed)
@@ -132,7 +132,7 @@ def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Od
 
 
 def judged(constellation: ConstellationMap, local: Landmarks, X_WH: Array, case: Case) -> Trial:
-    """Return what came of matching local landmarks whose true pose is known."""
+    """Return the result of matching local landmarks whose true pose is known."""
     begin = time.process_time()
     fix = constellation.locate(local)
     seconds = time.process_time() - begin

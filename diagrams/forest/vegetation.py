@@ -1,7 +1,7 @@
-"""What grows in a forest, as meshes for scanners and cameras: trunks, crowns, dead branches and undergrowth.
+"""The vegetation of a forest as meshes for scanners and cameras: trunks, crowns, dead branches and undergrowth.
 
-Everything of one kind is one mesh, because geometries cost time one by one. Trunks are landmarks; the rest is clutter:
-it hides trunks, and looks like them at times. All dimensions that the world model does not give are assumed.
+Everything of one kind is one mesh, because each geometry costs time. Trunks are landmarks; the rest is clutter: it
+hides trunks, and is sometimes mistaken for them. All dimensions that the world model does not contain are assumed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 BREAST_HEIGHT = 1.3
 """The height over the ground in m at which the diameter of a trunk is measured."""
 
-# The number of facets of a trunk, and how deep it stands in the ground, in m.
+# The number of facets of a trunk, and its depth in the ground in m.
 _FACETS, _ROOTED = 24, 0.5
 # The height at which a crown begins, and its diameter, as shares of the tree's height.
 _CROWN_BASE, _CROWN_DIAMETER = 0.45, 0.2
@@ -29,7 +29,7 @@ _BRANCH_HEIGHT, _BRANCH_LENGTH, _BRANCH_RADIUS, _BRANCH_ELEVATION = (0.4, 5.0), 
 # A bush: the number of its blades, and ranges of its radius and height and of the width of a blade, in m.
 _BLADES, _BUSH_RADIUS, _BUSH_HEIGHT, _BLADE_WIDTH = 30, (0.2, 0.6), (0.3, 1.3), (0.01, 0.06)
 
-# Streams of random numbers, beside those of `stand`, `ground`, `routes` and `plain`.
+# Streams of random numbers; `stand`, `ground`, `routes` and `plain` have others.
 _BRANCHES, _UNDERGROWTH, _LEAN = 4, 5, 8
 
 # A flat, pointed leaf in the plane of x and z.
@@ -38,7 +38,7 @@ _BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]
 
 @dataclass(frozen=True)
 class Vegetation:
-    """How trees grow, and how much clutter there is.
+    """The lean of trunks, and the amount of clutter.
 
     Attributes:
         seed: Determines directions and places.
@@ -62,12 +62,12 @@ class Vegetation:
             raise ValueError(f"trunks lean by a standard deviation within [0, 0.2] rad, not {self.lean:g} rad")
 
     def leans(self, trees: WorldModel) -> Array:
-        """Return how far each trunk leans in x and y per m of height, (n, 2)."""
+        """Return the lean of each trunk in x and y, in m per m of height, (n, 2)."""
         return np.random.default_rng([self.seed, _LEAN]).normal(0.0, self.lean, (len(trees), 2))
 
 
 def feet(trees: WorldModel, ground: Ground) -> Array:
-    """Return where the trees stand, (n, 3) in m: at their x and y in W, on the ground."""
+    """Return the feet of the trees, (n, 3) in m: at their x and y in W, on the ground."""
     p = trees.positions()
     return np.column_stack([p[:, :2], ground.height(p[:, 0], p[:, 1])])
 
@@ -80,8 +80,8 @@ def trunks(trees: WorldModel, ground: Ground, vegetation: Vegetation) -> Surface
 
     Args:
         trees: The trees, with the attributes ``trunk_diameter`` and ``height`` in m.
-        ground: What they stand on.
-        vegetation: How far they lean.
+        ground: The ground.
+        vegetation: The vegetation, for the lean of the trunks.
     """
     diameters, heights = _sizes(trees)
     length = heights + _ROOTED
@@ -124,11 +124,11 @@ def undergrowth(
     """Return bushes: bundles of blades that stand up and lean outwards.
 
     Args:
-        ground: What they grow on.
-        vegetation: How many.
+        ground: The ground.
+        vegetation: The vegetation, for the number of bushes.
         lower: The least x and y of the area in m, shape (2,).
         upper: The largest x and y of the area in m, shape (2,).
-        roads: Points of the roads in m, (n, 2), and how far from them nothing grows, in m.
+        roads: Points of the roads in m, (n, 2), and the distance from them within which nothing grows, in m.
     """
     rng = np.random.default_rng([vegetation.seed, _UNDERGROWTH])
     count = rng.poisson(vegetation.undergrowth * float(np.prod(upper - lower)) / 1e4)

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 # The ground goes on around a stand by this distance, in m.
 _MARGIN = 15.0
 
-# The extents of images with grain in m: of bark, which is drawn out upwards, and of everything else.
+# The extents of grained images in m: of bark, which is stretched upwards, and of everything else.
 _BARK_TILE, _TILE = (2.0, 40.0), (5.0, 5.0)
 
 _SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
@@ -89,8 +89,8 @@ def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> N
 
     Args:
         plant: A plant that is registered with a SceneGraph, and not finalized.
-        rock_field: The rocks as they are.
-        ground: What they lie on.
+        rock_field: The rocks.
+        ground: The ground.
     """
     add_ground(plant, ground, length=rock_field.length, width=rock_field.width, color=_SAND)
     rocks = rock_field.rocks()
@@ -103,15 +103,15 @@ def add_forest(
 ) -> None:
     """Register a stand on its ground, with branches and undergrowth, on the world body of a plant.
 
-    Scanners, cameras and Meshcat see it. Nothing collides with it: a driver keeps away from trees, and the wheels of a
-    carrier know the ground.
+    Scanners, cameras and Meshcat show it. Nothing collides with it: the driver keeps away from trees, and the wheels
+    compute the forces of the ground from its height.
 
     Args:
         plant: A plant that is registered with a SceneGraph, and not finalized.
-        stand: The trees as they are.
-        ground: What they stand on.
-        vegetation: How trees lean, branches and undergrowth.
-        textured: Whether all surfaces are grained, as stereo cameras need it; images then take longer to render.
+        stand: The stand.
+        ground: The ground.
+        vegetation: The vegetation, for lean, branches and undergrowth.
+        textured: Whether all surfaces are grained, as matching of stereo images needs it; rendering then takes longer.
     """
     even, upright = (_TILE, _BARK_TILE) if textured else (None, None)
     add_ground(plant, ground, length=stand.length, width=stand.width, tile=even)

@@ -40,7 +40,7 @@ from vtbdrake.scan import Scan
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.carrier import Carrier
-from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main, told
+from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main, status_text
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.perception import Localizer
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
@@ -360,8 +360,8 @@ def test_display_follows_the_pose(drive: Drive) -> None:
 
 def test_display_tells_how_well_the_position_is_known() -> None:
     turned = np.array([[0.0026, 0.0024], [0.0024, 0.0026]])  # variances 0.005 and 0.0002 m^2
-    assert told(TRACKING, turned) == "tracking ±0.21 m"
-    assert told(LOST, np.diag([np.inf, np.inf])) == "lost"
+    assert status_text(TRACKING, turned) == "tracking ±0.21 m"
+    assert status_text(LOST, np.diag([np.inf, np.inf])) == "lost"
 
 
 def test_display_of_another_scenario_is_refused() -> None:
