@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,11 +25,14 @@ from vtbdrake.reasoning.budget import Budget, check_budget
 from vtbdrake.reasoning.decision import Decision
 from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
+from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.addressed import AddressedDiagram
+
+_log = logging.getLogger(__name__)
 
 # The time limit of a rollout in a process, if none is given, is at least this, in seconds.
 _LEAST_TIME_LIMIT = 10.0
@@ -147,6 +151,7 @@ class Reasoner:
         self.task = replace(self.problem.task, catch=True, pruning=pruning)
         testbed = self.problem.testbed
         self.starter = Starter(testbed, uncertainty=uncertainty, seed=seed, max_age=max_age)
+        self._unbelieved = UnbelievedReadings(testbed, uncertain=uncertainty or ())
         # Reads values from a start.
         self._beginning = Beginning(testbed, testbed.default_context(), testbed.copier_from(testbed))
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
@@ -165,6 +170,7 @@ class Reasoner:
             self._check_executor()
         self._alone = threading.Lock()
         self._warm = False
+        self._has_warned = False
         self._closed = False
 
     def __repr__(self) -> str:
@@ -239,24 +245,27 @@ class Reasoner:
                 self._check_executor()
                 self._warm_up()
             begin = time.monotonic()
-            starts = self._starts(believer, context, now)
+            if isinstance(believer, AddressedDiagram):
+                if context is None:
+                    raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")
+                believer, now = Belief.of(believer, context), max(now, context.get_time())
+            starts = self._starts(believer, now)
             held = self._plan_in_use(starts[0])
             given = None if plan is None else self.space.point(plan, starts[0].time)
             try:
-                return DecisionRun(self, budget, starts, held, given, begin).decision()
+                decision = DecisionRun(self, budget, starts, held, given, begin).decision()
             except BaseException:
                 self._warm = False  # Workers that are interrupted are ended, and others take their place.
                 raise
+            doubts = self._unbelieved.warnings(believer) if isinstance(believer, Belief) else ()
+            if doubts and not self._has_warned:
+                _log.warning("the decision at t = %g s: %s", decision.time, doubts[0])
+                self._has_warned = True
+            return replace(decision, warnings=(*decision.warnings, *doubts)) if doubts else decision
 
-    def _starts(
-        self, believer: AddressedDiagram | Belief | Start, context: Context | None, now: float
-    ) -> Sequence[Start]:
+    def _starts(self, believer: Belief | Start, now: float) -> Sequence[Start]:
         if isinstance(believer, Start):
             return [believer] * self.samples
-        if isinstance(believer, AddressedDiagram):
-            if context is None:
-                raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")
-            believer, now = Belief.of(believer, context), max(now, context.get_time())
         return self.starter.starts(believer, samples=self.samples, now=now)
 
     def _plan_in_use(self, start: Start) -> dict[str, Any]:

@@ -104,6 +104,10 @@ class SampledSensor(LeafSystem):
         if self._stage is not None:
             self._stage.resume(context, y)
 
+    def measurement(self, context: Context) -> NDArray[np.float64]:
+        """Return what the sensor would measure now, without its errors, shape (n,)."""
+        return self._measure(context, self.AllocateDiscreteVariables())
+
     @abstractmethod
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         """Return the measurement without noise. Write memory for the next measurement to ``state``."""
