@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,7 +99,9 @@ def test_stopped_worker_process_skips_windows() -> None:
         os.kill(monitor.pid, signal.SIGCONT)
         before = monitor.history[-1].time
         wait_for_windows(monitor, together, len(monitor.history) + 10)
-        assert monitor.skipped >= 50
+        assert 50 <= monitor.skipped <= together.driver.cycles // CONFIG.horizon - len(monitor.history)
+        with pytest.raises(CalibrationError, match="skipped, because the worker process is too slow"):
+            monitor.calibrate()
         assert np.diff([window.time for window in monitor.history]).max() > 50 * CONFIG.window
         assert monitor.history[-1].time > before
         assert not monitor.alarms
@@ -116,6 +119,33 @@ def test_skipped_windows_are_reported_while_running() -> None:
         assert not monitor.history
         with pytest.raises(CalibrationError, match=r"not 0: run longer; \d+ windows were skipped, because samples"):
             monitor.calibrate()
+
+
+class FailingRhythm(Rhythm):
+    """A `Rhythm` that raises from 3 s on."""
+
+    def _update(self, context: Context, discrete: Any) -> None:
+        if context.get_time() > 3.0:
+            raise ZeroDivisionError("too late")
+        super()._update(context, discrete)
+
+
+class FailingPendulum(DrivenPendulum):
+    """A `DrivenPendulum` whose DPS fails."""
+
+    def make_dps(self) -> System:
+        return FailingRhythm(PERIOD)
+
+
+def test_failed_dps_has_no_residuals() -> None:
+    scenario = FailingPendulum()
+    driver = loop(DpsAlone(scenario), Line(scenario, machine(SCENARIO)), PERIOD)
+    monitor = ResidualMonitor(driver, "twin", config=replace(CONFIG, settle=0), learn=True, worker=False)
+    driver.run(cycles=300)
+    assert monitor.history[-1].time <= 3.2
+    assert monitor.skipped > 20
+    with pytest.raises(CalibrationError, match="because the DPS raised ZeroDivisionError: too late"):
+        monitor.calibrate()
 
 
 class OwnClock(Line):
@@ -212,7 +242,7 @@ def test_exceptions_of_the_dps_skip_windows(caplog: pytest.LogCaptureFixture) ->
     together.run(20)
     shadow.write({"dps.rhythm.mood": 1.0})
     together.run(200)
-    assert caplog.text.count("the DPS raised RuntimeError when its estimates were read: ") == 1
+    assert caplog.text.count("no residuals, because the DPS raised RuntimeError: not in the mood") == 1
     assert len(monitor.history) - before >= 18 and monitor.skipped >= 2
     assert "sense.position" not in [alarm.signal for alarm in monitor.alarms]
 

@@ -7,7 +7,7 @@ import pickle
 import select
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isnan, prod
 from typing import Self
 
@@ -53,7 +53,8 @@ class ResidualMonitor:
     sends the rows once per window; a worker process does the rest. If the worker is too slow, windows are skipped and
     counted; if it dies, the loop goes on, `running` becomes False, and an error is logged.
 
-    While a sensor signal is not on real, nothing is predicted; the prediction restarts afterwards.
+    While a sensor signal is not on real, nothing is predicted; the prediction restarts afterwards. In cycles in which
+    the DPS raises, it has no estimates, and their windows have no result.
 
     A window lacks a result if a sample is missing. If the machine has a clock of its own, and the loop another one,
     there are cycles without a new sample, and cycles with two, of which the first is missed. So let the machine's
@@ -76,7 +77,8 @@ class ResidualMonitor:
         places: Slices of a window by signal.
         alarms: Recent alarms, in the order in which they began.
         history: Recent windows.
-        skipped: Number of windows without a result, because rows were missing or the worker process was too slow.
+        skipped: Number of windows without a result, because samples or estimates were missing, or the worker process
+            was too slow.
         failed: Number of windows whose prediction failed; ``error`` describes the last failure.
 
     Raises:
@@ -128,8 +130,9 @@ class ResidualMonitor:
         else:
             self._comparison = Comparison(predictor, self._rows, config, mode=mode)
         self._results = 0
+        self._late = False
         self._is_warned = False
-        self._remedy = (
+        self._missing = "samples are missing: " + (
             "the clock begins the cycles of the loop: let the machine's messages do so (Deployment.pace)"
             if runtime.pace is None
             else "the loop is late, or messages are lost"
@@ -189,16 +192,13 @@ class ResidualMonitor:
     def _take_report(self, report: ResidualReport) -> None:
         self.history.extend(report.windows)
         self.skipped, self.failed, self.error = report.skipped, report.failed, report.error
+        self._late = report.late
         self._results += len(report.windows)
         share = self.skipped / max(self.skipped + self._results, 1)
         if not self._is_warned and self.skipped >= _BLIND_WINDOWS and share >= _BLIND_SHARE:
             self._is_warned = True
-            _log.warning(
-                "%d of %d windows have no residuals, because samples are missing: %s",
-                self.skipped,
-                self.skipped + self._results,
-                self._remedy,
-            )
+            windows = self.skipped + self._results
+            _log.warning("%d of %d windows have no residuals, because %s", self.skipped, windows, self._cause())
         for alarm in report.alarms:
             if alarm.ended == inf:
                 self.alarms.append(alarm)
@@ -207,6 +207,12 @@ class ResidualMonitor:
             for k, known in enumerate(self.alarms):
                 if (known.signal, known.entry, known.began) == (alarm.signal, alarm.entry, alarm.began):
                     self.alarms[k] = alarm
+
+    def _cause(self) -> str:
+        """Return why windows were skipped."""
+        if self._sampler.error:
+            return self._sampler.error
+        return "the worker process is too slow" if self._late or self.dropped else self._missing
 
     # -- results
 
@@ -264,8 +270,8 @@ class ResidualMonitor:
             if not (self.skipped or self.failed):
                 raise
             raise CalibrationError(
-                f"{error}; {self.skipped} windows were skipped, because samples were missing ({self._remedy}), and "
-                f"{self.failed} predictions failed{self.error and f' ({self.error})'}"
+                f"{error}; {self.skipped} windows were skipped, because {self._cause()}; {self.failed} predictions "
+                f"failed{self.error and f' ({self.error})'}"
             ) from error
 
     def close(self) -> None:
@@ -323,6 +329,9 @@ class Sampler:
         estimates: By age of a belief, in periods, the addresses of its estimates, which are read once per horizon.
         mode: ``shadow`` or ``twin``.
         horizon: Length of a window in periods.
+
+    Attributes:
+        error: What the DPS raised last, so that it had no estimates; empty if it never did.
     """
 
     def __init__(
@@ -341,7 +350,7 @@ class Sampler:
         self._reported = [(name, runtime.bridge.reported[name]) for name in layout.reported]
         self._counts = dict.fromkeys(layout.reported, 0)
         self._first = np.nan
-        self._last_error = ""
+        self.error = ""
 
     def fed_by_machine(self) -> bool:
         """Return whether the machine alone feeds the DPS, so that its belief is about the machine."""
@@ -363,14 +372,16 @@ class Sampler:
             row[INDEX], row[TIME] = index, cycle.time
             for name in groups[index]:
                 row[self._layout.sense[name]] = cycle.fed[name]
+        # The state of a DPS that raised stands still, while the machine moves on: it tells nothing.
+        raised = next((fault.reason for fault in cycle.verdict.faults if fault.kind == "raised"), "")
         try:
-            self._fill_answer(rows[len(groups) - 1], max(groups), cycle)
-            self._last_error = ""
+            self._fill_answer(rows[len(groups) - 1], max(groups), cycle, raised=bool(raised))
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            # Its window will lack these values. An error that repeats itself in every cycle is logged once.
-            if str(error) != self._last_error:
-                self._last_error = str(error)
-                _log.warning("the DPS raised %s when its estimates were read: %s", type(error).__name__, error)
+            raised = f"the DPS raised {type(error).__name__} when its estimates were read: {error}"
+        # Its window will lack these values. An error that repeats itself in every cycle is logged once.
+        if raised and raised != self.error:
+            self.error = raised
+            _log.warning("a window has no residuals, because %s", raised)
         return len(groups)
 
     def _by_index(self, cycle: Cycle) -> dict[int, list[str]]:
@@ -392,17 +403,20 @@ class Sampler:
             groups.setdefault(round((sent - self._first) / self._runtime.period), []).append(name)
         return groups
 
-    def _fill_answer(self, row: Array, index: int, cycle: Cycle) -> None:
-        """Fill in the DPS's actuator commands and estimates, and the reported actuator commands."""
+    def _fill_answer(self, row: Array, index: int, cycle: Cycle, *, raised: bool) -> None:
+        """Fill in the reported actuator commands, and unless it raised, what the DPS answers."""
         for name, received in self._reported:
             if received.count != self._counts[name]:
                 self._counts[name] = received.count
                 row[self._layout.reported[name]] = received.value
+        if raised and not self._twin:
+            return
         for name, place in self._layout.actuation.items():
+            # A twin is driven by what is sent, also by a fallback.
             command = cycle.verdict.actuation.get(name) if self._twin else self._runtime.actuator_command(name)
             if command is not None:
                 row[place] = command
-        for age, estimates in self._estimates:
+        for age, estimates in () if raised else self._estimates:
             if (index - age) % self._horizon == 0:
                 for place, read in estimates:
                     row[place] = np.ravel(read(self._runtime.context))
@@ -421,6 +435,7 @@ class ResidualReport:
     skipped: int = 0
     failed: int = 0
     error: str = ""
+    late: bool = False  # whether the worker process has left out rows, because it is too slow
 
 
 def _checked(comparison: Comparison, detector: AlarmDetector | None, rows: Array) -> ResidualReport:
@@ -449,20 +464,20 @@ def _serve(
     connection.send(pickle.dumps(predictor.estimates))
     layout: RowLayout = pickle.loads(connection.receive())
     comparison = Comparison(predictor, layout, config, mode=mode)
-    pending, dropped, reported, ended = ResidualReport(), 0, 0, False
+    pending, late, reported, ended = ResidualReport(), False, 0, False
     while not ended:
         blocks, ended = _waiting_blocks(connection)
-        dropped += max(0, len(blocks) - _MAX_WAITING)
+        late |= len(blocks) > _MAX_WAITING  # `Comparison` counts the windows that are left out.
         for block in blocks[-_MAX_WAITING:]:
             report = _checked(comparison, detector, np.frombuffer(block).reshape(-1, layout.width))
             report.windows = pending.windows + report.windows
-            report.skipped += dropped
+            report.late = late
             pending = report
             # Windows without a result are reported, too.
             without = report.skipped + report.failed
             if report.alarms or len(report.windows) + without - reported >= _REPORT_WINDOWS:
                 connection.send(pickle.dumps(report))
-                pending = ResidualReport(skipped=report.skipped, failed=report.failed, error=report.error)
+                pending = replace(report, windows=[], alarms=[])
                 reported = without
     connection.send(pickle.dumps(pending))
 
