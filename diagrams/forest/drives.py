@@ -525,7 +525,7 @@ def main() -> None:
         late = np.concatenate([drive.times for drive in driven.values()]) > LATE
         for when, rows in (("", slice(None)), (f", later than {LATE:g} s after the start", late)):
             roll, pitch = (_rms(angles) for angles in tilts[rows].T)
-            print(f"the vertical is off by {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
+            print(f"error of the vertical: {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
     least = least_error_along(driven, MAPS["poor"], scenario=drives.scenario)
     print(f"least error of an unbiased estimate on a poor map, by all landmarks within {REACH:g} m: {least:.2f} m")
 

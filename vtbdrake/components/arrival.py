@@ -48,10 +48,10 @@ class Arrival(LeafSystem):
         Args:
             model_value: A value of the signal, such as an image of its size.
             period: The period of the DPS, in s.
-            age: How long before its arrival a sample was taken, in s.
+            age: The time from the sampling of a value to its arrival, in s.
 
         Raises:
-            ValueError: A time is impossible, or there is no codec for the values (see `codec_of`).
+            ValueError: The period or the age is out of its range, or there is no codec for the values (see `codec_of`).
         """
         super().__init__()
         if not 0.0 < period < inf:

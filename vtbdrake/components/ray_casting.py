@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 # Vertices in m, shape (v, 3), and the triangles between them, shape (t, 3).
 Surface = tuple[Array, NDArray[np.int32]]
 
-# How far a facet may lie below the curved surface that it stands for, in m.
+# The largest distance of a facet below the curved surface that it approximates, in m.
 TOLERANCE = 1e-4
 # A half space is cast as a square of this side, in m: Embree computes with 32 bits.
 HALF_SPACE = 2000.0
@@ -36,7 +36,7 @@ class Hits:
     """The first hits of n rays.
 
     Attributes:
-        distances: From the origins of the rays in m, infinite where nothing is hit, shape (n,).
+        distances: Distances from the origins of the rays in m, infinite where nothing is hit, shape (n,).
         cosines: Cosines of the angles of incidence, 0 where nothing is hit, shape (n,).
         bodies: Indices of the bodies that are hit (one of each rigid group), -1 where nothing is hit, shape (n,).
     """
@@ -65,10 +65,10 @@ class RayCaster:
     `HALF_SPACE`. Bodies that are welded together share a scene; rays are transformed into its frame.
 
     A caster is built once per Diagram, and is immutable: contexts and threads share it. Geometry that is changed in a
-    Context afterwards is not seen.
+    Context afterwards is not hit.
 
     Attributes:
-        bodies: By rigid group, the index of the body in whose frame its scene is.
+        bodies: Index of the body in whose frame the scene is, for each rigid group.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class RayCaster:
         V_WB: Sequence[SpatialVelocity],
         reach: float = np.inf,
     ) -> Hits:
-        """Return what rays from the origin of a moving frame L hit first.
+        """Return the first hits of rays from the origin of a moving frame L.
 
         Between the time 0 and the firing times, L and the bodies move with constant velocities.
 
@@ -122,7 +122,7 @@ class RayCaster:
             V_WL: Spatial velocity of L at the time 0.
             X_WB: Poses of all bodies at the time 0, by their indices.
             V_WB: Spatial velocities of all bodies at the time 0, by their indices.
-            reach: Distance in m up to which something is hit.
+            reach: The largest distance of a hit in m.
         """
         n = len(times)
         nearest, cosines, bodies = np.full(n, reach), np.zeros(n), np.full(n, -1, dtype=np.int32)
@@ -299,7 +299,7 @@ def _fans(faces: Sequence[Sequence[int]]) -> NDArray[np.int32]:
 
 
 def _segments(radius: float) -> int:
-    """Return how many chords of a circle stay within half the `TOLERANCE`, as facets bend in two directions."""
+    """Return the number of chords of a circle within half the `TOLERANCE`, as facets approximate two curvatures."""
     return max(16, ceil(pi / acos(max(0.0, 1.0 - TOLERANCE / 2.0 / radius))))
 
 

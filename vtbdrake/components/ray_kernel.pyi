@@ -22,16 +22,16 @@ def to_body(
     bounds_B: Doubles,
     nearest: Doubles,
 ) -> tuple[Singles, Singles, Singles, Indices]:
-    """Return origins, directions, largest distances and numbers of the rays that may hit what moves with B, in B.
+    """Return origins, directions, largest distances and indices of the rays that may hit the geometry of B, in B.
 
     Args:
-        origins_W: Where the rays begin, in m, shape (n, 3).
-        directions_W: Their unit vectors, shape (n, 3).
+        origins_W: Origins of the rays in m, shape (n, 3).
+        directions_W: Unit vectors of the rays, shape (n, 3).
         times: Firing times in s, shape (n,).
         motion_WB: The motion of B in W, as in `to_world`.
-        bounds_B: Center and radius of a sphere, and lower and upper corner of a box along B's axes, around all that
-            moves with B, in m, shape (10,).
-        nearest: How far the rays reach, in m, shape (n,).
+        bounds_B: Center and radius of a sphere, and lower and upper corner of a box along B's axes, around the geometry
+            of B, in m, shape (10,).
+        nearest: Largest distances of the rays in m, shape (n,).
     """
 
 def keep_nearest(
@@ -51,9 +51,9 @@ def keep_nearest(
         distances: Distances to the hits in m, shape (m,).
         normals: Normals of the surface at the hits, of any length, shape (m, 3).
         directions: Unit vectors of the rays, shape (m, 3).
-        rays: Numbers of the rays, shape (m,).
-        body: What is hit.
-        nearest: Distances of all rays in m, shape (n,).
-        cosines: Cosines of their angles of incidence, shape (n,).
-        bodies: What they hit, shape (n,).
+        rays: Indices of the rays, shape (m,).
+        body: The index of the body that is hit.
+        nearest: Distances of the hits of all rays in m, shape (n,).
+        cosines: Cosines of the angles of incidence of all rays, shape (n,).
+        bodies: Indices of the bodies that the rays hit, shape (n,).
     """

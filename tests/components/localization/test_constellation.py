@@ -17,7 +17,7 @@ pytestmark = pytest.mark.one_python
 
 
 def landmarks(places, *, deviation=0.05):
-    """Landmarks of which the diameters are not known."""
+    """Return landmarks of unknown diameters."""
     places = np.asarray(places, dtype=float)
     n = len(places)
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.2), np.full(n, np.inf))
@@ -33,7 +33,7 @@ def scattered(rng, *, side, count, spacing):
 
 
 def seen(places_W, X_WH, rng, *, reach, deviation=0.05, missed=0.1, false=0):
-    """What is seen of the places around a pose, displaced, and false landmarks among them."""
+    """Return the detections of the places around a pose, with errors, and false landmarks among them."""
     around = transform(inverse(X_WH), places_W)
     around = around[(np.hypot(*around.T) < reach) & (rng.random(len(around)) >= missed)]
     around = around + deviation * rng.normal(size=around.shape)
@@ -95,7 +95,7 @@ def test_places_of_a_stand_are_recognized():
 
 
 def test_other_stands_are_not_recognized():
-    """In the plantations, the best of many poses that nearly match is ahead of the others by 8 to 21."""
+    """In the plantations, the best of many poses that nearly match leads by 8 to 21."""
     for kind, name, seed in (
         ("plantation", "accurate", 8000),
         ("plantation", "remote", 8003),
@@ -189,7 +189,7 @@ def test_trees_in_a_square_lattice_are_not_sure():
     ("seed", "missing"), [(2, None), (43, "count"), (93, "likelihood"), (44, "margin"), (53, "fit")]
 )
 def test_each_condition_of_the_test_of_uniqueness_counts(seed, missing):
-    """Places, qualities of map and detection, and clutter of which one condition alone does not hold."""
+    """Random cases: in the first one all conditions hold, in each of the others all but one."""
     rng = np.random.default_rng(seed)
     places = scattered(rng, side=60.0, count=120, spacing=2.0)
     of_map, of_local = rng.choice([0.1, 0.3, 0.6]), rng.choice([0.05, 0.3, 0.6])

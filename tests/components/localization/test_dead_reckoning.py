@@ -70,7 +70,7 @@ class Drive:
 
 
 def reckoned(samples, axle=0.0):
-    """The system and its context after these samples, each seen one period after it was taken."""
+    """Return the system and its context after these samples, each received one period after it was taken."""
     builder = DiagramBuilder()
     system = builder.AddSystem(DeadReckoning(period=T, axle=axle))
     times = T * (np.arange(len(samples) + 1) - 0.5)
@@ -107,7 +107,7 @@ def test_follows_a_drive_over_bumps():
 
 
 def test_bumps_beside_a_distant_axle_are_no_tilt():
-    """Pitch on a slope aside turns B about z_B, but not the heading: A swings as z_B tells."""
+    """Pitching on a side slope turns B about z_B, but not the heading: the velocity of A follows w_z."""
     drive = Drive(axle=-0.8)
     _, roll, pitch, *_ = motion_of(drive.samples()[:550], axle=-0.8)
     np.testing.assert_allclose([roll, pitch], drive.angles[548 * 20, :2], atol=5e-4)
@@ -179,7 +179,7 @@ def test_noisy_wheels_and_rocking_at_rest_are_no_bias(seed):
     )
     samples[:, :3] += bias + 0.015 * rocking + 2e-3 * rng.normal(size=(150, 3))
     samples[:, 6] += 0.02 * rng.normal(size=150)
-    # Of about 120 samples; a single one of a carrier that rocks would be off by 8e-3.
+    # The mean of about 120 samples; a single sample of a carrier that rocks has an error of 8e-3.
     np.testing.assert_allclose(value(samples, "gyro_bias"), bias, atol=1e-3)
 
 
@@ -189,7 +189,7 @@ def test_bias_across_the_vertical_is_learned_on_the_way():
     samples[:, :3] += bias
     np.testing.assert_allclose(value(samples[:550], "gyro_bias")[:2], bias[:2], atol=3e-4)
     _, roll, pitch, *_ = motion_of(samples[:550])
-    # Without that, gyros that are off by 3 mrad/s for some five seconds tilt the vertical by 15 mrad.
+    # Without the estimate, a bias of 3 mrad/s for some five seconds tilts the vertical by 15 mrad.
     np.testing.assert_allclose([roll, pitch], drive.angles[548 * 20, :2], atol=2e-3)
 
 
@@ -204,9 +204,9 @@ def test_settling_on_the_springs_is_no_bias():
 
 @pytest.mark.parametrize(("resting", "bounds"), [(2e-3, (0.0, 1e-3)), (0.02, (5e-3, 0.02))])
 def test_failed_wheel_sensor_is_no_standstill(resting, bounds):
-    """The carrier rests for 2 s and turns slowly for 20 s, while the wheels show nothing: only the shaking tells.
+    """The carrier rests for 2 s and turns slowly for 20 s, while the wheels show no speed: only the shaking shows this.
 
-    It does not if the accelerometers were as noisy at rest.
+    With accelerometers that are as noisy at rest, the estimated bias is wrong.
     """
     rng, n = np.random.default_rng(4), 1100
     samples = np.tile([0.0, 0.0, 0.0, *-G, 0.0], (n, 1))
@@ -217,7 +217,7 @@ def test_failed_wheel_sensor_is_no_standstill(resting, bounds):
     assert bounds[0] <= abs(bias) < bounds[1]
 
 
-def test_samples_that_cannot_be_are_left_out():
+def test_impossible_samples_are_left_out():
     samples = Drive().samples()[:300]
     broken = samples.copy()
     broken[200:204, 2], broken[204, 4], broken[220, 6] = np.nan, 1e300, np.inf
@@ -307,5 +307,5 @@ def test_drift_is_finite_and_not_negative(name):
             DriftModel(**{name: bad})
 
 
-def test_motion_has_the_size_it_says():
+def test_motion_has_the_declared_size():
     assert DeadReckoning(period=T).GetOutputPort("motion").size() == MOTION

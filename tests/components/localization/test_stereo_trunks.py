@@ -123,7 +123,7 @@ def test_diameter_of_a_trunk_that_is_half_hidden_is_unknown() -> None:
 
 
 def test_trunk_that_the_right_camera_sees_in_part_may_be_thicker() -> None:
-    """Its left part would be beside the right image."""
+    """The left part of the trunk is outside of the right image."""
     tree = np.array([[6.4, 4.6, 0.4]])
     whole = disparity(tree, LEVEL, ground=False)
     cut = np.where(whole > np.arange(640), np.nan, whole)
@@ -206,6 +206,6 @@ def test_rendered_trunks_are_found_within_their_covariances() -> None:
         ({"disparity_deviation": 0.0}, "disparity_deviation must be in pixels, positive, not 0.0"),
     ],
 )
-def test_detectors_that_cannot_be_are_refused(values: dict[str, object], message: str) -> None:
+def test_impossible_detectors_are_refused(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         StereoTrunkDetector(**values)

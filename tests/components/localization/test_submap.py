@@ -16,7 +16,7 @@ def seen(places, deviation=0.02, diameter=0.3):
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, diameter), np.full(n, 0.02))
 
 
-def test_landmarks_of_a_drive_are_where_they_are():
+def test_landmarks_of_a_drive_are_near_their_true_places():
     one = drive(0, ACCURATE, false=0.0)
     submap = Submap.empty(one.reckoned[0])
     for k, scan in enumerate(one.scans):
@@ -52,7 +52,7 @@ def test_a_landmark_seen_again_is_merged():
     assert landmarks.diameter_deviations[0] == pytest.approx(0.02 / np.sqrt(2.0))
 
 
-def test_what_is_seen_once_of_many_times_is_left_out():
+def test_detections_seen_once_in_many_scans_are_left_out():
     there, flicker = [[5.0, 0.0], [0.0, 9.0]], [[3.0, 3.0]]
     submap = Submap.empty().with_scan(seen(there + flicker))
     assert len(submap.landmarks()) == 3

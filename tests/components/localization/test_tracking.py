@@ -136,7 +136,7 @@ def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
 
 
 @pytest.mark.parametrize(("deviations", "is_lost"), [(0.5, False), (2.2, True)])
-def test_first_matches_that_fit_badly_are_a_loss(deviations, is_lost):
+def test_first_matches_that_fit_badly_lose_the_track(deviations, is_lost):
     places = np.array([[x, y] for x in (-9.0, 0.0, 9.0) for y in (-9.0, -3.0, 3.0, 9.0)])
     tracker = Tracker(spread_out(places, 0.1), least_deviation=0.0, bias_deviation=1e-6)
     state, _ = tracker.start(np.zeros(3), 1e-12 * np.eye(3))
@@ -148,7 +148,7 @@ def test_first_matches_that_fit_badly_are_a_loss(deviations, is_lost):
     assert tracker.is_lost(state) == is_lost
 
 
-def test_an_uncertain_position_is_a_loss():
+def test_an_uncertain_position_loses_the_track():
     tracker = Tracker(drive(0, ACCURATE).map, largest_deviation=0.5, odometry_deviation=0.0)
     state, _ = tracker.start(np.zeros(3), np.diag([0.1, 0.1, 0.0]) ** 2)
     for way, is_lost in ((100.0, False), (300.0, True)):
@@ -260,7 +260,7 @@ def test_correlated_errors_of_the_map_are_expected():
 
 
 def test_the_heading_is_no_more_certain_than_the_map_allows():
-    """Neighbours that are displaced alike may be turned alike, too: scans do not show it, however many there are."""
+    """Neighbours on the map may be displaced and rotated together, which scans do not show, however many there are."""
     rng = np.random.default_rng(8)
     n, deviation, length, share, noise = 49, 0.7, 40.0, 0.98, 0.03
     places = 6.0 * (np.array(np.divmod(np.arange(n), 7)).T - 3.0) + rng.uniform(-1.0, 1.0, (n, 2))
@@ -311,8 +311,8 @@ def test_without_detections_covariance_grows_by_the_odometry():
     assert not tracker.is_lost(state)
 
 
-def test_landmarks_without_a_place_do_not_take_part():
-    """Within the gate of a landmark that may be anywhere, all others would be looked at in each scan."""
+def test_landmarks_without_a_known_place_are_not_used():
+    """The gate of a landmark that may be anywhere would contain all others in each scan."""
     one = drive(1, ACCURATE)
     C = one.map.covariances.copy()
     C[5] = 1e4 * np.eye(2)

@@ -141,7 +141,7 @@ def test_stands_on_uneven_ground(bushes, recall, precision):
     assert right >= precision * claimed
 
 
-def test_a_hidden_edge_is_not_taken_for_the_trunks_own():
+def test_a_hidden_edge_is_not_an_edge_of_the_trunk():
     # The nearer trunk hides the left half of the farther one.
     places = np.array([[5.0, 0.2], [10.0, 0.2]]) + EYE[:2]
     diameters = np.array([0.2, 0.4])
@@ -181,7 +181,7 @@ def test_branches_beside_a_trunk_do_not_widen_it():
         assert abs(diameter - 0.2) < 0.025
 
 
-def test_what_is_no_trunk_is_not_found():
+def test_other_objects_are_not_found():
     nothing = Scene(np.zeros((0, 2)), np.zeros(0), height=hills)
     ground, _ = nothing.scan(EYE, noise=0.02)
     wall = np.stack(np.meshgrid([6.0], np.linspace(-2, 2, 60), np.linspace(0, 3, 20)), axis=-1).reshape(-1, 3)

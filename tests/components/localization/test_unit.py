@@ -78,7 +78,7 @@ def test_a_doubtful_pose_is_back_with_the_next_good_scan():
 
 
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
-def test_with_the_map_of_another_place_it_never_tracks(errors):
+def test_unit_never_tracks_on_the_map_of_another_place(errors):
     for seed in range(2):
         one = drive(seed, errors, reach=18.0, elsewhere=seed + 50)
         answers, _ = run(unit_for(one.map), one.scans, one.reckoned)
@@ -87,7 +87,7 @@ def test_with_the_map_of_another_place_it_never_tracks(errors):
 
 @dataclass(frozen=True)
 class Wrong:
-    """Matches anything with a place that it is not."""
+    """A locator that always returns a wrong pose, and is sure of it."""
 
     pose: np.ndarray
     covariance: np.ndarray
@@ -113,7 +113,7 @@ def test_matching_is_tried_after_some_metres_or_seconds(speed, calls):
 
 
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
-def test_a_wrong_first_pose_ends_soon(errors):
+def test_a_wrong_first_pose_is_soon_lost(errors):
     for seed in range(4):
         one = drive(seed, errors)
         wrong = Wrong(compose(one.poses[0], [9.0, -7.0, 1.0]), np.diag([0.2, 0.2, 0.02]) ** 2)
@@ -125,7 +125,7 @@ def test_a_wrong_first_pose_ends_soon(errors):
         assert longest <= 12
 
 
-def test_narrow_views_need_all_that_was_gathered_to_begin():
+def test_narrow_views_begin_with_all_gathered_landmarks():
     """Each scan shows three landmarks, fewer than a track begins with."""
     one = drive(3, ACCURATE, reach=18.0)
     narrow = [scan.select(np.arange(3 * k, 3 * k + 3) % len(scan)) for k, scan in enumerate(one.scans)]
@@ -179,7 +179,7 @@ def test_no_trees_in_sight_is_no_error():
     assert answers[-1].status == TRACKING
 
 
-def test_wheels_that_are_off_are_learned_and_in_the_covariance_of_a_gap():
+def test_scale_of_the_wheels_is_estimated_and_in_the_covariance():
     one = drive(3, ACCURATE, reach=18.0, scans=60)
     motions = [compose(inverse(a), b) for a, b in pairwise(one.poses)]
     reckoned = [np.zeros(3)]
@@ -188,10 +188,10 @@ def test_wheels_that_are_off_are_learned_and_in_the_covariance_of_a_gap():
     scans = [*one.scans[:10], *[Landmarks.empty()] * 50]
     answers, state = run(unit_for(one.map), scans, reckoned)
     assert answers[-1].status == TRACKING and not answers[-1].matched
-    # Of 3 % of 20 m, ten scans have taught a third.
+    # Ten scans correct about a third of the scale error, which is 3 % of 20 m.
     assert 0.3 < np.linalg.norm(error(answers[-1].pose, one.poses[-1])[:2]) < 0.5
     assert nees(answers[-1].pose, answers[-1].covariance, one.poses[-1]) < 9.0
-    # In the end, nothing is known any more.
+    # After a long time without detections, the track is lost.
     assert unit_for(one.map).step(state, scans[-1], X_OH=reckoned[-1], time=1e3)[0].status == LOST
 
 

@@ -248,7 +248,7 @@ def test_driver_looks_for_the_route_where_the_rear_axle_is() -> None:
         assert context.get_discrete_state(0).value()[1] == pytest.approx(route.nearest(rear[:2]), abs=0.25)
 
 
-def test_driver_stops_after_the_last_round() -> None:
+def test_driver_stops_after_the_last_lap() -> None:
     length = strip_roads(100.0, 100.0)[0].length
     driving = world(route=0, laps=1, along=length - 3.0)
     simulator = driving.simulator()

@@ -1,4 +1,4 @@
-"""Tests of the choices of a scanner and of a route: what counts, and that the testbed is asked as it should be."""
+"""Tests of the choices of a scanner and of a route: their criteria, and the problems that are solved."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -113,7 +113,7 @@ def test_summary_compares_the_choice_with_all_routes() -> None:
     choice, none = SimpleNamespace(values={ROUTE: 1.0}), SimpleNamespace(values={})
     first, second = np.array([0.5, 0.2, 0.1]), np.array([0.1, 0.2, 0.6])
     answers = {
-        # Two surveys, of which the root mean square is as told; the map in use says something else.
+        # Two surveys with the given root mean square; the error with the map in use differs.
         7: RouteAnswer(choice, np.array([0.2, 0.1, 0.3]), np.array([[0.4, 0.3, 0.0], 0.6 * first, 1.64**0.5 * first])),
         8: RouteAnswer(none, np.array([0.3, 0.4, 0.5]), np.array([[0.9, 0.9, 0.9], second, second]), in_use=2),
     }

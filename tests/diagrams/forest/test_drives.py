@@ -33,7 +33,7 @@ COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 0.0], [0.0, 0.0, 1e-6]])
 
 
 def track(seed: int, *, factor: float = 1.0, searching: int = 10, lost: slice = slice(0, 0)) -> Track:
-    """Return a track along 50 m at 1 m/s, whose errors are ``factor`` times what they are said to be."""
+    """Return a track along 50 m at 1 m/s, whose errors are ``factor`` times as large as its covariances say."""
     n = 251
     truth = np.column_stack([np.linspace(0.0, 50.0, n), np.full(n, 7.0), np.full(n, np.pi - 1e-4)])
     errors = factor * np.random.default_rng(seed).multivariate_normal(np.zeros(3), COVARIANCE, n)
@@ -147,7 +147,7 @@ def test_forests_are_of_both_kinds() -> None:
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_drives_lead_through_the_world_that_is_asked_for(source: str) -> None:
+def test_source_selects_the_world(source: str) -> None:
     scenario = Drives(source=source, range_bias=0.01).scenario(4)
     assert isinstance(scenario, PlainScenario if source == "plain" else ForestScenario)
     assert getattr(scenario, "perception", "scanner") == ("stereo" if source == "stereo" else "scanner")

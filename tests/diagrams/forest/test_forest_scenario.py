@@ -1,4 +1,4 @@
-"""Tests of the simulated forest: what the scanner sees against analytic geometry, what the sensors tell, bad fields."""
+"""Tests of the simulated forest: scans against analytic geometry, readings of the sensors, bad fields."""
 
 import gc
 import json
@@ -220,7 +220,7 @@ def test_carrier_stands_where_it_is_believed_to_be(drive: tuple[VirtualTestbed, 
     assert R_WB.T @ (v + np.cross(w, R_WB @ [-0.8, 0.0, 0.0])) == pytest.approx([0.8, 0.0, 0.0], abs=2e-2)
 
 
-def test_nothing_is_believed_without_a_pose(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
+def test_there_is_no_belief_without_a_pose(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
     testbed, _, _ = drive
     with pytest.raises(ValueError, match="the carrier is not localized"):
         testbed.start_from_belief(testbed.default_context())
@@ -240,7 +240,7 @@ def test_drive_continues_exactly_from_a_fork(drive: tuple[VirtualTestbed, list[S
 
 
 @pytest.mark.parametrize("make", [ForestScenario, PlainScenario])
-def test_detectors_know_the_angles_between_rays(make: type[CarrierScenario]) -> None:
+def test_detectors_have_the_angles_between_rays(make: type[CarrierScenario]) -> None:
     scanner, accuracy = make().scanner, make().scanner_accuracy()
     rays = raster(*raster_size(scanner), scanner.azimuth, scanner.elevation)
     elevations, azimuths = np.arcsin(rays[:, 2]), np.arctan2(rays[:, 1], rays[:, 0])
@@ -248,19 +248,19 @@ def test_detectors_know_the_angles_between_rays(make: type[CarrierScenario]) -> 
     assert np.diff(np.unique(azimuths.round(9))) == pytest.approx(accuracy["azimuth_step"])
 
 
-def test_unit_knows_the_errors_of_its_map_and_its_mast() -> None:
+def test_unit_has_the_errors_of_its_map_and_mast() -> None:
     scenario = ForestScenario(seed=2, length=40.0, width=40.0, map="poor", scanner_forward=-0.5, scanner_height=3.0)
     world_map = scenario.global_map()
     unit, low = scenario.unit(world_map), replace(scenario, scanner_height=2.0).unit(world_map)
     # Neighbours of the poor map share their errors over 40 m; see `MAPS`.
     assert unit.tracker.correlation == unit.locator.correlation == 40.0
     assert unit.tracker.sensor == (-0.5, 0.0)
-    # A vertical that is off displaces what is seen from a high mast.
+    # An error of the vertical displaces detections from a high mast.
     assert unit.tracker.scan_deviation == pytest.approx(1.5 * low.tracker.scan_deviation)
     assert low.tracker.scan_deviation > 0.0
 
 
-def test_start_beyond_a_round_is_no_round_driven() -> None:
+def test_start_beyond_a_lap_counts_no_lap() -> None:
     scenario = ForestScenario(length=40.0, width=40.0)
     length = scenario.routes()[0].length
     testbed = replace(scenario, start=length + 5.0, laps=1).build()

@@ -28,7 +28,7 @@ def test_mesh_lies_on_the_ground() -> None:
     corners = vertices[triangles]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2.0
     assert (area > 0.0).all() and area.sum() == pytest.approx(240.0)
-    # Between the vertices, it is off by less than the noise of a scanner.
+    # Between the vertices, the error is less than the noise of a scanner.
     middles = corners.mean(axis=1)
     assert np.abs(middles[:, 2] - ground.height(*middles[:, :2].T)).max() < 0.02
 

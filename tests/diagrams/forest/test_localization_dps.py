@@ -98,7 +98,7 @@ def test_carrier_localizes_itself_among_landmarks(scenario: CarrierScenario) -> 
     assert abs(wrap(float(testbed.read(context, f"{POSE}.heading")) - yaw)) < np.radians(0.4)
 
 
-def test_axle_of_the_carrier_is_the_one_that_the_dps_knows() -> None:
+def test_dps_has_the_axle_of_the_carrier() -> None:
     assert Carrier().wheel_base / 2.0 == -AXLE
 
 
@@ -141,7 +141,7 @@ def test_when_the_scanner_is_silent_the_unit_is_lost() -> None:
 
 
 @pytest.mark.parametrize("broken", [2, 6])
-def test_numbers_that_are_not_finite_do_no_harm(broken: int) -> None:
+def test_numbers_that_are_not_finite_are_left_out(broken: int) -> None:
     testbed = built(broken=broken)
     context = testbed.default_context()
     testbed.simulator(context).AdvanceTo(3.0)
@@ -187,7 +187,7 @@ def anything() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", [ForestScenario, PlainScenario])
-def test_scans_of_anything_are_no_place_and_no_error(kind: type[CarrierScenario]) -> None:
+def test_arbitrary_scans_give_no_pose_and_no_error(kind: type[CarrierScenario]) -> None:
     scenario = kind(**SMALL, map="poor")
     localizer = Localizer(scenario.detector(), scenario.unit(scenario.global_map()))
     reckoning = DeadReckoning(period=PERIOD)
@@ -358,7 +358,7 @@ def test_display_follows_the_pose(drive: Drive) -> None:
     assert drawn(meshcat, "set_property")["carrier"] is True
 
 
-def test_display_tells_how_well_the_position_is_known() -> None:
+def test_display_shows_the_size_of_the_ellipse() -> None:
     turned = np.array([[0.0026, 0.0024], [0.0024, 0.0026]])  # variances 0.005 and 0.0002 m^2
     assert status_text(TRACKING, turned) == "tracking ±0.21 m"
     assert status_text(LOST, np.diag([np.inf, np.inf])) == "lost"

@@ -19,7 +19,7 @@ def diameters(model: WorldModel) -> np.ndarray:
 
 
 def offsets(stand: Stand, errors: MapErrors, *, seed: int = 0) -> np.ndarray:
-    """What the nearest entry of the map is off, for each tree."""
+    """Return the displacement of the nearest entry of the map from each tree."""
     found, true = stand.map(errors, seed=seed).positions()[:, :2], stand.trees().positions()[:, :2]
     nearest = np.argmin(np.sum((true[:, np.newaxis] - found) ** 2, axis=2), axis=1)
     return found[nearest] - true

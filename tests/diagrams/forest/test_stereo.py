@@ -114,6 +114,6 @@ def test_trials_count_errors_in_pixels() -> None:
         ({"stereo": StereoConfig(width=0)}, "at least one pixel, not 0 x 240"),
     ],
 )
-def test_fields_that_cannot_be_are_refused(fields: dict[str, object], message: str) -> None:
+def test_impossible_fields_are_refused(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
         ForestScenario(**{"perception": "stereo", **fields}).build()

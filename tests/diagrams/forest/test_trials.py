@@ -1,4 +1,4 @@
-"""Tests of the trials of global localization: what counts as right, and a few of them."""
+"""Tests of the trials of global localization: their criteria, and a few trials."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Global localization without a guess: the constellation of the landmarks around the carrier, found again on a map.
+"""Global localization without an initial guess, by the constellation of the landmarks around the carrier on a map.
 
 Pairs of landmarks vote for poses (`pair_votes`). Those with most votes are fitted to the nearest landmarks of the map
 (least squares with weights that fall with the distance), and the best of them are compared by their likelihood.

@@ -95,7 +95,7 @@ class TrackState:
 
     Attributes:
         mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
-        covariance: Its covariance, shape (6 + 2 n, 6 + 2 n).
+        covariance: The covariance of x, shape (6 + 2 n, 6 + 2 n).
         indices: Indices on the map of the landmarks in x, shape (n,).
         is_recent: Whether each of them was seen in the last scan that was fused, shape (n,).
         evidence: Cumulative log-likelihood ratio of first matches, see `Tracker`.

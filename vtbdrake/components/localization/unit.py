@@ -1,7 +1,8 @@
 """The localization unit: the pose of a carrier on a map of landmarks, from detections and odometry.
 
-Without a pose, it gathers a local map along the odometry and matches it with the map, without a guess. Once a match is
-sure, it tracks. When the track is lost, it reports this, and searches again with the landmarks detected from then on.
+Without a pose, it gathers a local map along the odometry and matches it with the map, without an initial guess. Once a
+match is sure, it tracks. When the track is lost, it reports this, and searches again with landmarks detected from then
+on.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Localization:
         time: The time of the scan, in s; -inf before the first one.
         X_OH: The pose of the odometry for which the answer holds, shape (3,).
         pose: X_WH, shape (3,) in m and rad; NaN without a pose.
-        covariance: Its covariance in the order x, y, heading, shape (3, 3); infinite variances without a pose.
+        covariance: Covariance of the pose in the order x, y, heading, shape (3, 3); infinite variances without a pose.
         status: `SEARCHING`, `TRACKING`, `LOST` or `DOUBTFUL`. Only with `TRACKING` is there a pose.
         detected: The number of detections.
         matched: The number of detections that were fused. If 0, the scan has not confirmed the pose by dead reckoning.

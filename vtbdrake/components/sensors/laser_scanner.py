@@ -411,7 +411,7 @@ def raster(rows: int, columns: int, azimuth: float, elevation: float, *, by_colu
         rows: Number of rows, which follow each other from the top.
         columns: Number of rays in each row, which follow each other from the right.
         azimuth: Width of the field of view about z, in rad.
-        elevation: Its height, in rad.
+        elevation: Height of the field of view, in rad.
         by_columns: Whether all rays of a column are fired before those of the next, instead of row by row.
     """
     up = elevation * (0.5 - (np.arange(rows) + 0.5) / rows)
