@@ -32,8 +32,8 @@ def declare_belief(
 ) -> None:
     """Declare how the estimates of the DPS set the state of the carrier and of its driver.
 
-    The carrier stands at the place where the DPS has localized it, with the measured roll and pitch, and rolls without
-    slip. The driver is on the advised route, or else on the nearest one.
+    The carrier has the position and heading by the DPS, the height at which it stands there, and the measured roll and
+    pitch; it rolls without slip. The driver is on the advised route, or else on the nearest one.
 
     The belief holds for the time of the measured motion. The pose of the DPS, which is that of the present, is moved
     back by this motion.

@@ -171,7 +171,7 @@ class Stand:
     def diameters(self, uniform: Array) -> Array:
         """Return the diameters (m), (n,), at which the distribution has the probabilities ``uniform`` (n,)."""
         scale, shape = self.diameter_scale, self.diameter_shape
-        # From the lower to the upper cut.
+        # The values of the survival function at the lower and at the upper limit.
         low, high = (exp(-((limit / scale) ** shape)) for limit in (self.least_diameter, self.largest_diameter))
         quantiles: Array = scale * (-np.log(low - uniform * (low - high))) ** (1.0 / shape)
         return quantiles

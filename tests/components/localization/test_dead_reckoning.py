@@ -50,7 +50,7 @@ class Drive:
         self.times, self.fine = times, fine
 
     def samples(self):
-        """What the sensors show from 0 on: [w, f, v], as an `Imu` defines its means."""
+        """Return the samples of the sensors from 0 on: [w, f, v], as an `Imu` defines its means."""
         fine, shown = self.fine, []
         for k in range(0, len(self.times), fine):
             R = self.R_OB[k]

@@ -193,9 +193,9 @@ def test_the_filter_equals_batch_least_squares(correlation):
     poses, duration = [np.array([0.5, -0.5, 0.2])], 2.0
     move, lasting, deviations = np.array([0.6, 0.1, 0.15]), np.array([0.2, -0.01]), np.array([0.1, 0.02])
 
-    def corrected(told, share, rate):
-        way = (1.0 - share) * rotation(-0.5 * rate * duration) @ told[:2]
-        return np.array([*way, told[2] - rate * duration])
+    def corrected(measured, share, rate):
+        way = (1.0 - share) * rotation(-0.5 * rate * duration) @ measured[:2]
+        return np.array([*way, measured[2] - rate * duration])
 
     noise = np.array([[4e-4, 1e-4, 0.0], [1e-4, 4e-4, 5e-5], [0.0, 5e-5, 1e-4]])
     for _ in range(scans - 1):
@@ -364,23 +364,23 @@ def test_the_map_is_used_once_on_a_closed_route():
 def test_lasting_errors_of_dead_reckoning_are_expected():
     """Drive 100 m in a curve without landmarks, by the same odometry each time."""
     known, rng, steps, duration = drive(0, ACCURATE).map, np.random.default_rng(5), 50, 2.0
-    told = np.array([2.0, 0.1, 0.1])
-    C, exactly = DRIFT.covariance(told, duration), 1e-12 * np.eye(3)
+    measured = np.array([2.0, 0.1, 0.1])
+    C, exactly = DRIFT.covariance(measured, duration), 1e-12 * np.eye(3)
     tracker, forgetful = Tracker(known), Tracker(known, odometry_deviation=0.0, rate_deviation=0.0, rate_walk=0.0)
     last, without = (one.start(np.zeros(3), exactly)[0] for one in (tracker, forgetful))
     for _ in range(steps):
         last, without = (
-            one.predict(state, told, C, duration=duration) for one, state in ((tracker, last), (forgetful, without))
+            one.predict(state, measured, C, duration=duration) for one, state in ((tracker, last), (forgetful, without))
         )
     wrong = []
     for _ in range(60):
         share, rate = rng.normal(size=2) * [tracker.odometry_deviation, tracker.rate_deviation]
         truth = np.zeros(3)
         for noise in rng.multivariate_normal(np.zeros(3), C, steps):
-            way = (1.0 - share) * rotation(-0.5 * rate * duration) @ told[:2]
-            truth = compose(truth, np.array([*way, told[2] - rate * duration]) + noise)
+            way = (1.0 - share) * rotation(-0.5 * rate * duration) @ measured[:2]
+            truth = compose(truth, np.array([*way, measured[2] - rate * duration]) + noise)
             rate += tracker.rate_walk * duration**0.5 * rng.normal()
-            kept = np.exp(-np.hypot(*told[:2]) / tracker.odometry_length)
+            kept = np.exp(-np.hypot(*measured[:2]) / tracker.odometry_length)
             share = kept * share + (1.0 - kept**2) ** 0.5 * tracker.odometry_deviation * rng.normal()
         wrong.append(error(last.pose, truth))
     low, high = chi2(3 * 60).ppf([0.025, 0.975]) / 60.0

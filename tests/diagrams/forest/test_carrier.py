@@ -93,7 +93,7 @@ def test_springs_carry_the_weight_on_level_ground() -> None:
     simulator = standing.simulator()
     assert standing.loads(simulator) == pytest.approx(np.full(4, WEIGHT / 4.0))
     simulator.AdvanceTo(1.0)
-    # It stands as it was put down.
+    # The carrier keeps its initial pose.
     assert standing.pose(simulator).translation() == pytest.approx([50.0, 50.0, 0.0], abs=1e-6)
 
 

@@ -41,10 +41,10 @@ TRUTH, VELOCITY, LAG = np.array([3.03, 4.04, 0.5, 0.0, 0.0, 1.0]), np.array([0.0
 
 
 def test_error_counts_from_when_the_pose_has_settled() -> None:
-    early, told = SETTLING - 0.1, SETTLING - LAG
+    early, stamp = SETTLING - 0.1, SETTLING - LAG
     assert position_error(early, np.zeros(2), early - LAG, TRUTH, VELOCITY) == 0.0
-    assert position_error(SETTLING, np.array([3.3, 4.4]), told, TRUTH, VELOCITY) == pytest.approx(0.5)
-    assert position_error(SETTLING, np.full(2, np.nan), told, TRUTH, VELOCITY) == FAR
+    assert position_error(SETTLING, np.array([3.3, 4.4]), stamp, TRUTH, VELOCITY) == pytest.approx(0.5)
+    assert position_error(SETTLING, np.full(2, np.nan), stamp, TRUTH, VELOCITY) == FAR
 
 
 def test_the_best_scanner_has_the_least_mean_error() -> None:

@@ -13,7 +13,7 @@ from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 def test_unit_over_lcm_finds_the_simulated_pose() -> None:
     found = over_lcm(ForestScenario(seed=1, length=50.0, width=50.0, start=12.0), cycles=40)
     assert found.agrees
-    # Points travel with 32 bits: the poses come by two ways.
+    # Points are sent with 32 bits, so that the two poses differ.
     assert found.difference > 0.0
 
 
@@ -22,13 +22,13 @@ def test_least_error_is_that_of_generalized_least_squares() -> None:
     """The mean of draws, weighted by their covariance: two trees, and the trees of a stand."""
     two = np.array([[0.0, 0.0], [30.0, 0.0]])
     errors, shared = MapErrors(position=0.7, correlation=40.0), np.exp(-(30.0**2) / (2.0 * 40.0**2))
-    # By symmetry, both count alike: each axis has the variance of the mean of both.
+    # By symmetry, both have the same weight: each axis has the variance of the mean of both.
     variance = 0.7**2 * (1.0 + shared) / 2.0 + 0.1**2 / 2.0
     assert least_error(errors, two, noise=0.1) == pytest.approx(np.sqrt(2.0 * variance))
     places = Stand(seed=1, length=60.0, width=40.0, density=300.0).trees().positions()[:, :2]
     independent = least_error(MapErrors(position=0.3), places, noise=0.4)
     assert independent == pytest.approx(np.sqrt(2.0) * 0.5 / np.sqrt(len(places)))
-    # More trees tell more, but far less than independent ones would; and better than their mean.
+    # More trees reduce the error, but far less than independent ones would; the estimate is better than their mean.
     assert least_error(MAPS["poor"], places) < least_error(MAPS["poor"], places[:20]) < 0.7 * np.sqrt(2.0)
     assert least_error(MAPS["poor"], places) > 0.5
 

@@ -88,7 +88,7 @@ def test_trunks_lean_about_their_feet() -> None:
     vertices = trunks(trees, GROUND, vegetation)[0].reshape(len(trees), -1, 3)
     base, top = vertices[:, :-1].mean(axis=1), vertices[:, -1]
     slopes = (top - base)[:, :2] / (top - base)[:, 2:]
-    # The lines from base to top pass through the feet, as inclined as it was asked for.
+    # The lines from base to top pass through the feet, with the given inclination.
     on_ground = base[:, :2] + slopes * (feet[:, 2] - base[:, 2])[:, np.newaxis]
     np.testing.assert_allclose(on_ground, feet[:, :2], atol=1e-9)
     assert slopes.std() == pytest.approx(0.02, rel=0.05) and abs(slopes.mean()) < 0.002
@@ -210,7 +210,7 @@ def test_carrier_stands_where_it_is_believed_to_be(drive: tuple[VirtualTestbed, 
     assert [x, y] == pytest.approx(place - 0.02 * v[:2], abs=1e-4)
     assert rpy == pytest.approx([0.05, -0.02, heading - 0.02 * 0.1])
     assert height == pytest.approx(scenario.ground().height(x, y), abs=0.1)
-    # By default, route 0 is advised; but that is not where the carrier is.
+    # By default, route 0 is advised, but the carrier is not on it.
     assert read["act.driver.route"] == 1.0
     assert read["act.driver.along"] == pytest.approx(50.0 - 0.8, abs=0.3)
     assert read["act.wheels.curvature"] == pytest.approx(0.125)

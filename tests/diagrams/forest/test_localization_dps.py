@@ -300,7 +300,7 @@ def test_unit_beside_a_machine_localizes_as_in_simulation(drive: Drive) -> None:
 
 
 def test_throwing_the_switches_changes_nothing_else(drive: Drive) -> None:
-    # Its simulated world is another stand than the one on the map: there it would find nothing.
+    # The simulated world is another stand than the one on the map, in which the unit would not be localized.
     testbed = built(stand_seed=4)
     context = testbed.default_context()
     with deployed(testbed, context) as (runtime, _):
@@ -353,7 +353,7 @@ def test_display_follows_the_pose(drive: Drive) -> None:
         ellipse = matrices["ellipse"][:2, :2]
         covariance = drive.seen["dps.env.pose.covariance"][k][:2, :2]
         np.testing.assert_allclose(ellipse @ ellipse.T, 9.0 * covariance, rtol=1e-6)
-        # It lies on the carrier, which would hide it otherwise: it is far smaller.
+        # The ellipse lies on top of the carrier, which would hide it otherwise, because it is far smaller.
         assert matrices["ellipse"][2, 3] > 2.0 * X_WH[2, 3]
     assert drawn(meshcat, "set_property")["carrier"] is True
 

@@ -62,7 +62,7 @@ def test_pose_goes_on_with_the_last_motion() -> None:
     assert estimate[0] == pytest.approx(1.0)
     expected = compose(X_WH, compose(inverse(on_circle(then)), on_circle(1.0)))
     np.testing.assert_allclose(estimate[1:4], expected, atol=1e-6)
-    # It has grown with the way of half a second, and with the time.
+    # The covariance has grown with the distance travelled in half a second, and with the time.
     _, grown = moved(X_WH, C, compose(inverse(on_circle(then)), on_circle(1.0)), DriftModel(), 1.0 - then)
     np.testing.assert_allclose(estimate[4:13].reshape(3, 3), grown, rtol=1e-6)
 
@@ -87,7 +87,7 @@ def test_landmarks_are_seen_in_the_level_frame() -> None:
     assert seen["settings"] == "settings"
     np.testing.assert_allclose(seen["points"], points_H, atol=1e-12)
     np.testing.assert_allclose(seen["origin"], (X_HB @ X_BL).translation(), atol=1e-12)
-    # Fired before the poses that are remembered: 20 ms, which were given as 20 s.
+    # The rays were fired before the history begins: 20 ms were given as 20 s.
     seen.clear()
     late = Scan(scan.directions_L, scan.ranges, np.array([-20.0, 0.0]), time)
     assert len(ScanLandmarks(detect, "settings", X_BL)(late, history, time)) == 0

@@ -67,7 +67,7 @@ def test_storm_fells_the_trees_of_round_gaps() -> None:
     before = {tuple(place) for place in Stand(seed=4, road_width=4.0).trees().positions()[:, :2].tolist()}
     after = {tuple(p) for p in Stand(seed=4, road_width=4.0, kind="windthrown").trees().positions()[:, :2].tolist()}
     assert after < before
-    # All middles of discs of 25 m without a tree that stands, to 0.5 m.
+    # All centres, to 0.5 m, of discs with a radius of 25 m that contain no tree.
     x, y = np.meshgrid(np.arange(0.0, 100.5, 0.5), np.arange(0.0, 100.5, 0.5))
     empty = np.column_stack([x.ravel(), y.ravel()])
     empty = empty[cKDTree(list(after)).query(empty)[0] > 24.5]
@@ -92,7 +92,7 @@ def test_strip_roads_are_free_of_trees() -> None:
     trees = stand.trees()
     for route in stand.routes():
         assert (route.distances(trees.positions()[:, :2]) - 0.5 * diameters(trees)).min() > 2.0
-    # The other trees are those of the stand without roads, and the map has what is left.
+    # The other trees are those of the stand without roads, and the map shows them.
     everything = {tuple(p) for p in Stand(seed=3).trees().positions().tolist()}
     assert {tuple(p) for p in trees.positions().tolist()} < everything
     assert len(stand.map(ACCURATE)) == len(trees) > 0.7 * 800

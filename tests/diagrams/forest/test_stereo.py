@@ -44,7 +44,7 @@ def test_landmarks_stand_where_trees_are(driven: tuple[VirtualTestbed, Context])
     rows = testbed.read(context, "dps.env.localizer.landmarks").reshape(SHOWN, 3)
     shown = rows[np.isfinite(rows[:, 0])]
     found = Landmarks(shown[:, :2], np.tile(np.eye(2), (len(shown), 1, 1)), shown[:, 2], shown[:, 2])
-    # Where they are in the world, by the odometry since the images were taken.
+    # Positions in the world, by the odometry since the images were taken.
     x, y, _, *_, yaw = testbed.read(context, "sim.sys.carrier.base.pose")
     since = float(context.get_time() - testbed.read(context, "dps.env.localizer.time"))
     X_WH = np.array([x - SCENARIO.speed * since * np.cos(yaw), y - SCENARIO.speed * since * np.sin(yaw), yaw])
@@ -58,7 +58,7 @@ def test_left_camera_is_on_the_left() -> None:
     poses = StereoConfig(baseline=0.4).poses()
     assert poses["left_image"].translation() == pytest.approx([0.0, 0.2, 0.0])
     between = poses["left_image"].inverse() @ poses["right_image"]
-    # As `StereoCamera` has it: along x of the left camera.
+    # The baseline is along x of the left camera, as in `StereoCamera`.
     assert between.IsNearlyEqualTo(RigidTransform([0.4, 0.0, 0.0]), 1e-12)
     # Both look ahead, upright.
     assert poses["left_image"].rotation().matrix()[:, 2] == pytest.approx([1.0, 0.0, 0.0])

@@ -104,7 +104,7 @@ def _outlines(clusters: Clusters, detector: RockDetector, origin: Array) -> Land
     hidden = clusters.hidden_edges(detector, gap=detector.cell + 4.0 * detector.range_noise)
     good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1)
     good &= (width >= detector.least_width) & (width <= detector.largest_width)
-    # How much farther the sides are than the middle, in comparison with a circle.
+    # The distance of the sides beyond the middle, as a share of that of a circle.
     middle, half = 0.5 * (left + right), 0.5 * (left - right + step)
     turned = (clusters.azimuths - middle[clusters.owners]) / half[clusters.owners]
     bulge = np.sqrt(np.maximum(1.0 - turned**2, 0.0)) * radius[clusters.owners]

@@ -20,7 +20,7 @@ _GATE = 0.997
 # Standard deviation in m that is added to that of each position, per axis: a trunk is not a point.
 _LEAST_DEVIATION = 0.02
 
-# What was in view of at least so many scans is a landmark only if it was detected at least twice.
+# A place that was in view of at least so many scans is a landmark only if it was detected at least twice.
 _CHANCES = 3
 
 # A place is in view up to this share of the distance of the farthest detection: beyond, detections are unreliable.

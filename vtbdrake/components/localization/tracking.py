@@ -70,7 +70,7 @@ _HYPOTHESES = 40
 _OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
 _FIRST_GATE = 0.95
 
-# The largest squared innovation of a diameter, that of three deviations: trunks are not cylinders.
+# The upper limit of -2 times the log-likelihood ratio of a diameter, as for three deviations: trunks are not cylinders.
 _DIAMETER_CAP = 9.0
 
 # Larger standard deviations of a diameter, in m, are cut to this one: the diameter is unknown.
