@@ -23,7 +23,7 @@ _ANCHOR = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundSurface:
     """A surface over the plane, bilinear between the nodes of a square grid.
 
     Attributes:
@@ -53,7 +53,7 @@ class Ground:
             yield node + dx * m + dy, weights
 
 
-def fit_ground(points: Array, center: Array, *, reach: float) -> Ground:
+def fit_ground(points: Array, center: Array, *, reach: float) -> GroundSurface:
     """Fit a surface to the lowest points of a scan; where no ray reaches the ground, they are of trunks or undergrowth.
 
     The surface minimizes the sum of the weighted squares of its distances from the lowest points of all cells and of
@@ -69,7 +69,7 @@ def fit_ground(points: Array, center: Array, *, reach: float) -> Ground:
     corner = center[:2] - 0.5 * (m - 1) * _SPACING
     lowest = _lowest(points, corner, cells=int((m - 1) * _SPACING / _CELL) + 1)
     lowest = np.vstack([center, lowest])
-    surface = Ground(corner, np.full((m, m), center[2]))
+    surface = GroundSurface(corner, np.full((m, m), center[2]))
     support = list(surface.support(lowest[:, :2]))
     # The entries (row, column) of the upper band of the normal matrix, and what each point adds to them.
     rows = np.concatenate([a for a, _ in support for _ in support])
@@ -85,7 +85,7 @@ def fit_ground(points: Array, center: Array, *, reach: float) -> Ground:
         band = stiffness * _stiffness(m)
         band += np.bincount(entries, shares * weights[owners], band.size).reshape(band.shape)
         right = np.bincount(nodes, parts * np.tile(weights * lowest[:, 2], 4), m * m)
-        surface = Ground(corner, solveh_banded(band, right, check_finite=False).reshape(m, m))
+        surface = GroundSurface(corner, solveh_banded(band, right, check_finite=False).reshape(m, m))
         above = np.maximum(lowest[1:, 2] - surface.at(lowest[1:, :2]), 0.0)
         weights[1:] = np.exp(-((above / tolerance) ** 2))
     return surface
