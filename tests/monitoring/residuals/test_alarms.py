@@ -213,7 +213,7 @@ def test_deviation_is_that_of_the_noisiest_time() -> None:
     table = noise(2000)
     table[500:600, 0] = 1.0 + 5.0 * (table[500:600, 0] - 1.0)
     noisiest = table[500:600, 0].std(ddof=1)
-    assert noisiest < of(table).deviation["sense.a"][0] < 1.5 * noisiest
+    assert noisiest <= of(table).deviation["sense.a"][0] < 1.5 * noisiest
 
 
 def test_lasting_offset_widens_the_deviation() -> None:
@@ -247,6 +247,13 @@ def test_deviation_counts_correlated_residuals_as_fewer() -> None:
     ratio = (1.9 / 0.1) ** 0.5
     found = of(correlated(0.9, 2000)).deviation
     assert all(0.9 * ratio < value < 1.8 * ratio for value in (*found["sense.a"], *found["act.b"]))
+
+
+def test_independent_residuals_keep_their_deviation() -> None:
+    table = noise(500)
+    found = of(table).deviation
+    batches = table.reshape(5, 100, 3).std(axis=1, ddof=1).max(axis=0)
+    np.testing.assert_allclose([*found["sense.a"], *found["act.b"]], batches)
 
 
 def test_missing_windows_do_not_count() -> None:

@@ -73,12 +73,14 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
     batch of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), times the largest
     ratio, over L = 1, 2, 4 .. 64, of the deviation of sums of L consecutive windows to sqrt(L) times that of one. For
     an autocorrelation rho^n, this ratio tends to sqrt((1 + rho) / (1 - rho)). The standard error of the ratio in n
-    windows is about sqrt(L / (3 n)) of it (from overlapping sums); two such errors are added, and L is at most n / 8.
+    windows is about e = sqrt(L / (3 n)) of it (from overlapping sums), and L is at most n / 8. A ratio up to 1 + 3 e is
+    taken for chance, so that independent values keep their deviation; two such errors are added to a larger one.
 
     The deviation is also at least four times the largest distance of a batch's mean from the overall mean: then a
     lasting offset takes no more than half of the allowance of 1/2 (`Cusum`).
 
-    Correlation over more than an eighth of the run, or 64 windows, is found in part only. Then give a tolerance.
+    Weak correlation is found in longer runs than 200 windows only, and correlation over more than an eighth of the run,
+    or 64 windows, in part only. Then give a tolerance.
 
     Args:
         residuals: Residuals of consecutive windows, each of shape (size,).
@@ -128,7 +130,8 @@ def _scatter(table: Array) -> tuple[Array, Array]:
             once = np.nan_to_num(np.sqrt(square))
         else:
             error = np.sqrt(length / (3.0 * counts[-1]))
-            ratio = np.fmax(ratio, np.sqrt(square) / once * (1.0 + 2.0 * error))
+            found = np.sqrt(square) / once
+            ratio = np.maximum(ratio, np.where(found > 1.0 + 3.0 * error, found * (1.0 + 2.0 * error), 1.0))
         length *= 2
     return once, ratio
 
