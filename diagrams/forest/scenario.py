@@ -45,8 +45,9 @@ PERCEPTIONS = ("scanner", "stereo")
 _LEAST_RANGE_NOISE = 0.005
 
 # Standard deviation of the error of the vertical in rad, per axis, which displaces the detections of a high sensor. It
-# is about the larger one of roll and pitch that `drives` prints for later than ten seconds after the start; the first
-# seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not contained.
+# lies between those of pitch that `drives` prints, for later than ten seconds after the start, for the forest and for
+# the plain; the first seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not
+# contained.
 _LEVELLING = 0.001
 
 
