@@ -292,6 +292,24 @@ def test_the_heading_is_no_more_certain_than_the_map_allows():
     assert nees(state.pose, found, truth) < chi2.ppf(0.999, 3)
 
 
+def test_landmarks_that_pass_the_gate_have_smaller_errors():
+    """A map's largest errors are not matched: with all of its variance, the pose would seem worse than it is."""
+    rng, n, deviation, noise, count = np.random.default_rng(3), 36, 0.3, 0.01, 300
+    places = 7.0 * (np.array(np.divmod(np.arange(n), 6)).T - 2.5)
+    covariances, diameters, known = np.tile(np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01)
+    squares = []
+    for _ in range(count):
+        shown = places + deviation * rng.standard_normal((n, 2))
+        tracker = Tracker(Landmarks(shown, deviation**2 * covariances, diameters, known))
+        z = places + noise * rng.standard_normal((n, 2))
+        scan = Landmarks(z, noise**2 * covariances, diameters, known)
+        state, matches = tracker.start(np.zeros(3), np.diag([0.05, 0.05, 0.005]) ** 2, scan)
+        assert len(matches.pairs) > 0.8 * n
+        squares.append(nees(state.pose, state.pose_covariance, np.zeros(3)))
+    low, high = chi2(3 * count).ppf([0.025, 0.975]) / count
+    assert low < np.mean(squares) < high
+
+
 def test_without_detections_covariance_grows_by_the_odometry():
     one = drive(0, ACCURATE)
     tracker, states = tracked(one, odometry_deviation=0.0, rate_deviation=0.0, rate_walk=0.0)

@@ -70,6 +70,9 @@ _HYPOTHESES = 40
 _OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
 _FIRST_GATE = 0.95
 
+# The variance that this gate leaves of a standard normal distribution in the plane, per axis: 0.84.
+_FIRST_VARIANCE = 1.0 + 0.5 * (1.0 - 1.0 / _FIRST_GATE) * chi_square_quantile(_FIRST_GATE, 2)
+
 # The upper limit of -2 times the log-likelihood ratio of a diameter, as for three deviations: trunks are not cylinders.
 _DIAMETER_CAP = 9.0
 
@@ -195,7 +198,8 @@ class Tracker:
     probable. Diameters count in the assignment. The first match of a landmark, which is not in the state yet, may be
     wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs that exclude
     it, and of what the map does not show. It must be at least 0.8, and the prior covariance of the landmark (given its
-    neighbours) is divided by p².
+    neighbours) is divided by p². It is also multiplied by 0.84, the share of the variance that passes the gate of 0.95
+    for first matches: landmarks with the largest errors on the map are never matched.
 
     Health: a scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
     last fused scan showed. The track is lost after ``patience`` failures in succession, when the position is uncertain
@@ -390,11 +394,11 @@ class Tracker:
         Args:
             state: The state.
             indices: The indices of these landmarks on the map.
-            probability: The probabilities of their matches, (m,); by default 1.
+            probability: The probabilities of their first matches, (m,); by default nothing was matched.
         """
         places, variances = self.landmarks.positions, self.landmarks.covariances
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
-        factor = np.ones(m) if probability is None else probability**-2.0
+        factor = np.ones(m) if probability is None else _FIRST_VARIANCE * probability**-2.0
         if self.correlation == 0.0:
             prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
