@@ -122,7 +122,7 @@ def spread_out(places, deviation):
 @pytest.mark.parametrize(("view", "variance"), [(2.0 * np.pi, 0.045), (np.pi, 0.025)])
 def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
     places = np.array([[2.0, 0.0], [0.0, -2.0]])
-    settings = {"least_deviation": 0.0, "bias_deviation": 1e-6, "field_of_view": view}
+    settings = {"least_deviation": 0.0, "bias_deviation": 1e-6, "field_of_view": view, "first_gate": 0.999999}
     tracker = Tracker(spread_out(places, variance**0.5), **settings)
     state, _ = tracker.start(np.zeros(3), 1e-12 * np.eye(3))
     state, matches = tracker.update(state, spread_out(places, variance**0.5))
@@ -220,6 +220,7 @@ def test_the_filter_equals_batch_least_squares(correlation):
         rate_walk=0.0,
         least_deviation=0.0,
         gate=0.99999,
+        first_gate=0.99999,
         correlation=correlation,
         correlated_share=share,
     )
@@ -268,7 +269,8 @@ def test_the_heading_is_no_more_certain_than_the_map_allows():
     K = deviation**2 * (share * np.exp(-0.5 * squares / length**2) + (1.0 - share) * np.eye(n))
     shown = places + np.linalg.cholesky(K) @ rng.standard_normal((n, 2))
     covariances, diameters, known = np.tile(np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01)
-    tracker = Tracker(Landmarks(shown, deviation**2 * covariances, diameters, known), correlation=length, gate=0.9999)
+    surveyed = Landmarks(shown, deviation**2 * covariances, diameters, known)
+    tracker = Tracker(surveyed, correlation=length, gate=0.9999, first_gate=0.9999)
     motion, drift = np.array([0.25, 0.0, 0.0]), np.diag([0.01, 0.01, 0.001]) ** 2
     truth = np.zeros(3)
     for k in range(40):
@@ -360,7 +362,7 @@ def test_the_map_is_used_once_on_a_closed_route():
     tree_map = Landmarks(
         shown, np.tile(deviation**2 * np.eye(2), (count, 1, 1)), np.full(count, 0.3), np.full(count, 0.01)
     )
-    tracker = Tracker(tree_map)
+    tracker = Tracker(tree_map, first_gate=0.9999)
     motion, drift = np.array([2.0, 0.0, 2.0 / 20.0]), np.diag([0.005, 0.005, 0.0005]) ** 2
     truth = np.array([20.0, 0.0, np.pi / 2.0])
     state = tracker.start(truth, START)[0]
@@ -429,6 +431,7 @@ def test_the_state_stays_small_and_is_a_value():
     ("settings", "message"),
     [
         ({"gate": 1.0}, "gate must be a share between 0 and 1, not 1.0"),
+        ({"first_gate": 0.0}, "first_gate must be a share between 0 and 1, not 0.0"),
         ({"correlation": -1.0}, "correlation must be in m, at least 0"),
         ({"scan_deviation": -0.1}, "scan_deviation must be in m, at least 0"),
         ({"least_deviation": np.nan}, "least_deviation must be in m, at least 0, not nan"),

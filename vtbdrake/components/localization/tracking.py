@@ -68,10 +68,6 @@ _HYPOTHESES = 40
 # that is not on the map: assumed, on the safe side for a map that lacks a third of the trees. The second number is the
 # least probability of a first match.
 _OTHERS, _LEAST_PROBABILITY = 2.0, 0.8
-_FIRST_GATE = 0.95
-
-# The variance that this gate leaves of a standard normal distribution in the plane, per axis: 0.84.
-_FIRST_VARIANCE = 1.0 + 0.5 * (1.0 - 1.0 / _FIRST_GATE) * chi_square_quantile(_FIRST_GATE, 2)
 
 # The upper limit of -2 times the log-likelihood ratio of a diameter, as for three deviations: trunks are not cylinders.
 _DIAMETER_CAP = 9.0
@@ -198,15 +194,15 @@ class Tracker:
     probable. Diameters count in the assignment. The first match of a landmark, which is not in the state yet, may be
     wrong: its probability p is its density, divided by the sum of the densities of this pair, of all pairs that exclude
     it, and of what the map does not show. It must be at least 0.8, and the prior covariance of the landmark (given its
-    neighbours) is divided by p². It is also multiplied by 0.84, the share of the variance that passes the gate of 0.95
-    for first matches: landmarks with the largest errors on the map are never matched.
+    neighbours) is divided by p². It is also multiplied by the share of the variance that passes ``first_gate``, 0.84:
+    landmarks with the largest errors on the map are never matched.
 
     Health: a scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
     last fused scan showed. The track is lost after ``patience`` failures in succession, when the position is uncertain
     by more than ``largest_deviation`` or the heading by more than 0.2 rad, or when first matches contradict the pose:
-    the d² of a right match is chi-square distributed, that of a match by chance is uniform within the gate (of 0.95 for
-    first matches). The log-likelihood ratio of right matches is summed up to at most ``credit``; below 0, the track is
-    lost (the cumulative sum of Page, Biometrika 41, 1954).
+    the d² of a right match is chi-square distributed, that of a match by chance is uniform within ``first_gate``. The
+    log-likelihood ratio of right matches is summed up to at most ``credit``; below 0, the track is lost (the cumulative
+    sum of Page, Biometrika 41, 1954).
 
     Landmarks that were marginalized enter anew if the carrier comes back, and their map error is then used twice:
     ``horizon`` and ``most`` must be so large that the state holds the landmarks of a whole closed route. Landmarks of
@@ -228,6 +224,7 @@ class Tracker:
         correlation: Correlation length L of the map's errors in m; 0 if they are independent.
         correlated_share: The share c of the variance of the map that is correlated; assumed.
         gate: The share of right pairs that the gate lets pass.
+        first_gate: The same of first matches, whose gate is narrower: on the map, another landmark may be near.
         horizon: Distance from the carrier in m beyond which landmarks are marginalized.
         most: The largest number of landmarks in the state; the farthest are marginalized.
         patience: The number of failures in succession after which the track is lost.
@@ -252,6 +249,7 @@ class Tracker:
     correlation: float = 0.0
     correlated_share: float = 0.98
     gate: float = 0.997
+    first_gate: float = 0.95
     horizon: float = 100.0
     most: int = 400
     patience: int = 3
@@ -277,6 +275,7 @@ class Tracker:
             "correlation": (0.0 <= self.correlation < inf, "in m, at least 0"),
             "correlated_share": (0.0 <= self.correlated_share < 1.0, "a share from 0 to below 1"),
             "gate": (0.0 < self.gate < 1.0, "a share between 0 and 1"),
+            "first_gate": (0.0 < self.first_gate < 1.0, "a share between 0 and 1"),
             "horizon": (self.horizon > 0.0, "in m, positive"),
             "most": (self.most >= 1, "at least 1"),
             "patience": (self.patience >= 1, "at least 1"),
@@ -398,7 +397,7 @@ class Tracker:
         """
         places, variances = self.landmarks.positions, self.landmarks.covariances
         mean, P, n, m = state.mean, state.covariance, len(state.indices), len(indices)
-        factor = np.ones(m) if probability is None else _FIRST_VARIANCE * probability**-2.0
+        factor = np.ones(m) if probability is None else _variance_within(self.first_gate) * probability**-2.0
         if self.correlation == 0.0:
             prior = block_diag(np.zeros((0, 0)), *(factor[:, None, None] * variances[indices]))
             J, added = np.zeros((2 * m, 2 * n)), places[indices]
@@ -518,7 +517,7 @@ class Tracker:
         probability = (density / (others + rivals))[one, two]
         indices = extended.indices[rows[two]]
         found = _Found(np.column_stack([one, indices]), squares[one, two], probability)
-        is_first = (probability >= _LEAST_PROBABILITY) & (found.squares < chi_square_quantile(_FIRST_GATE, 2))
+        is_first = (probability >= _LEAST_PROBABILITY) & (found.squares < chi_square_quantile(self.first_gate, 2))
         return found.select(np.isin(indices, state.indices) | is_first)
 
     def _nearby(self, state: TrackState, landmarks: Landmarks) -> Indices:
@@ -559,7 +558,7 @@ class Tracker:
 
     def _evidence(self, squares: Array) -> float:
         """Return the log-likelihood ratio of first matches, right against by chance, from their d² (k,)."""
-        ratio = 0.5 * chi_square_quantile(_FIRST_GATE, 2) * np.exp(-0.5 * squares)
+        ratio = 0.5 * chi_square_quantile(self.first_gate, 2) * np.exp(-0.5 * squares)
         return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
 
 
@@ -590,6 +589,11 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
     best = np.argmax(agreement.sum(axis=0))
     return squares[:, best], np.maximum(np.linalg.det(spread[:, best]), 1e-12)
+
+
+def _variance_within(gate: float) -> float:
+    """Return the variance, per axis, of the share of a standard normal distribution in the plane that passes a gate."""
+    return 1.0 + 0.5 * (1.0 - 1.0 / gate) * chi_square_quantile(gate, 2)
 
 
 def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
