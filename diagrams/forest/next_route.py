@@ -1,4 +1,4 @@
-"""Where should the carrier drive next to be localized best? It simulates all routes; true drives check its choice.
+"""A carrier chooses the next route, to be localized best, by simulating all of them; true drives check its choice.
 
 A storm has left gaps in a stand, where the carrier detects no trees and has its odometry only. The unit is localized on
 a remote map, and chooses among the routes: the reasoner simulates each in a mental copy, whose forest is the map of the

@@ -48,7 +48,7 @@ class World:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Belief:
-    """What a DPS believes at one instant: its own state, and the world according to its estimates.
+    """A Belief holds what a DPS believes at one instant: its own state, and the world according to its estimates.
 
     The mental scenario has the rules by which estimates set variables of the world (`VirtualTestbedBuilder.believe`),
     and determines everything that no rule sets. A belief is plain data, which can be pickled.
@@ -154,8 +154,8 @@ class Starter:
         self._default = mental.start_layout.take(self._context)
         self._dps = mental.dps_layout.indices_in(mental.start_layout)
         vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
-        self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and _resumes(s)}
-        self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and _resumes(s)}
+        self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and can_resume(s)}
+        self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and can_resume(s)}
         self._targets = [_Target(mental, rule) for rule in mental.belief_rules]
         self._copied = _Copied([t for t in self._targets if t.is_copy and t.rule.target not in (uncertainty or {})])
         self._computed = [target for target in self._targets if target not in self._copied.targets]
@@ -418,12 +418,17 @@ class _Copied:
 def _resume(system: System, root: Context, value: Any) -> None:
     """Set a sensor or an actuator to the state of one whose last output or input, respectively, was ``value``."""
     own = system.GetMyMutableContextFromRoot(root)
-    if isinstance(system, ZeroOrderHold | DiscreteTimeDelay):
+    if is_hold(system):
         own.SetDiscreteState(0, np.resize(value, own.get_discrete_state(0).size()))
     else:
         system.resume(own, value)
 
 
-def _resumes(system: System) -> bool:
-    """Return whether `_resume` can set the state of a sensor or an actuator."""
-    return hasattr(system, "resume") or isinstance(system, ZeroOrderHold | DiscreteTimeDelay)
+def can_resume(system: System) -> bool:
+    """Return whether a mental copy can continue a sensor or an actuator."""
+    return hasattr(system, "resume") or is_hold(system)
+
+
+def is_hold(system: System) -> bool:
+    """Return whether a system is one of Drake's that sample their input, and show it later or until the next sample."""
+    return isinstance(system, ZeroOrderHold | DiscreteTimeDelay)

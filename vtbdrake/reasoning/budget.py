@@ -1,4 +1,4 @@
-"""How much a decision may take."""
+"""The budget of a decision: how many rollouts, or how much time, it may take."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vtbdrake.argument_checks import as_number, as_whole
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a decision may take. If both limits are given, the decision ends at the first that is reached.
+    """A Budget limits a decision by rollouts, by time, or by both: the decision ends at the first limit it reaches.
 
     Attributes:
         rollouts: Number of rollouts. A decision with this budget alone can be repeated exactly, with any executor.

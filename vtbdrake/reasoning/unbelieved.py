@@ -8,9 +8,8 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
-from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 
-from vtbdrake.reasoning.belief import Belief
+from vtbdrake.reasoning.belief import Belief, can_resume, is_hold
 from vtbdrake.state.variables import Variable, VariableError, Variables, X, with_unit
 from vtbdrake.testbed import VirtualTestbed
 
@@ -37,7 +36,7 @@ class UnbelievedReadings:
     def __init__(self, mental: VirtualTestbed, *, uncertain: Iterable[str] = ()) -> None:
         variables, context = mental.variables(), mental.default_context()
         units = {signal.name: signal.unit for signal in mental.interface.sense if signal.is_vector}
-        sensors = {n: s for n, s in mental.simulated_sensors.items() if n in units and _tells(s)}
+        sensors = {n: s for n, s in mental.simulated_sensors.items() if n in units and _is_examined(s)}
 
         def measured(context: Context) -> np.ndarray:
             return np.concatenate([np.zeros(0), *(_measurement(s, context) for s in sensors.values())])
@@ -65,17 +64,17 @@ class UnbelievedReadings:
         """Return a sentence about the first reading that does not begin with what the DPS has received, if any."""
         if belief.world is not None:
             return ()
-        told = []
-        for name, entry, value, unit, address in self._readings:
-            received = float(belief.dps.received[name][entry])
-            if not np.isclose(received, value):
-                told.append(
-                    f"the simulated sensor signal {name}[{entry}] begins at {with_unit(f'{value:g}', unit)}, but the "
-                    f"DPS has received {with_unit(f'{received:g}', unit)} last: no belief rule reaches it; declare a "
-                    f"belief for {address} (VirtualTestbedBuilder.believe)"
-                )
-        others = f"; the same holds for further readings: {len(told) - 1}" if len(told) > 1 else ""
-        return (told[0] + others,) if told else ()
+        received = [float(belief.dps.received[name][entry]) for name, entry, *_ in self._readings]
+        wrong = [k for k, (_, _, value, *_) in enumerate(self._readings) if not np.isclose(received[k], value)]
+        if not wrong:
+            return ()
+        name, entry, value, unit, address = self._readings[wrong[0]]
+        others = f"; the same holds for further readings: {len(wrong) - 1}" if len(wrong) > 1 else ""
+        return (
+            f"the simulated sensor signal {name}[{entry}] begins at {with_unit(f'{value:g}', unit)}, but the DPS has "
+            f"received {with_unit(f'{received[wrong[0]]:g}', unit)} last: no belief rule reaches it; declare a belief "
+            f"for {address} (VirtualTestbedBuilder.believe){others}",
+        )
 
 
 def _world(variables: Variables) -> list[Variable]:
@@ -84,16 +83,14 @@ def _world(variables: Variables) -> list[Variable]:
     return [v for v in own if v.kind == X and not v.derived]
 
 
-def _tells(sensor: System) -> bool:
-    own = hasattr(sensor, "resume") and hasattr(sensor, "measurement")
-    return own or isinstance(sensor, ZeroOrderHold | DiscreteTimeDelay)
+def _is_examined(sensor: System) -> bool:
+    return can_resume(sensor) and (is_hold(sensor) or hasattr(sensor, "measurement"))
 
 
 def _measurement(sensor: System, root: Context) -> np.ndarray:
     """Return what a sensor would sample now, without its errors."""
     own = sensor.GetMyContextFromRoot(root)
-    is_held = isinstance(sensor, ZeroOrderHold | DiscreteTimeDelay)
-    return np.array(sensor.get_input_port().Eval(own) if is_held else sensor.measurement(own))
+    return np.array(sensor.get_input_port().Eval(own) if is_hold(sensor) else sensor.measurement(own))
 
 
 def _change(variable: Variable, context: Context, amount: ArrayLike) -> None:

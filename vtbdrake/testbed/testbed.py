@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BeliefRule:
-    """How estimates of the DPS set a variable of the world; see `VirtualTestbedBuilder.believe`.
+    """A BeliefRule tells how estimates of the DPS set a variable of the world; see `VirtualTestbedBuilder.believe`.
 
     ``target`` (an address in sim) is ``by`` of the estimates at the addresses ``of`` (in dps).
 

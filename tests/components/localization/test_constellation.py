@@ -95,7 +95,7 @@ def test_places_of_a_stand_are_recognized():
 
 
 def test_other_stands_are_not_recognized():
-    """In the plantations, the best of many poses that nearly match leads by 8 to 21."""
+    """Many poses nearly match in a plantation; the log-likelihood of the best one leads by 8 to 21."""
     for kind, name, seed in (
         ("plantation", "accurate", 8000),
         ("plantation", "remote", 8003),
