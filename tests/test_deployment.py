@@ -13,9 +13,10 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.servo_machine import COMMAND, ServoMachineScenario
 from tests.control.test_loop import Ear
+from tests.lcm.hub.clients import Client
 from vtbdrake.control.bridge import Bridge, BridgeError
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.fallback import Hold
+from vtbdrake.control.fallback import Hold, Silence
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment, DeploymentError
@@ -162,6 +163,31 @@ def test_deployed_dps_commands_is_recorded_and_ends_with_the_fallback(tmp_path: 
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
     report = replay(tmp_path / "servo.lcm")
     assert report.identical and report.cycles == runtime.cycles
+
+
+def test_silent_fallback_keeps_its_protected_channel() -> None:
+    scenario = ServoMachineScenario(rate=0.0)
+    deployment = replace(Deployment.of(scenario), guards={"fallback": {"velocity": Silence()}})
+    lease = 1.5
+    with Hub(port=0, protect=[COMMAND], lease=lease) as hub, MachineProcess(scenario, hub.url):
+        foreign, robot = Client(hub.url), Client(hub.url, COMMAND)
+        with scenario.deploy(hub.url, deployment=deployment, values=FAR) as runtime:
+            runtime.take_over()
+            runtime.run(cycles=10)
+            runtime.guards.latch("the test says so", runtime.clock.now(), runtime.watched)
+            begin = runtime.clock.now()
+
+            def attack() -> bool:
+                if runtime.cycles % 20 == 0:
+                    foreign.publish(f"VTB_HUB_TAKE/{COMMAND}")
+                    foreign.publish(COMMAND, b"foreign")
+                return runtime.clock.now() - begin > 1.2 * lease
+
+            runtime.run(until=attack)
+            status = hub.statistics().protected[COMMAND]
+            robot.sync()
+    assert status.taken == 0 and status.refused > 10
+    assert b"foreign" not in robot.data(COMMAND) != []
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])

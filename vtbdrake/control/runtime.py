@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 _LOG_PERIOD = 1.0  # s, for messages that could be logged in every cycle
 _MOST_POLLS = 100  # of what has waited while the loop was held up
+_KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
 _WAIT = 0.1  # s, for newer samples after a pause
 
 
@@ -212,7 +213,8 @@ class Runtime(Stepped):
             left = limit - self._read_at
             if left <= 0.0:
                 break
-            self.bridge.poll(left)
+            if not self.bridge.poll(min(left, _KEEP_PERIOD)):
+                self.bridge.keep(self.active)
         woke = self.clock.now()
         return woke, max(woke - limit, 0.0)
 
@@ -264,7 +266,10 @@ class Runtime(Stepped):
             blocked=self.blocked_reason() if active else None,
             others=self.bridge.sensed,
         )
-        self.guards.note_unsent(self.bridge.publish(verdict.actuation) if verdict.actuation else ())
+        unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
+        self.guards.note_unsent(unsent)
+        if unsent or len(verdict.actuation) < len(active):
+            self.bridge.keep([name for name in active if name in unsent or name not in verdict.actuation])
         self.slow_parts.send()
         if self.bridge.foreign != self._foreign:
             self._note_foreign()

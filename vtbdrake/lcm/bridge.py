@@ -13,7 +13,7 @@ from typing import Any
 from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
 from vtbdrake.control.limits import Bounds
 from vtbdrake.lcm.connections import Handler, LcmLink
-from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
+from vtbdrake.lcm.hub import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal
@@ -235,6 +235,11 @@ class LcmBridge(Bridge):
                 self.tap(channel, data)
         return () if len(passed) == len(actuation) else tuple(name for name in actuation if name not in passed)
 
+    def keep(self, signals: Collection[str]) -> None:
+        if self.url.startswith(_HUB):
+            channels = [writer.channel for writer in self._writers if not writer.signals.isdisjoint(signals)]
+            self.link.publish(*[(KEEP_PREFIX + channel, b"") for channel in channels])
+
     def _tapped(self, reader: ChannelReader) -> Handler:
         def take(channel: str, data: bytes) -> None:
             if self.tap is not None:
@@ -345,7 +350,12 @@ class SentSignal:
 
 
 class ChannelWriter:
-    """Makes the messages of one channel; ``channel`` is its name."""
+    """Makes the messages of one channel.
+
+    Attributes:
+        channel: Name of the channel.
+        signals: Names of its actuator signals.
+    """
 
     def __init__(self, map: LcmMap, signals: Sequence[Signal], sent: Mapping[str, SentSignal]) -> None:
         """Prepare the encoder.
@@ -356,6 +366,7 @@ class ChannelWriter:
         self.channel = map.channel
         self._encode = map.encoder(signals)
         self._bounds = {signal.name: Bounds(signal) for signal in signals}
+        self.signals = self._bounds.keys()
         self._sent = sent
 
     def message(self, actuation: Mapping[str, Any], utime: int) -> tuple[list[str], bytes] | None:

@@ -264,6 +264,30 @@ def test_active_owner_is_not_replaced(long_lease) -> None:
     assert (state(long_lease).owner, state(long_lease).refused) == (client_name(owner.bus.fileno()), 2)
 
 
+def test_owner_that_keeps_the_channel_is_not_replaced(short_lease) -> None:
+    robot, owner, other = Client(short_lease.url, ".*COMMAND"), Client(short_lease.url), Client(short_lease.url)
+    owner.publish("COMMAND", b"1")
+    owner.sync()
+    wait_until(lambda: state(short_lease).lease_over)
+    owner.publish("VTB_HUB_KEEP/COMMAND")
+    other.publish("VTB_HUB_KEEP/COMMAND")
+    other.sync()
+    robot.sync()
+    # Neither a request nor a rejection, and relayed to nobody.
+    assert (state(short_lease).owner, state(short_lease).refused) == (client_name(owner.bus.fileno()), 0)
+    assert [channel for channel, _ in robot.received if channel.endswith("COMMAND")] == ["COMMAND"]
+
+
+def test_free_channel_belongs_to_the_client_that_keeps_it(long_lease) -> None:
+    first, second = Client(long_lease.url), Client(long_lease.url)
+    first.publish("VTB_HUB_KEEP/COMMAND")
+    first.publish("VTB_HUB_KEEP/UNPROTECTED")
+    first.sync()
+    second.publish("COMMAND")
+    second.sync()
+    assert (state(long_lease).owner, long_lease.statistics().refused) == (client_name(first.bus.fileno()), 1)
+
+
 def test_delay_of_the_hub_extends_the_lease(monkeypatch: pytest.MonkeyPatch) -> None:
     delay = 0.0
     monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + delay))
@@ -327,6 +351,17 @@ class TestLease:
         assert channel.statistics(1.91).lease_over
         assert channel.take(other, 1.91)
         assert not channel.publish(owner, 1.92)
+
+    def test_owner_keeps_the_channel_without_publications(self, connections) -> None:
+        owner, other = connections
+        channel = ProtectedChannel("C", lease=1.0)
+        channel.keep(owner, 0.0)
+        channel.keep(other, 0.9)
+        channel.keep(owner, 0.9)
+        assert not channel.take(other, 1.9)
+        assert channel.take(other, 1.91)
+        channel.keep(owner, 5.0)
+        assert channel.owner is other
 
     def test_extension_prolongs_the_lease(self, connections) -> None:
         owner, other = connections

@@ -511,6 +511,7 @@ def test_incomplete_rejection_is_no_hub(answer: bytes) -> None:
         ({"protect": "COMMAND"}, "protect must be a sequence, such as ['COMMAND']"),
         ({"protect": ["VTB_HUB"]}, "cannot protect 'VTB_HUB', one of the hub's own channels"),
         ({"protect": ["VTB_HUB_TAKE/A"]}, "one of the hub's own channels"),
+        ({"protect": ["VTB_HUB_KEEP/A"]}, "one of the hub's own channels"),
         ({"protect": [""]}, "must have 1 to 242 bytes"),
         ({"protect": ["Ä" * 122]}, "must have 1 to 242 bytes"),
         ({"users": "nobody"}, "users must be a sequence"),

@@ -28,7 +28,10 @@ default.
   3. A client requests the channel by publishing anything on ``VTB_HUB_TAKE/<channel>``. It becomes the owner if there
      is none, or if the owner's lease has expired; otherwise the request is rejected and reported. Rule 2 then holds
      for the former owner, if it resumes.
-  4. If the owner disconnects, its lease continues: until it expires, only a request gives the channel to a client;
+  4. An owner that has nothing to send keeps the channel by publishing anything on ``VTB_HUB_KEEP/<channel>``, which
+     counts as a publication that no subscriber receives. From another client it has no effect, unless the channel is
+     free (rule 1).
+  5. If the owner disconnects, its lease continues: until it expires, only a request gives the channel to a client;
      then the channel is free (rule 1). So no other client gets it while a controller restarts or is replaced.
 
   Delays of the hub itself extend the leases.
@@ -45,9 +48,10 @@ default.
 from vtbdrake.lcm.hub.process import Hub, HubError, serve
 from vtbdrake.lcm.hub.routing import ChannelStatistics, HubStatistics
 from vtbdrake.lcm.hub.server import HubAddressError, HubConfig, HubServer
-from vtbdrake.lcm.hub.tcpq import STATUS_CHANNEL, TAKE_PREFIX, client_name
+from vtbdrake.lcm.hub.tcpq import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, client_name
 
 __all__ = [
+    "KEEP_PREFIX",
     "STATUS_CHANNEL",
     "TAKE_PREFIX",
     "ChannelStatistics",

@@ -77,14 +77,18 @@ class ProtectedChannel:
 
     def publish(self, client: ClientConnection, now: float) -> bool:
         """Decide about a publication; return whether it is accepted."""
+        self.keep(client, now)
         if client is self.owner:
-            self._renewed = now
-            return True
-        if self.owner is None and self._lease_over(now):
-            self._set_owner(client, now)
             return True
         self._reject(client, "publication")
         return False
+
+    def keep(self, client: ClientConnection, now: float) -> None:
+        """Renew the owner's lease; a client that is not the owner gets the channel only if it is free."""
+        if client is self.owner:
+            self._renewed = now
+        elif self.owner is None and self._lease_over(now):
+            self._set_owner(client, now)
 
     def take(self, client: ClientConnection, now: float) -> bool:
         """Decide about a request to take over the channel; return whether the client is the owner now."""
@@ -213,7 +217,7 @@ class Router:
         if route is None:
             cost, route = _NEW_CHANNEL, self._find_route(channel)
         if route.reserved:
-            self._take(client, route.channel, now)
+            self._handle_reserved(client, route.channel, now)
             return cost
         if route.protected is not None:
             owner = route.protected.owner
@@ -233,7 +237,7 @@ class Router:
             channel=name,
             subscribers=tuple(client for client in self._clients if client.subscriptions.match(name)),
             protected=self._protected.get(name),
-            reserved=name == tcpq.STATUS_CHANNEL or name.startswith(tcpq.TAKE_PREFIX),
+            reserved=name == tcpq.STATUS_CHANNEL or name.startswith((tcpq.TAKE_PREFIX, tcpq.KEEP_PREFIX)),
         )
         if len(self._routes) >= _MAX_ROUTES:
             self._routes.clear()
@@ -246,8 +250,11 @@ class Router:
                 self.outgoing.setdefault(subscriber, []).append(content)
                 self.totals.delivered += 1
 
-    def _take(self, client: ClientConnection, channel: str, now: float) -> None:
-        """Handle a publication on one of the hub's own channels: a request to take over a channel, or an error."""
+    def _handle_reserved(self, client: ClientConnection, channel: str, now: float) -> None:
+        """Handle a publication on one of the hub's own channels: to take over or keep a channel, or an error."""
+        if channel.startswith(tcpq.KEEP_PREFIX):
+            self._keep(client, channel.removeprefix(tcpq.KEEP_PREFIX), now)
+            return
         self.status_changed = True
         protected = self._protected.get(channel.removeprefix(tcpq.TAKE_PREFIX))
         if protected is None:
@@ -256,6 +263,13 @@ class Router:
             )
         if protected is None or not protected.take(client, now):
             self.totals.refused += 1
+
+    def _keep(self, client: ClientConnection, channel: str, now: float) -> None:
+        protected = self._protected.get(channel)
+        if protected is not None:  # Clients do not know which channels are protected.
+            owner = protected.owner
+            protected.keep(client, now)
+            self.status_changed |= protected.owner is not owner
 
     def extend_leases(self, seconds: float) -> None:
         """Extend all leases by a time in which the hub was delayed."""

@@ -17,7 +17,7 @@ from math import inf
 from vtbdrake.lcm.hub import tcpq
 from vtbdrake.lcm.hub.clients import SLICE, ClientConnection
 from vtbdrake.lcm.hub.routing import HubStatistics, Router
-from vtbdrake.lcm.hub.tcpq import LOOPBACK, MAX_CHANNEL, STATUS_CHANNEL, TAKE_PREFIX, TcpqError
+from vtbdrake.lcm.hub.tcpq import KEEP_PREFIX, LOOPBACK, MAX_CHANNEL, STATUS_CHANNEL, TAKE_PREFIX, TcpqError
 
 MEBIBYTE = 1024 * 1024
 
@@ -93,9 +93,9 @@ class HubConfig:
             if isinstance(value, str):
                 raise ValueError(f"{name} must be a sequence, such as [{value!r}], not a string")
             object.__setattr__(self, name, tuple(map(_user_id, value)) if name == "users" else tuple(value))
-        longest = MAX_CHANNEL - len(TAKE_PREFIX)
+        longest = MAX_CHANNEL - max(len(TAKE_PREFIX), len(KEEP_PREFIX))
         for channel in self.protect:
-            if channel == STATUS_CHANNEL or channel.startswith(TAKE_PREFIX):
+            if channel == STATUS_CHANNEL or channel.startswith((TAKE_PREFIX, KEEP_PREFIX)):
                 raise ValueError(f"cannot protect {channel!r}, one of the hub's own channels")
             if not 0 < len(channel.encode()) <= longest:
                 raise ValueError(f"the name of a protected channel must have 1 to {longest} bytes, not {channel!r}")
