@@ -10,7 +10,7 @@ from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.child_process import ending_signals
 from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.fallback import FallbackController, Zero
+from vtbdrake.control.fallback import FallbackController, Silence, Zero
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
@@ -548,6 +548,27 @@ def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, a
     assert bool(runtime.guards.latched) == (missed > 10)
     # Who waits for a message may do so for three periods; this one comes a period after the hold-up.
     assert runtime.statistics.misses == (max(missed - 2, 0) if asleep else missed)
+
+
+def test_paced_loop_keeps_its_channels_while_it_waits():
+    quiet = []
+    runtime, bridge, clock = switched(
+        rate=0.0,
+        sensors=lambda t: {} if quiet else still(t),
+        pace="position",
+        patience=1000.0,
+        guards=Guards(ServoScenario(rate=0.0).interface(), PERIOD, fallback={"velocity": Silence()}),
+    )
+    kept = []
+    bridge.keep = lambda signals: kept.append((clock.now(), tuple(signals)))
+    runtime.run(cycles=3)
+    assert kept == []
+    quiet.append(True)
+    begin = clock.now()
+    runtime.run(cycles=1)  # It begins by the clock, with stale samples: the fallback sends nothing.
+    assert runtime.guards.latched
+    assert np.diff([begin, *(at for at, _ in kept)]) == pytest.approx(0.1, abs=2 * PERIOD)
+    assert len(kept) == 10 and {signals for _, signals in kept} == {("velocity",)}
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), SystemExit("a failed assertion in Drake")])

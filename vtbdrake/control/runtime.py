@@ -207,14 +207,17 @@ class Runtime(Stepped):
             # Shortly before the deadline, messages that have arrived are received and fed already.
             return deadline, self.clock.wait_until(deadline, self._receive_early) - deadline
         paced = self.bridge.sensed[self.pace]
-        count, limit = paced.count, self.clock.now() + self._patience
+        count, begin = paced.count, self.clock.now()
+        limit, keep_at = begin + self._patience, begin + _KEEP_PERIOD
         while paced.count == count:
-            self._read_at = self.clock.now()
-            left = limit - self._read_at
+            self._read_at = now = self.clock.now()
+            if now >= keep_at:
+                self.bridge.keep(self.active)
+                keep_at = now + _KEEP_PERIOD
+            left = limit - now
             if left <= 0.0:
                 break
-            if not self.bridge.poll(min(left, _KEEP_PERIOD)):
-                self.bridge.keep(self.active)
+            self.bridge.poll(min(left, _KEEP_PERIOD))
         woke = self.clock.now()
         return woke, max(woke - limit, 0.0)
 
