@@ -98,6 +98,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
         (["remove", file, 7], "no point 7 waits to be evaluated"),
         (["attribute", file, "a=1", "--trial", 99], "no trial 99"),
         (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
+        (["run", file, *BEGIN, "--rollouts", 4, "--parallel", 8], "was begun with parallel None, not 8"),
     ):
         assert message in error_of("study", *arguments)
 

@@ -27,7 +27,7 @@ from tests.optimization.studies import (
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
 from vtbdrake.optimization.solvers import CATALOGUE, Solver
-from vtbdrake.rollout import Constraint, Quality, QualityError
+from vtbdrake.rollout import Constraint, Quality, QualityError, SerialExecutor
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -143,6 +143,55 @@ def test_a_study_is_the_same_in_series_and_in_parallel(solver):
         )
     assert table(studies[0])[0] == table(studies[1])[0] == table(studies[2])[0]
     assert table(studies[0])[1] == table(studies[1])[1] == table(studies[2])[1]
+
+
+class SideBySide(SerialExecutor):
+    """Notes how many rollouts it gets at a time."""
+
+    def __init__(self):
+        super().__init__()
+        self.widths = []
+
+    def run(self, task, points, **more):
+        self.widths.append(len(points))
+        return super().run(task, points, **more)
+
+
+THREE = [{DAMPING: 0.0}, {DAMPING: 0.2}, {DAMPING: 0.4}]
+
+
+@pytest.mark.parametrize("racing", [False, True])
+@pytest.mark.parametrize("solver", ["auto", *on_one_python("cmaes", "TPE", "sobol")])
+def test_a_wide_study_fills_as_many_workers(solver, racing):
+    narrow, wide = SideBySide(), SideBySide()
+    for parallel, executor in ((None, narrow), (30, wide)):
+        study = pendulum_problem(conditions=THREE).study(solver=solver, parallel=parallel)
+        study.run(rollouts=240, racing=racing, executor=executor, progress=False)
+    # Of rollouts that run side by side in a batch of 24 at least. What a race has left of its points is smaller.
+    shares = [sum(width for width in each.widths if width >= 24) / 240 for each in (narrow, wide)]
+    assert shares[1] >= (0.7 if racing else 0.95)
+    assert shares[0] <= 0.2 or solver == "sobol"
+
+
+def test_a_wide_study_is_the_same_with_any_number_of_workers():
+    studies = []
+    for executor, workers in (("serial", None), ("threads", 2), ("threads", 3)):
+        study = pendulum_problem(conditions=THREE).study(seed=5, parallel=20)
+        studies.append(study.run(rollouts=120, executor=executor, workers=workers, progress=False))
+    assert table(studies[0]) == table(studies[1]) == table(studies[2])
+
+
+def test_the_width_identifies_a_study(tmp_path):
+    path = tmp_path / "wide.db"
+    with pendulum_problem().study(path, solver="cmaes", parallel=20) as study:
+        study.run(rollouts=30, executor="serial", progress=False)
+        assert "seed 0, 20 rollouts side by side" in study.summary()
+        assert [trial.batch for trial in study.trials] == [0] * 20 + [1] * 10
+    with pytest.raises(StudyError, match="was begun with parallel 20, not 40: leave parallel out to resume it"):
+        pendulum_problem().study(path, parallel=40)
+    with pendulum_problem().study(path) as study:
+        assert len(study.run(rollouts=60, executor="serial", progress=False).trials) == 60
+        assert study.record["parallel"] == 20
 
 
 @pytest.mark.parametrize("solver", ["cmaes", "SNOPT", *on_one_python("TPE", "auto", "LN_COBYLA")])
@@ -501,6 +550,8 @@ def test_a_quality_function_that_has_changed_is_refused(tmp_path):
         ({"solver": 3}, "a solver is given by its name, one of auto, "),
         ({"seed": 1.5}, "a seed is a whole number, not 1.5"),
         ({"seed": True}, "a seed is a number, not True"),
+        ({"parallel": 0}, "parallel is the number of rollouts side by side, at least one, not 0"),
+        ({"parallel": 2.5}, "parallel is a whole number, not 2.5"),
         ({"options": 3}, "the options of a solver are given as {name: value, ...}, not as 3"),
     ],
 )

@@ -93,6 +93,11 @@ def study() -> None:
     "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
 )
 @option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int)
+@option(
+    "--parallel N",
+    "Ask for enough points at a time for N rollouts side by side.  [default: the solver's own, or that of FILE]",
+    type=click.IntRange(min=1),
+)
 @option("--rollouts N", "End when the study has N rollouts.", type=click.IntRange(min=1))
 @option("--seconds S", "End after S seconds of wall time.", type=float)
 @option("--target H", "End when a point is at least as good as H.", type=float)
@@ -121,6 +126,7 @@ def run(
     solver: str | None,
     options: tuple[tuple[str, Any], ...],
     seed: int | None,
+    parallel: int | None,
     allow_changed_code: bool,
     **others: Any,
 ) -> None:
@@ -141,7 +147,10 @@ def run(
     running = {name: others.pop(name) for name in _RUNNING}
     stated = make_problem(scenario, [*vary, *choose], **others, constraints=[*at_most, *at_least])
     chosen = settings(options) if options else None
-    with stated.study(file, solver=solver, seed=seed, options=chosen, allow_changed_code=allow_changed_code) as opened:
+    begun = stated.study(
+        file, solver=solver, seed=seed, options=chosen, parallel=parallel, allow_changed_code=allow_changed_code
+    )
+    with begun as opened:
         opened.run(**running)
         click.echo(opened.summary())
         if opened.reason == "interrupted":

@@ -21,7 +21,7 @@ from vtbdrake.rollout.task import FAILED
 
 # Racing goes through the conditions in rounds of at least this many rollouts, enough for several workers. It does not
 # depend on their number: a study is the same with any.
-_ROUND = 8
+ROUND = 8
 
 # The step of a quality by which the slope of the risk is taken.
 _STEP = 1e-7
@@ -40,6 +40,7 @@ class Evaluator:
             bound, for example, and no point is dropped for its value.
         budget: Number of rollouts that the points may take together; no more points run side by side than can finish
             within it.
+        round_size: Number of rollouts that racing runs side by side at least, as long as there are as many.
 
     Raises:
         ValueError: Racing, but several qualities.
@@ -53,6 +54,7 @@ class Evaluator:
         *,
         racing: bool = False,
         budget: float = inf,
+        round_size: int = ROUND,
     ) -> None:
         if racing and len(problem.objectives) > 1:
             raise ValueError("racing compares one quality, but the problem has several: leave racing out")
@@ -61,6 +63,7 @@ class Evaluator:
         self._run = run
         self._racing = racing and len(problem.conditions) > 1
         self._budget = budget
+        self._round = round_size
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
@@ -114,7 +117,7 @@ class Evaluator:
         alive = list(points)
         done = 0
         while alive and done < len(order):
-            share = ceil(_ROUND / len(alive))
+            share = ceil(self._round / len(alive))
             self._complete([(point, condition) for point in alive for condition in order[done : done + share]])
             done += share
             evaluations |= {point: self.evaluation(point, order[:done]) for point in alive}

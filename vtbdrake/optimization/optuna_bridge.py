@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vtbdrake.optimization.study import Study
 
 # Identifies a study besides its problem: the same one may be exported again.
-_IDENTITY = ("solver", "seed", "options")
+_IDENTITY = ("solver", "seed", "options", "parallel")
 
 # Importances need at least so many points.
 _FEWEST = 10
@@ -151,7 +151,7 @@ def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> opt
     if name in optuna.get_all_study_names(storage):
         found = optuna.load_study(study_name=name, storage=storage)
         there = found.user_attrs
-        same = all(there.get(key) == record[key] for key in _IDENTITY)
+        same = all(there.get(key) == record.get(key) for key in _IDENTITY)
         # Its code may have changed since, see `Problem.study`.
         if not same or "problem" not in there or differences(there["problem"], record["problem"]):
             raise StudyError(

@@ -458,6 +458,7 @@ class Problem:
         solver: str | None = None,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
+        parallel: int | None = None,
         allow_changed_code: bool = False,
     ) -> Study:
         """Begin a study of the problem, or resume the one in a file.
@@ -468,14 +469,26 @@ class Problem:
                 problem, or that of the file.
             seed: Seed of the solver; 0 by default, or that of the file.
             options: Options of the solver.
+            parallel: The number of rollouts that can run side by side, at least: the solver asks for enough points at a
+                time for as many workers, and racing goes in rounds of as many rollouts. The points depend on it, never
+                on the number of workers. By default the solver chooses its batches, which suits about eight cores (see
+                docs/studies.md), or as in the file.
             allow_changed_code: Whether to go on although the functions of the problem, or the Python code of its
                 testbed, have changed. The file records the changes (`Study.record`, ``changes``). Its rollouts stay,
                 but those in which a quality function failed run again.
 
         Raises:
-            StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed or
-                code.
+            StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed,
+                width or code.
         """
         from vtbdrake.optimization.study import Study
 
-        return Study.of(self, path, solver=solver, seed=seed, options=options, allow_changed_code=allow_changed_code)
+        return Study.of(
+            self,
+            path,
+            solver=solver,
+            seed=seed,
+            options=options,
+            parallel=parallel,
+            allow_changed_code=allow_changed_code,
+        )

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
 from datetime import datetime
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -74,16 +75,20 @@ class Study:
         solver: str | None = None,
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
+        parallel: int | None = None,
         allow_changed_code: bool = False,
     ) -> Self:
         """Begin or resume the study of a problem; see `Problem.study`."""
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(f"the options of a solver are given as {{name: value, ...}}, not as {options!r}")
+        if parallel is not None and as_whole("parallel", parallel) < 1:
+            raise ValueError(f"parallel is the number of rollouts side by side, at least one, not {parallel}")
         meta: dict[str, Any] = {
             "problem": describe(problem),
             "solver": "auto" if solver is None else solver,
             "seed": 0 if seed is None else as_whole("a seed", seed),
             "options": plain(options or {}, "the options of its solver"),
+            "parallel": None if parallel is None else as_whole("parallel", parallel),
             "versions": versions(),
             "revision": revision(problem.scenario),
             "units": list(problem.units),
@@ -92,7 +97,7 @@ class Study:
         made = _solver(problem, meta, rollouts=None)
         made.close()
         meta["solver"] = made.name
-        given = {"solver": solver, "seed": seed, "options": options}
+        given = {"solver": solver, "seed": seed, "options": options, "parallel": parallel}
         study = cls(StudyFile(path, meta=meta), problem)
         try:
             changed = differences(study._meta["problem"], meta["problem"])
@@ -108,9 +113,9 @@ class Study:
                     "its rollouts would come out the same, go on with allow_changed_code=True"
                 )
             for key, value in given.items():
-                if value is not None and study._meta[key] != meta[key]:
+                if value is not None and study._meta.get(key) != meta[key]:
                     raise StudyError(
-                        f"{path} was begun with {key} {study._meta[key]!r}, not {meta[key]!r}: leave {key} out to "
+                        f"{path} was begun with {key} {study._meta.get(key)!r}, not {meta[key]!r}: leave {key} out to "
                         "resume it, or give another file"
                     )
             if code:
@@ -244,7 +249,7 @@ class Study:
         if larger or racing != raced:
             self._file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
             self._meta = self._file.meta
-        return _solver(problem, self._meta, rollouts=self._meta["budget"])
+        return _solver(problem, self._meta, rollouts=self._meta["budget"], racing=racing)
 
     # -- points and attributes given by hand
 
@@ -427,7 +432,8 @@ class Study:
         methods = Counter(trial.method for trial in trials)
         lines = [
             f"{len(trials)} points, {len(outcomes)} rollouts; solver {self._meta['solver']}, seed "
-            f"{self._meta['seed']}: " + ", ".join(f"{method} ({count})" for method, count in methods.items())
+            f"{self._meta['seed']}{self._width}: "
+            + ", ".join(f"{method} ({count})" for method, count in methods.items())
         ]
         for change in self._meta.get("changes", []):
             lines.append(f"the code changed on {change['at'][:10]}: {'; '.join(change['what'])}")
@@ -447,6 +453,11 @@ class Study:
                 + self._failures()
             )
         return "\n".join(lines)
+
+    @property
+    def _width(self) -> str:
+        parallel = self._meta.get("parallel")
+        return "" if parallel is None else f", {parallel} rollouts side by side"
 
     def _result(self) -> str:
         """Return the best point, or the size of the Pareto front, in a line."""
@@ -540,9 +551,12 @@ def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
     return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
 
 
-def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None) -> Solver:
+def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None, racing: bool = False) -> Solver:
     """Return the solver of a study, made for a budget of rollouts."""
-    budget = None if rollouts is None else -(-rollouts // len(problem.conditions))
+    conditions, parallel = len(problem.conditions), meta.get("parallel")
+    budget = None if rollouts is None else ceil(rollouts / conditions)
+    # The rollouts of a batch are those of its points under all conditions; the first round of a race takes two each.
+    width = min(conditions, 2) if racing else conditions
     return make_solver(
         meta["solver"],
         problem.parameters,
@@ -550,5 +564,6 @@ def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None) 
         constraints=len(problem.constraints),
         seed=meta["seed"],
         budget=budget,
+        parallel=None if parallel is None else ceil(parallel / width),
         **meta["options"],
     )

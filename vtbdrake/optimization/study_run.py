@@ -11,7 +11,7 @@ from math import inf, isfinite, isnan
 from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_number, as_whole
-from vtbdrake.optimization.evaluator import Evaluator, Gradients
+from vtbdrake.optimization.evaluator import ROUND, Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyFile, Trial
@@ -74,9 +74,14 @@ class StudyRun:
         self._executor = executor
         self._known: dict[RolloutKey, Outcome] = file.outcomes()
         # Not the budget of this run: how points are evaluated must not depend on where a study is interrupted.
-        budget = file.meta["budget"]
+        budget, parallel = file.meta["budget"], file.meta.get("parallel")
         self._evaluator = Evaluator(
-            problem, self._known, self._roll_out, racing=racing, budget=inf if budget is None else budget
+            problem,
+            self._known,
+            self._roll_out,
+            racing=racing,
+            budget=inf if budget is None else budget,
+            round_size=max(ROUND, parallel or 1),
         )
         self._gradients = Gradients(problem) if solver.wants_gradient else None
         self._slopes = file.gradients()

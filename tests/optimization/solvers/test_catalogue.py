@@ -89,6 +89,37 @@ def test_what_a_solver_cannot_do_is_refused_by_name(name, arguments, message):
         make_solver(name, arguments.pop("space", [X]), **arguments)
 
 
+@pytest.mark.parametrize(
+    "name", [name for name in known_solvers() if not {name} & {*ALGORITHMS, "SNOPT", "IPOPT", "GP"}]
+)
+def test_batches_are_as_wide_as_asked_for(name):
+    sizes = []
+    solver = make_solver(name, SPHERE.space, budget=100, parallel=24, **({"points": 10} if name == "grid" else {}))
+    while points := solver.ask():
+        sizes.append(len(points))
+        solver.tell([evaluation(point, SPHERE.cost) for point in points])
+    # Differential evolution does not evaluate the same point twice, and the last batch gets what is left.
+    assert min(sizes[:-1], default=100) >= (20 if name == "differential-evolution" else 24)
+    assert sum(sizes) == 100
+
+
+@pytest.mark.parametrize("size", [1, 2, 25])
+def test_every_stage_of_auto_is_as_wide_as_asked_for(size):
+    solver, widths = make_solver("auto", box(size, -1.0, 2.0), budget=3000, parallel=40), {}
+    while points := solver.ask():
+        widths.setdefault(solver.method, []).append(len(points))
+        solver.tell([evaluation(point, lambda p: float(np.sum(np.square(p)))) for point in points])
+    assert len(widths) > 1, "several methods were used"
+    assert all(max(sizes) >= 40 for sizes in widths.values()), widths
+
+
+@pytest.mark.parametrize("name", ["LN_BOBYQA", "SNOPT"])
+def test_a_method_of_single_points_refuses_to_be_wide(name):
+    make_solver(name, box(2, 0.0, 1.0), parallel=1)
+    with pytest.raises(SolverError, match=f"{name} chooses each point by the last one, and cannot evaluate 8 side by"):
+        make_solver(name, box(2, 0.0, 1.0), parallel=8)
+
+
 def test_a_missing_optuna_names_the_extra(monkeypatch):
     # None in sys.modules is how Python itself marks a module that cannot be imported.
     monkeypatch.setitem(sys.modules, "optuna", None)

@@ -63,6 +63,7 @@ def make_solver(
     seed: int = 0,
     budget: int | None = None,
     start: Point | None = None,
+    parallel: int | None = None,
     **options: Any,
 ) -> Solver:
     """Return a solver for a problem.
@@ -75,6 +76,7 @@ def make_solver(
         seed: Seed of the solver's random numbers, in [0, 2^32).
         budget: The largest number of evaluations; None: until the solver converges, if it does.
         start: Where a local method starts; None: in the middle of the ranges.
+        parallel: The number of points that are evaluated side by side; batches have at least as many.
         options: Options of the solver, see its class.
 
     Raises:
@@ -90,7 +92,13 @@ def make_solver(
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise SolverError(f"{canonical} has no option {option!r}{hint}; it has {allowed}")
     search = Search(
-        space=tuple(space), objectives=objectives, constraints=constraints, seed=seed, budget=budget, start=start
+        space=tuple(space),
+        objectives=objectives,
+        constraints=constraints,
+        seed=seed,
+        budget=budget,
+        start=start,
+        parallel=parallel,
     )
     return factory(search, name=canonical, **options)
 

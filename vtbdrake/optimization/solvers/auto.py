@@ -25,8 +25,8 @@ PROGRESS = 1e-6
 PATIENCE = 5
 # A Gaussian process helps with up to this many parameters; beyond, a quadratic model is expensive, too.
 MODEL_SIZE = 20
-# Points of the model: per parameter and one more, and in all.
-MODEL_POINTS, MODEL_LIMIT = 25, 120
+# Points of the model: per parameter and one more, and in all; with wide batches at least so many of these.
+MODEL_POINTS, MODEL_LIMIT, MODEL_BATCHES = 25, 120, 4
 # Half widths of the boxes of local searches, as parts of the ranges: after the model, and last.
 LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
 
@@ -42,7 +42,9 @@ class Auto(Solver):
       CMA-ES is less than ten generations, Bayesian optimization gets all of it;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
-    Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations.
+    Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations. If more
+    points run side by side (`Search.parallel`), every method asks for as many at a time, Bayesian optimization in at
+    least four batches, and the local searches, which choose each point by the last one, are left out.
 
     CMA-ES ends when it has converged, or when it *stalls*: when for 20 + 30 n / lambda generations, of lambda points
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
@@ -105,7 +107,7 @@ class Auto(Solver):
     @property
     def _batch(self) -> int:
         """Return the number of points that the model asks for at a time; 1 with a small budget, to learn from each."""
-        return 4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4)
+        return self.search.batch(4 if self.search.budget is None else min(max(self.search.budget // 25, 1), 4))
 
     def _global_stages(self) -> Iterator[None]:
         search = self.search
@@ -140,11 +142,11 @@ class Auto(Solver):
         """Begin the Gaussian process, or for many parameters a design."""
         search, size, left = self.search, self.search.size, math.inf if self._left is None else self._left
         if size > MODEL_SIZE:
-            points = int(min(2 * (size + 1), max(1, left // 2)))
+            points = int(min(search.batch(2 * (size + 1)), max(1, left // 2)))
             self._begin("sobol", Sobol(replace(search, start=None, budget=None), name="sobol", points=points))
             return
-        points = min(MODEL_POINTS * (size + 1), MODEL_LIMIT)
-        if left < points + 10 * default_population(size):
+        points = max(min(MODEL_POINTS * (size + 1), MODEL_LIMIT), MODEL_BATCHES * search.batch(1))
+        if left < points + 10 * search.batch(default_population(size)):
             points = int(left)
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
         # These evaluations are charged already.
@@ -166,10 +168,10 @@ class Auto(Solver):
             self._begin(
                 f"differential-evolution, start {start + 1}",
                 DifferentialEvolution(search, name="differential-evolution"),
-                generation=15 * search.size,
+                generation=search.batch(15 * search.size),
             )
             return
-        population = default_population(search.size) << (start - start // 3)
+        population = search.batch(default_population(search.size)) << (start - start // 3)
         if start == 0 and self._best is not None:
             search = replace(search, start=self._best.point)
         else:
@@ -183,7 +185,7 @@ class Auto(Solver):
 
     @property
     def _has_local(self) -> bool:
-        return len(self._continuous) > 0 and self.search.size <= MODEL_SIZE
+        return len(self._continuous) > 0 and self.search.size <= MODEL_SIZE and not self.search.is_wide
 
     @property
     def _continuous(self) -> list[int]:

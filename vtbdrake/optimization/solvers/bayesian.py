@@ -43,9 +43,9 @@ class Bayesian(Solver):
     Args:
         search: Any parameters (20 at most are reasonable), objectives and constraints.
         name: Name in the catalogue.
-        initial: Points of the design; by default 2 (n + 1), and half of the budget at most. There is no design if as
-            many points were given by hand before.
-        batch: How many points it asks for at a time.
+        initial: Points of the design; by default 2 (n + 1), at least one batch, and half of the budget at most. There is no
+            design if as many points were given by hand before.
+        batch: How many points it asks for at a time; by default 4, or as many as run side by side (`Search.parallel`).
         memory: How many points the model is fitted to at most: the best ones and the latest.
 
     Jones, D. R., Schonlau, M. and Welch, W. J. (1998): Efficient global optimization of expensive black-box functions,
@@ -53,15 +53,15 @@ class Bayesian(Solver):
     """
 
     def __init__(
-        self, search: Search, *, name: str, initial: int | None = None, batch: int = 4, memory: int = 100
+        self, search: Search, *, name: str, initial: int | None = None, batch: int | None = None, memory: int = 100
     ) -> None:
         super().__init__(search, name=name)
         for option, given in (("initial", initial), ("batch", batch), ("memory", memory)):
             if given is not None and given < 1:
                 raise SolverError(f"{option} is a number of points, at least one, not {given}")
         most = search.budget if search.budget is None else max(1, search.budget // 2)
-        self._initial = initial or min(2 * (search.size + 1), most or 1 << 16)
-        self._batch = batch
+        self._initial = initial or min(search.batch(2 * (search.size + 1)), most or 1 << 16)
+        self._batch = batch or search.batch(4)
         self._memory = memory
         self._evaluations: dict[Point, Evaluation] = {}
         self._begun = False

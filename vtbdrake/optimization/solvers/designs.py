@@ -13,6 +13,8 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solv
 
 # A power of two, so that a Sobol sequence is balanced batch by batch; enough to keep a machine busy.
 BATCH = 64
+# A batch ends when its last rollout does, and workers wait for that; with so many rollouts for each, they hardly do.
+ROUNDS = 16
 
 
 class Design(Solver):
@@ -38,7 +40,8 @@ class Design(Solver):
         raise NotImplementedError
 
     def _next(self) -> list[Point]:
-        points = list(itertools.islice(self._points, BATCH if self._left is None else min(BATCH, self._left)))
+        batch = BATCH if self.search.parallel is None else max(BATCH, ROUNDS * self.search.parallel)
+        points = list(itertools.islice(self._points, batch if self._left is None else min(batch, self._left)))
         if not points:
             self._spent()
         return points

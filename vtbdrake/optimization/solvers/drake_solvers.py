@@ -155,7 +155,7 @@ class ProgramSolver(BlockingSolver):
             raise SolverError(f"constraints need gradient='central': {AUTODIFF} gives the objective's only")
         if step is not None and (gradient == AUTODIFF or not 0.0 < step <= 0.25):
             raise SolverError(f"step is of differences, a part of the range in (0, 0.25], not {step} of {gradient}")
-        search.require(name, continuous=True, one_objective=True)
+        search.require(name, continuous=True, one_objective=True, not_wide=True)
         self._algorithm = ALGORITHMS.get(name, Algorithm(constraints=True))
         search.require(name, no_constraints=not self._algorithm.constraints, several=self._algorithm.several)
         super().__init__(search, name=name)

@@ -31,7 +31,8 @@ class CmaEs(Solver):
     Args:
         search: Numbers, one objective.
         name: Name in the catalogue.
-        population: Points per generation, at least 3; by default 4 + floor(3 ln n).
+        population: Points per generation, at least 3; by default 4 + floor(3 ln n), or as many as run side by
+            side (`Search.parallel`) if these are more.
         sigma: The first standard deviation, as a part of the ranges.
 
     Hansen, N. (2016): The CMA evolution strategy, a tutorial, arXiv:1604.00772. Hamano, R. et al. (2022): CMA-ES with
@@ -41,7 +42,7 @@ class CmaEs(Solver):
     def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.3) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)
-        population = default_population(search.size) if population is None else population
+        population = search.batch(default_population(search.size)) if population is None else population
         if population < 3:
             raise SolverError(f"a population has at least 3 points, not {population}")
         if not sigma > 0.0:
@@ -114,16 +115,16 @@ class DifferentialEvolution(BlockingSolver):
     Args:
         search: Numbers, one objective.
         name: Name in the catalogue.
-        population: Points per generation and parameter.
+        population: Points per generation and parameter; by default 15, or more if more run side by side.
         tolerance: It ends when the standard deviation of the population's values is below this part of their mean.
 
     Storn, R. and Price, K. (1997), Journal of Global Optimization 11.
     """
 
-    def __init__(self, search: Search, *, name: str, population: int = 15, tolerance: float = 0.01) -> None:
+    def __init__(self, search: Search, *, name: str, population: int | None = None, tolerance: float = 0.01) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)
-        self._population = population
+        self._population = math.ceil(search.batch(15 * search.size) / search.size) if population is None else population
         self._tolerance = tolerance
 
     def _solve(self) -> tuple[bool, str]:

@@ -38,7 +38,7 @@ class OptunaSolver(Solver):
         search: What is searched.
         name: Name in the catalogue: TPE, GP, NSGA-II, NSGA-III, QMC.
         batch: Number of points asked for at a time, on which the search depends; by default 4 for TPE, a population for
-            NSGA, 1 for GP, 16 for QMC.
+            NSGA (50), 1 for GP, 16 for QMC, or as many as run side by side (`Search.parallel`) if these are more.
         sampler_options: Further options of Optuna's sampler (``n_startup_trials``, ``population_size``, ...).
 
     Raises:
@@ -58,7 +58,11 @@ class OptunaSolver(Solver):
         super().__init__(search, name=name)
         kind, defaults, usual = SAMPLERS[name]
         options = {**defaults, **(sampler_options or {})}
-        self._batch = batch if batch is not None else options.get("population_size", usual)
+        wide = search.batch(usual)
+        if name.startswith("NSGA") and wide > usual:
+            # A batch is a generation.
+            options.setdefault("population_size", wide)
+        self._batch = batch if batch is not None else options.get("population_size", wide)
         if self._batch < 1:
             raise SolverError(f"a batch has at least one point, not {self._batch}")
         self._keys = [f"{i} {parameter.address}" for i, parameter in enumerate(search.space)]

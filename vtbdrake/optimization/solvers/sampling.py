@@ -33,7 +33,8 @@ class SamplingSolver(Solver):
     Args:
         search: n numbers, one objective; mu begins at its start.
         name: Name in the catalogue.
-        population: The number N of points per batch, at least 2; by default 2 (4 + floor(3 ln n)).
+        population: The number N of points per batch, at least 2; by default 2 (4 + floor(3 ln n)), or as many as
+            run side by side (`Search.parallel`) if these are more.
         sigma: The standard deviation, as a part of the ranges; above 0.
 
     Raises:
@@ -43,7 +44,8 @@ class SamplingSolver(Solver):
     def __init__(self, search: Search, *, name: str, population: int | None, sigma: float) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)
-        self.population = 2 * default_population(search.size) if population is None else population
+        usual = search.batch(2 * default_population(search.size))
+        self.population = usual if population is None else population
         if self.population < 2:
             raise SolverError(f"a batch of {name} has at least 2 points, not {population}")
         if not sigma > 0.0:

@@ -123,6 +123,8 @@ class Search:
         seed: Seed of all random numbers, in [0, 2^32).
         budget: The number of evaluations that may be asked for; None: as many as the method needs.
         start: Where a local method starts; None: in the middle of the ranges.
+        parallel: The number of points that are evaluated side by side: a batch has at least as many. None: the method
+            chooses its batches.
 
     Raises:
         SolverError: A number is out of range, or the start lies outside the space.
@@ -134,6 +136,7 @@ class Search:
     seed: int = 0
     budget: int | None = None
     start: Point | None = None
+    parallel: int | None = None
 
     def __post_init__(self) -> None:
         if not self.space:
@@ -145,6 +148,8 @@ class Search:
             raise SolverError(f"a seed is a whole number in [0, 2^32), not {self.seed}")
         if self.budget is not None and self.budget < 1:
             raise SolverError(f"a budget is at least one evaluation, not {self.budget}")
+        if self.parallel is not None and self.parallel < 1:
+            raise SolverError(f"parallel is a number of points side by side, at least one, not {self.parallel}")
         if self.start is not None:
             if len(self.start) != self.size:
                 raise SolverError(f"a start has one value per parameter, {self.size}, not {len(self.start)}")
@@ -158,6 +163,15 @@ class Search:
     def size(self) -> int:
         """Return the number of parameters, n."""
         return len(self.space)
+
+    @property
+    def is_wide(self) -> bool:
+        """Return whether more than one point at a time is asked for."""
+        return self.parallel is not None and self.parallel > 1
+
+    def batch(self, usual: int) -> int:
+        """Return the size of a batch: the method's usual one, or as many as are evaluated side by side."""
+        return max(usual, self.parallel or 1)
 
     def point(self, u: Any) -> Point:
         """Return the point at ``u`` in the unit cube, shape (n,); coordinates outside are clipped."""
@@ -191,6 +205,7 @@ class Search:
         no_constraints: bool = False,
         no_start: bool = False,
         several: bool = False,
+        not_wide: bool = False,
     ) -> None:
         """Check that a method can perform this search.
 
@@ -202,6 +217,7 @@ class Search:
             no_constraints: Whether it takes no constraints.
             no_start: Whether it does not start at a point.
             several: Whether it needs at least two parameters.
+            not_wide: Whether it chooses each point by the last one, so that its batches cannot be widened.
 
         Raises:
             SolverError: The method cannot; the message names a solver that can.
@@ -222,6 +238,11 @@ class Search:
             raise SolverError(f"{name} takes no constraints, and there are {self.constraints}; CMA-ES can do that")
         if several and self.size < 2:
             raise SolverError(f"{name} needs at least two parameters, and there is one; LN_COBYLA can do that")
+        if not_wide and self.is_wide:
+            raise SolverError(
+                f"{name} chooses each point by the last one, and cannot evaluate {self.parallel} side by side; leave "
+                "parallel out, or take CMA-ES"
+            )
         if no_start and self.start is not None:
             raise SolverError(f"{name} does not start at a point; leave start out, or tell the solver of that point")
 
