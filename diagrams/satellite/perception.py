@@ -57,13 +57,19 @@ def target_faces(target: Target | None = None) -> Faces:
     return Faces.of_boxes((RigidTransform(center), edges) for edges, center in (target or Target()).boxes)
 
 
+def target_motion() -> MotionModel:
+    """Return the free flight of the target, whose inertia is known."""
+    inertia = Target().inertia().CalcRotationalInertia()
+    return MotionModel(inertia=[*inertia.get_moments().tolist(), *inertia.get_products().tolist()])
+
+
 @dataclass
 class PerceptionConfig:
     """The configuration of the perception of the target."""
 
     detector: MarkerDetector = field(default_factory=MarkerDetector)
     registration: Registration = field(default_factory=Registration)
-    motion: MotionModel = field(default_factory=MotionModel)
+    motion: MotionModel = field(default_factory=target_motion)
     # Whether the points of a scan are corrected by the estimated motion of the target during the scan.
     deskew: bool = True
     # From the sample of an image to its markers (s).

@@ -145,7 +145,8 @@ def _make_env(config: PerceptionConfig) -> Diagram:
     """Return the perceived environment: base and target, as in a capture, from scans alone."""
     builder = DiagramBuilder()
     base = builder.AddNamedSystem("base", BaseEstimator(period=PERIOD))
-    target = builder.AddNamedSystem("target", TargetTracker(["scan"], starting=["scan"], period=PERIOD))
+    tracker = TargetTracker(["scan"], starting=["scan"], period=PERIOD, motion=config.motion)
+    target = builder.AddNamedSystem("target", tracker)
     builder.ExportInput(base.GetInputPort("imu"), "imu")
     facing = RotationMatrix()
     part = add_scan_part(builder, base, target, config=config, period=PERIOD, attitude=facing)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
-from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix, rotation_vector
-from vtbdrake.components.perception.tracking import MotionModel, TargetTracker, Track, pose_of_state
+from vtbdrake.components.perception.estimate import PoseEstimate, cross_matrix, rotation_matrix, rotation_vector
+from vtbdrake.components.perception.tracking import SPHERE, MotionModel, TargetTracker, Track, pose_of_state
 from vtbdrake.state.declarations import NO_DICT
 
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.01, 0.01, 0.03]) ** 2
@@ -66,6 +69,107 @@ def test_errors_agree_with_the_covariance_over_many_runs(late: bool) -> None:
     assert low < mean < high
 
 
+INERTIAS = {
+    "long": [1.0, 0.6, 0.4, 0.0, 0.0, 0.0],
+    "flat": [1.6, 1.0, 0.7, 0.0, 0.0, 0.0],
+    "skew": [1, 0.8, 0.5, 0.1, -0.1, 0.05],
+}
+
+
+def free_flight(
+    inertia: list[float], X: RigidTransform, w: np.ndarray, times: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return R and the angular velocity in the world of a body in free flight, from Euler's equations in the body."""
+    xx, yy, zz, xy, xz, yz = inertia
+    J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def rate(_: float, x: np.ndarray) -> np.ndarray:
+        R, own = x[:9].reshape(3, 3), x[9:]
+        return np.concatenate([(R @ cross_matrix(own)).ravel(), np.linalg.solve(J, -np.cross(own, J @ own))])
+
+    R = X.rotation().matrix()
+    begin = np.concatenate([R.ravel(), R.T @ w])
+    solution = solve_ivp(rate, (times[0], times[-1]), begin, t_eval=times, rtol=1e-9, atol=1e-11)
+    return [(x[:9].reshape(3, 3), x[:9].reshape(3, 3) @ x[9:]) for x in solution.y.T]
+
+
+def consistency(model: MotionModel, inertia: list[float], *, rate_deg: float, seeds: int, late: bool = False) -> float:
+    """Return the mean distance after 10 s of poses, measured twice a second, of bodies that turn about any axis."""
+    times, distances = np.arange(21) * 0.5, []
+    for seed in range(seeds):
+        generator = np.random.default_rng(seed)
+        w, v = generator.standard_normal(3), 0.05 * generator.standard_normal(3)
+        w *= np.radians(rate_deg) / np.linalg.norm(w)
+        X = RigidTransform(RollPitchYaw(generator.uniform(-2, 2, 3) / [1, 2, 1]), [2.0, 0.0, 0.0])
+        flight = free_flight(inertia, X, w, times)
+        poses = [
+            RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), X.translation() + v * t)
+            for (R, _), t in zip(flight, times, strict=True)
+        ]
+        order = (
+            [0, *(k for pair in zip(range(2, 21, 2), range(1, 21, 2), strict=True) for k in pair)]
+            if late
+            else range(21)
+        )
+        estimates = [measured(poses[k], times[k], generator) for k in order]
+        track = model.begin(estimates[0])
+        for estimate in estimates[1:]:
+            track, _ = model.fuse(track, estimate)
+        distances.append(distance(track, poses[-1], flight[-1][1], v))
+    return float(np.mean(distances))
+
+
+def bounds(seeds: int) -> tuple[float, float]:
+    """Return the 99 % interval of the mean distance over runs whose covariance is right."""
+    low, high = chi2.ppf([0.005, 0.995], 12 * seeds) / seeds
+    return float(low), float(high)
+
+
+@pytest.mark.parametrize("rate_deg", [3.0, 10.0])
+@pytest.mark.parametrize("body", INERTIAS)
+def test_errors_agree_with_the_covariance_of_a_body_of_known_inertia(body: str, rate_deg: float) -> None:
+    seeds, inertia = 40, INERTIAS[body]
+    low, high = bounds(seeds)
+    quiet = MotionModel(rate_noise=1e-5, velocity_noise=1e-5, inertia=inertia)
+    assert low < consistency(quiet, inertia, rate_deg=rate_deg, seeds=seeds) < high
+    # Noise that the motion does not have makes the covariance too large, never too small.
+    assert consistency(MotionModel(inertia=inertia), inertia, rate_deg=rate_deg, seeds=10) < bounds(10)[1]
+
+
+def test_late_estimates_of_an_asymmetric_body_agree_with_the_covariance() -> None:
+    seeds, inertia = 40, INERTIAS["skew"]
+    low, high = bounds(seeds)
+    quiet = MotionModel(rate_noise=1e-5, velocity_noise=1e-5, inertia=inertia)
+    assert low < consistency(quiet, inertia, rate_deg=10.0, seeds=seeds, late=True) < high
+
+
+@pytest.mark.parametrize("rate_deg", [3.0, 10.0])
+def test_rate_noise_of_the_docstring_covers_a_body_of_unknown_inertia(rate_deg: float) -> None:
+    inertia, high = INERTIAS["long"], bounds(20)[1]
+    noise = (1.0 - 0.4) / 0.6 * np.radians(rate_deg) ** 2 * np.sqrt(0.5)
+    covering = MotionModel(rate_noise=noise, velocity_noise=1e-5)
+    assert consistency(covering, inertia, rate_deg=rate_deg, seeds=20) < high
+    # A hundredth of it does not.
+    assert consistency(replace(covering, rate_noise=0.01 * noise), inertia, rate_deg=rate_deg, seeds=20) > high
+
+
+def test_track_moves_as_the_body_does() -> None:
+    X, w = RigidTransform(RollPitchYaw(0.3, -0.5, 0.8), [1.0, 2.0, 3.0]), np.radians([6.0, -7.0, 4.0])
+    model = MotionModel(inertia=INERTIAS["skew"])
+    track = replace(model.begin(measured(X, 0.0, np.random.default_rng(0))), R=X.rotation().matrix(), w=w)
+    _, (R, rate) = free_flight(INERTIAS["skew"], X, w, np.array([0.0, 3.0]))
+    later = model.moved(track, 3.0)
+    np.testing.assert_allclose(later.R, R, atol=2e-4)
+    np.testing.assert_allclose(later.w, rate, atol=2e-5)
+    back = model.moved(later, 0.0)
+    np.testing.assert_allclose(back.R, track.R, atol=2e-4)
+
+
+def test_impossible_inertia_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"inertia must be \[Ixx, .*not \[1.0, 1.0, 3.0"):
+        TargetTracker(["scan"], starting=["scan"], period=0.02, motion=MotionModel(inertia=[1.0, 1.0, 3.0, 0, 0, 0]))
+
+
 def test_late_estimate_counts_as_if_it_had_been_in_time() -> None:
     generator, model = np.random.default_rng(0), MotionModel(rate_noise=0.0, velocity_noise=0.0)
     w, v = np.array([0.02, -0.05, 0.03]), np.array([0.01, 0.02, -0.03])
@@ -83,8 +187,9 @@ def test_late_estimate_counts_as_if_it_had_been_in_time() -> None:
     assert np.concatenate([other.w, other.v]) == pytest.approx(np.concatenate([one.w, one.v]), abs=2e-5)
 
 
-def test_deviations_are_those_of_the_predicted_covariance() -> None:
-    generator, model = np.random.default_rng(0), MotionModel()
+@pytest.mark.parametrize("inertia", [list(SPHERE), *INERTIAS.values()])
+def test_deviations_are_those_of_the_predicted_covariance(inertia: list[float]) -> None:
+    generator, model = np.random.default_rng(0), MotionModel(inertia=inertia)
     track = model.begin(measured(truth(0.0), 0.0, generator))
     for k in range(1, 6):
         track, _ = model.fuse(track, measured(truth(0.2 * k), 0.2 * k, generator))

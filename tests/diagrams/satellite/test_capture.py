@@ -55,6 +55,13 @@ def test_bar_is_held_at_the_end() -> None:
     assert moved.rotation().ToAngleAxis().angle() < np.radians(0.25)
 
 
+def test_tracker_knows_the_inertia_of_the_target() -> None:
+    body = built().plant.GetBodyByName("body", built().plant.GetModelInstanceByName("target"))
+    inertia = body.default_spatial_inertia().CalcRotationalInertia()
+    expected = [*inertia.get_moments(), *inertia.get_products()]
+    assert built().read(built().default_context(), "dps.env.target.inertia") == pytest.approx(expected)
+
+
 def advanced(time: float, **values: object) -> Context:
     """A context in the course of a capture."""
     context = built().default_context()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import inf
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.tree import RotationalInertia
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from vtbdrake.components.perception.estimate import (
@@ -46,10 +47,10 @@ class Track:
     v: Array
     P: Array
 
-    def at(self, time: float) -> RigidTransform:
-        """Return X_IT at ``time`` (s), with constant velocities."""
-        R, p = _moved(self, time - self.time)
-        return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
+    @property
+    def X(self) -> RigidTransform:
+        """The pose X_IT."""
+        return RigidTransform(RotationMatrix.ProjectToRotationMatrix(self.R), self.p)
 
     def numbers(self) -> Array:
         """Return the track as one vector, (`TRACK_SIZE`,)."""
@@ -65,24 +66,42 @@ class Track:
 TRACK_SIZE = 1 + 9 + 9 + 144
 
 
+SPHERE = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+"""The inertia of a body whose angular velocity is constant in free flight, whatever its axis."""
+
+
 @dataclass
 class MotionModel:
-    """The assumed motion of a body in free fall: constant velocity and angular velocity, plus white noise.
+    r"""The assumed motion of a body in free fall: momentum is conserved, up to white noise.
 
-    The angular velocity of a torque-free body is constant only about a principal axis. Otherwise it changes by up to
-    (I_max - I_min) / I ω², which ``rate_noise`` must cover: 0.001 rad/s² at 3 deg/s and a ratio of 0.4.
+    With the inertia J in T, the angular momentum L = J_I ω, J_I = R J R', is constant, and ω follows from it: Euler's
+    equations. The error of attitude moves by θ' = J_I^-1 ([L]× θ + δL), with δL = (J_I [ω]× - [L]×) θ + J_I δω.
+
+    A body of unknown inertia may be taken for a `SPHERE`, whose ω is constant. ``rate_noise`` must then cover what ω
+    does between estimates that are dt apart: (I_max - I_min) / I_mid ω^2 sqrt(dt), 0.0012 rad/s^1.5 for principal
+    moments of 1, 0.6 and 0.4 at 3 deg/s, five times a second.
 
     Attributes:
         rate_noise: Square root of the spectral density of the angular acceleration, in rad/s^1.5.
         velocity_noise: Square root of the spectral density of the acceleration, in m/s^1.5.
         first_rate: Initial standard deviation of the angular velocity, in rad/s.
         first_velocity: Initial standard deviation of the velocity, in m/s.
+        inertia: [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of the body about its centre of mass, in T; only ratios matter.
     """
 
     rate_noise: float = 1e-3
     velocity_noise: float = 1e-3
     first_rate: float = 0.1
     first_velocity: float = 0.1
+    inertia: list[float] = field(default_factory=lambda: list(SPHERE))
+
+    def check(self) -> None:
+        """Raise ValueError if the inertia is not that of a body."""
+        if len(self.inertia) != 6 or not RotationalInertia(*self.inertia).CouldBePhysicallyValid():
+            raise ValueError(
+                "MotionModel.inertia must be [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of a body: positive, no principal moment "
+                f"larger than the sum of the others; not {self.inertia!r}"
+            )
 
     def begin(self, estimate: PoseEstimate) -> Track:
         """Return the track that begins with one pose."""
@@ -94,9 +113,60 @@ class MotionModel:
     def predict(self, track: Track, time: float) -> Track:
         """Return the track at a later (or the same) time."""
         dt = time - track.time
-        F = _transition(track, dt)
-        R, p = _moved(track, dt)
-        return replace(track, time=time, R=R, p=p, P=F @ track.P @ F.T + self._noise(dt))
+        F = self._transition(track, dt)
+        return replace(self.moved(track, time), P=F @ track.P @ F.T + self._noise(dt))
+
+    def moved(self, track: Track, time: float) -> Track:
+        """Return the track at another time, without its covariance there."""
+        dt = time - track.time
+        *_, (R, _, w) = self._flight(track, dt)
+        return replace(track, time=time, R=R, p=track.p + dt * track.v, w=w)
+
+    def _inertia(self) -> Array:
+        """Return J in T, (3, 3)."""
+        xx, yy, zz, xy, xz, yz = self.inertia
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def _flight(self, track: Track, dt: float) -> Iterator[tuple[Array, Array, Array]]:
+        """Yield R_IT and ω after each of some equal steps over ``dt``, with J_I^-1 in the middle of it: (R, J_I^-1, ω).
+
+        The steps are of second order, and exact for a `SPHERE`.
+        """
+        J = self._inertia()
+        inverse = np.linalg.inv(J)
+        R, w = track.R, track.w
+        L = R @ (J @ (w @ R))
+        # Each step turns the body by at most 0.1 rad, unless the track has long been lost.
+        steps = min(max(1, ceil(float(np.linalg.norm(w)) * abs(dt) / 0.1)), 30)
+        h = dt / steps
+        for _ in range(steps):
+            middle = rotation_matrix(0.5 * h * w) @ R
+            K = middle @ inverse @ middle.T
+            R = rotation_matrix(h * (K @ L)) @ R
+            w = R @ (inverse @ (L @ R))
+            yield R, K, w
+
+    def _transition(self, track: Track, dt: float) -> Array:
+        """Return F(dt), which carries the error of a track over ``dt``, (12, 12)."""
+        J = track.R @ self._inertia() @ track.R.T
+        flight = list(self._flight(track, dt))
+        turning, h = cross_matrix(J @ track.w), dt / len(flight)
+        before = J @ cross_matrix(track.w) - turning  # δL = before θ + J δω
+        A, B = np.eye(3), np.zeros((3, 3))  # θ = A θ(0) + B δL
+        for _, K, _ in flight:
+            M = h * K @ turning
+            square = M @ M
+            E = np.eye(3) + M + square @ (np.eye(3) / 2.0 + M / 6.0)
+            A, B = E @ A, E @ B + h * (np.eye(3) + M / 2.0 + square / 6.0) @ K
+        F = np.eye(12)
+        F[:3, :3], F[:3, 6:9] = A + B @ before, B @ J
+        R, _, w = flight[-1]
+        J_after = R @ self._inertia() @ R.T
+        after = J_after @ cross_matrix(w) - turning
+        F[6:9, :3] = np.linalg.solve(J_after, before - after @ F[:3, :3])
+        F[6:9, 6:9] = np.linalg.solve(J_after, J - after @ F[:3, 6:9])
+        F[3:6, 9:] = dt * np.eye(3)
+        return F
 
     def _noise(self, dt: float) -> Array:
         density = np.repeat([self.rate_noise**2, self.velocity_noise**2], 3)
@@ -130,10 +200,9 @@ class MotionModel:
         if estimate.time > track.time:
             track = self.predict(track, estimate.time)
         dt = estimate.time - track.time
-        H = _transition(track, dt)[:6]
-        R, p = _moved(track, dt)
+        H, there = self._transition(track, dt)[:6], self.moved(track, estimate.time)
         innovation = np.concatenate(
-            [rotation_vector(estimate.matrix[:, :3] @ R.T), estimate.matrix[:, 3] - p],
+            [rotation_vector(estimate.matrix[:, :3] @ there.R.T), estimate.matrix[:, 3] - there.p],
         )
         PHt = track.P @ H.T
         S = H @ PHt + estimate.covariance + self._noise(-dt)[:6, :6]
@@ -152,22 +221,6 @@ class MotionModel:
             ),
             float(innovation @ solved[:, 0]),
         )
-
-
-def _moved(track: Track, dt: float) -> tuple[Array, Array]:
-    """Return R_IT and p_IoTo_I ``dt`` seconds later (or earlier)."""
-    return rotation_matrix(track.w * dt) @ track.R, track.p + dt * track.v
-
-
-def _transition(track: Track, dt: float) -> Array:
-    """Return F(dt), which carries the error of a track over ``dt``, (12, 12)."""
-    F = np.eye(12)
-    F[:3, :3] = rotation_matrix(track.w * dt)
-    half = 0.5 * dt * track.w
-    # The integral of exp([ω]× s) ds over dt, to third order in ω dt.
-    F[:3, 6:9] = dt * (np.eye(3) + cross_matrix(half) + (2.0 / 3.0) * cross_matrix(half) @ cross_matrix(half))
-    F[3:6, 9:] = dt * np.eye(3)
-    return F
 
 
 STATE_SIZE, STATUS_SIZE = 13, 4
@@ -240,6 +293,7 @@ class TargetTracker(LeafSystem):
         self._starting = [name in starting for name in sources]
         self._inputs = [self.DeclareAbstractInputPort(name, Value(PoseEstimate.missing())) for name in sources]
         model = motion or MotionModel()
+        model.check()
         declared = {
             "rate_noise": (model.rate_noise, "rad/s^1.5", (0.0, inf)),
             "velocity_noise": (model.velocity_noise, "m/s^1.5", (0.0, inf)),
@@ -251,6 +305,7 @@ class TargetTracker(LeafSystem):
             "lost_after": (3.0, "s", (0.0, inf)),
         }
         self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
+        self._inertia = int(self.DeclareNumericParameter(BasicVector(model.inertia)))
         self._pose = int(self.DeclareDiscreteState(6))
         self._state = int(self.DeclareDiscreteState(body_state(RigidTransform(), np.zeros(3), np.zeros(3))))
         self._status = int(self.DeclareDiscreteState([0.0, inf, inf, inf]))
@@ -275,14 +330,17 @@ class TargetTracker(LeafSystem):
                 parameter(name, 0, start=k, unit=unit, bounds=bounds)
                 for k, (name, (_, unit, bounds)) in enumerate(declared.items())
             ),
+            parameter("inertia", self._inertia, shape=(6,), unit="kg m^2"),
         )
         self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
         self.DeclareStateOutputPort("status", DiscreteStateIndex(self._status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        *noises, gate, patience, fewest, lost_after = context.get_numeric_parameter(0).value().tolist()
-        model = MotionModel(*noises)
+        p = context.get_numeric_parameter(0).value().tolist()
+        rate_noise, velocity_noise, first_rate, first_velocity, gate, patience, fewest, lost_after = p
+        inertia = context.get_numeric_parameter(self._inertia).value().tolist()
+        model = MotionModel(rate_noise, velocity_noise, first_rate, first_velocity, inertia)
         fused, in_succession, left_out, *times = context.get_discrete_state(self._counts).value().tolist()
         numbers = context.get_discrete_state(self._track).value()
         track = Track.of(numbers) if fused else None
@@ -309,8 +367,9 @@ class TargetTracker(LeafSystem):
         if fresh:
             state.set_value(self._track, track.numbers())
         now, age = max(context.get_time(), track.time), context.get_time() - track.time
-        X_IT = track.at(now)
+        present = model.moved(track, now)
+        X_IT = present.X
         status = [fused >= fewest and age <= lost_after, age, *model.deviations(track, now)]
-        state.set_value(self._state, body_state(X_IT, track.w, track.v))
+        state.set_value(self._state, body_state(X_IT, present.w, track.v))
         state.set_value(self._pose, pose_to_array(X_IT))
         state.set_value(self._status, np.array(status, dtype=float))
