@@ -43,8 +43,8 @@ class Bayesian(Solver):
     Args:
         search: Any parameters (20 at most are reasonable), objectives and constraints.
         name: Name in the catalogue.
-        initial: Points of the design; by default 2 (n + 1), at least one batch, and half of the budget at most. There is no
-            design if as many points were given by hand before.
+        initial: Points of the design; by default 2 (n + 1), at least one batch, and half of the budget at most. There
+            is no design if as many points were given by hand before.
         batch: How many points it asks for at a time; by default 4, or as many as run side by side (`Search.parallel`).
         memory: How many points the model is fitted to at most: the best ones and the latest.
 
