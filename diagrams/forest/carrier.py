@@ -363,19 +363,16 @@ class WheelOdometer(SampledSensor):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float, scale: float = 1.0, stream: int = 5, errors: ErrorModel | None = None) -> None:
+    def __init__(self, *, period: float, scale: float = 1.0, errors: ErrorModel | None = None) -> None:
         """Declare the sensor.
 
         Args:
             period: Sample period in s.
             scale: The initial value of the parameter ``scale``: measured over true speed of the treads.
-            stream: The number of the stream of noise.
             errors: The errors of the sensor in m/s; none by default.
         """
         noise = {"noise": (1, "m/s")}
-        super().__init__(
-            "odometry", default=[0.0], period=period, unit="m/s", noise=noise, stream=stream, errors=errors
-        )
+        super().__init__("odometry", default=[0.0], period=period, unit="m/s", noise=noise, errors=errors)
         self._speed = self.DeclareVectorInputPort("speed", 1)
         self._scale = int(self.DeclareNumericParameter(BasicVector([scale])))
         self.variables += (parameter("scale", self._scale, bounds=(0.0, np.inf)),)

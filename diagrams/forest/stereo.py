@@ -143,14 +143,13 @@ def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfi
         shadows=False,
     )
     lit = builder.add("env", "light", Light(light))
-    for stream, (signal, X_LC) in enumerate(config.poses().items(), start=6):
+    for signal, X_LC in config.poses().items():
         camera = Camera(
             builder.plant,
             frame,
             period=1.0 / config.rate,
             info=config.info(),
             X_FC=X_LC,
-            stream=stream,
             errors=ErrorModel(noise=config.noise, seed=config.seed),
         )
         builder.add("sense", signal.replace("image", "camera"), camera)

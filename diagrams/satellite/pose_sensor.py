@@ -49,7 +49,6 @@ class PoseSensor(SampledSensor):
         target: RigidBody,
         *,
         period: float,
-        stream: int = 0,
         errors: ErrorModel | None = None,
     ) -> None:
         self._starts = base.floating_positions_start(), target.floating_positions_start()
@@ -60,7 +59,6 @@ class PoseSensor(SampledSensor):
             period=period,
             unit="1, m",
             noise={"orientation_noise": (4, "1"), "position_noise": (3, "m")},
-            stream=stream,
             errors=errors,
         )
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())

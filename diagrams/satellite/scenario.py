@@ -227,7 +227,7 @@ class SatelliteScenario(Scenario):
         imu = Imu(plant, plant.GetFrameByName("imu", servicer), period=PERIOD, errors=self.imu_errors)
         builder.add_sensor("imu", imu)
         if self.perception == "pose_sensor":
-            pose_sensor = PoseSensor(plant, base, body, period=POSE_PERIOD, stream=2, errors=self.pose_errors)
+            pose_sensor = PoseSensor(plant, base, body, period=POSE_PERIOD, errors=self.pose_errors)
             builder.add_sensor("target_pose", pose_sensor)
         else:
             nothing = builder.add("sense", "target_pose", ConstantVectorSource(np.zeros(7)))

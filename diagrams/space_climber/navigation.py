@@ -34,7 +34,7 @@ class VisualOdometer(SampledSensor):
 
     __slots__ = NO_DICT
 
-    def __init__(self, body: BodyIndex, *, period: float, stream: int = 3, errors: ErrorModel | None = None) -> None:
+    def __init__(self, body: BodyIndex, *, period: float, errors: ErrorModel | None = None) -> None:
         """Declare the sensor of the body with this index in the plant."""
         super().__init__(
             "visual_odometry",
@@ -42,7 +42,6 @@ class VisualOdometer(SampledSensor):
             period=period,
             unit="m/s",
             noise={"noise": (3, "m/s")},
-            stream=stream,
             errors=errors,
         )
         self._body = int(body)

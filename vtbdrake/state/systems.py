@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 POSE_UNIT = "m, rad"
 # Drake names a system without a name by its class and its address in memory.
-_UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
+UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
 
 def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
@@ -53,9 +53,9 @@ def name_systems(diagram: Diagram) -> None:
     Drake itself names them by their addresses in memory.
     """
     systems = diagram.GetSystems()
-    taken = {system.get_name() for system in systems if not _UNNAMED.search(system.get_name())}
+    taken = {system.get_name() for system in systems if not UNNAMED.search(system.get_name())}
     for system in systems:
-        if _UNNAMED.search(system.get_name()):
+        if UNNAMED.search(system.get_name()):
             names = (class_name(system) + (f"_{count}" if count > 1 else "") for count in itertools.count(1))
             system.set_name(next(name for name in names if name not in taken))
             taken.add(system.get_name())

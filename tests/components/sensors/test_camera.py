@@ -54,7 +54,7 @@ class Scene:
         self.light = None if light is None else builder.AddSystem(Light(light))
         haze = None if haze is None else builder.AddSystem(haze)
         options = {"period": PERIOD, "info": INFO} | options
-        self.camera = builder.AddSystem(Camera(plant, frame, **options))
+        self.camera = builder.AddNamedSystem("camera", Camera(plant, frame, **options))
         connect_camera(builder, self.camera, scene_graph, light=self.light, haze=haze)
         self.joint = joint
         self.diagram: Diagram = builder.Build()
@@ -185,7 +185,7 @@ def test_images_move_with_the_world_after_their_latency(latency: int) -> None:
 
 
 def test_dropped_images_hold_the_last_one() -> None:
-    scene = Scene(errors=ErrorModel(dropout=0.5, seed=3))
+    scene = Scene(errors=ErrorModel(dropout=0.5, seed=3), stream=6)
     times = [k * PERIOD + 0.01 for k in range(12)]
     shown = images(scene, scene.context(speed=0.5), times)
     exact_scene = Scene()

@@ -4,7 +4,7 @@ from vtbdrake.components.sensors.encoders import JointEncoders, JointTachometers
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.foot_contact import ContactSensor
 from vtbdrake.components.sensors.imu import Imu
-from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
+from vtbdrake.components.sensors.noise import normal_noise, stream_of, uniform_noise
 from vtbdrake.components.sensors.reaction import ForceTorqueSensor, JointTorqueSensors
 from vtbdrake.components.sensors.sampled import SampledSensor, connect_to_plant
 
@@ -19,5 +19,6 @@ __all__ = [
     "SampledSensor",
     "connect_to_plant",
     "normal_noise",
+    "stream_of",
     "uniform_noise",
 ]

@@ -36,7 +36,7 @@ from vtbdrake.components.environment.haze import hazed
 from vtbdrake.components.environment.light import LIGHT_SIZE
 from vtbdrake.components.rendering import FILL, SUN, Illumination, RenderedScene, RenderingError
 from vtbdrake.components.sensors.errors import ErrorModel
-from vtbdrake.components.sensors.noise import noise_generator, uniform_noise
+from vtbdrake.components.sensors.noise import noise_generator, random_stream, uniform_noise
 from vtbdrake.components.shadows import sunlit
 from vtbdrake.state import parameter
 from vtbdrake.state.declarations import NO_DICT
@@ -129,7 +129,7 @@ class Camera(LeafSystem):
         near: float = 0.05,
         far: float = 200.0,
         photon_noise: float = 0.0,
-        stream: int = 6,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         """Declare the camera.
@@ -145,7 +145,7 @@ class Camera(LeafSystem):
             near: Distance along z_C in metres below which nothing is seen.
             far: Distance along z_C in metres beyond which nothing is seen.
             photon_noise: Standard deviation of the shot noise at full scale, in counts.
-            stream: Number of the random stream, which makes the noise of several cameras independent.
+            stream: Number of the random stream, as in `SampledSensor`.
             errors: Read noise (in counts), latency, drop-out and seed; None for an exact camera.
 
         Raises:
@@ -167,7 +167,7 @@ class Camera(LeafSystem):
             raise ValueError("Camera: the plant has no geometry; register it with a SceneGraph")
         info = info or CameraInfo(320, 240, np.pi / 4)
         self._width, self._height = info.width(), info.height()
-        self._period, self._stream = float(period), int(stream)
+        self._period, self._stream = float(period), random_stream(self, stream)
         self._near, self._far = float(near), float(far)
         # The number of the frame, because the id of a plant keeps it alive.
         self._frame_number = plant.GetBodyFrameIdOrThrow(frame.body().index()).get_value()
@@ -300,7 +300,7 @@ class Camera(LeafSystem):
         gain, noise, photon_noise, seed = values[[11, 13, 14, 17]].tolist()
         if noise or photon_noise:
             expected = color[..., :3].astype(np.float32)
-            generator = noise_generator(seed=int(seed), stream=self._stream, tick=tick, channel=_PIXEL_CHANNEL)
+            generator = noise_generator(seed=int(seed), stream=self._stream(), tick=tick, channel=_PIXEL_CHANNEL)
             sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / _FULL_SCALE * expected)
             counts = expected + sigma * generator.standard_normal(expected.shape, np.float32)
             color = np.array(color)
@@ -331,8 +331,9 @@ class Camera(LeafSystem):
             color, depth = colors[round(latency)], depths[round(latency)]
             images = ImagesInTransit(colors[:-1], depths[:-1])
             state.get_mutable_abstract_state(int(self._transit)).set_value(images)
-        key = {"seed": int(seed), "stream": self._stream, "tick": tick}
-        if not dropout or uniform_noise(channel=_DROPOUT_CHANNEL, **key) >= dropout:
+        if not dropout or dropout <= uniform_noise(
+            seed=int(seed), stream=self._stream(), tick=tick, channel=_DROPOUT_CHANNEL
+        ):
             self._show(state, color, depth)
         return EventStatus.Succeeded()
 

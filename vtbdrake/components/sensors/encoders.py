@@ -32,7 +32,7 @@ class _JointSensor(SampledSensor):
         default: NDArray[np.float64],
         period: float,
         unit: str,
-        stream: int,
+        stream: int | None,
         errors: ErrorModel | None,
     ) -> None:
         noise = {"noise": (len(entries), unit)}
@@ -68,7 +68,7 @@ class JointEncoders(_JointSensor):
         joints: Sequence[Joint],
         *,
         period: float,
-        stream: int = 1,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         _check_single(joints, self)
@@ -103,7 +103,7 @@ class JointTachometers(_JointSensor):
         joints: Sequence[Joint],
         *,
         period: float,
-        stream: int = 3,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         _check_single(joints, self)

@@ -18,7 +18,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
+from vtbdrake.components.sensors.noise import normal_noise, random_stream, uniform_noise
 from vtbdrake.components.settings import check_settings
 from vtbdrake.state import Element, discrete_state, parameter
 from vtbdrake.state.declarations import weakly
@@ -63,7 +63,7 @@ class ErrorModel:
     outlier_probability: float = 0.0
     # Standard deviation of the error of an outlier, in the unit of the signal.
     outlier_size: float = 0.0
-    # Seed of all random numbers, together with the stream of the sensor.
+    # Seed of all random numbers. Sensors of one seed are independent: each has a stream of random numbers of its own.
     seed: int = 0
 
     def without_chance(self) -> ErrorModel:
@@ -99,6 +99,8 @@ class _Settings:
     """The parameters of an `ErrorStage`, as they are used. None: there is no such error."""
 
     seed: int
+    # 0 without random errors.
+    stream: int = 0
     noise: NDArray[np.float64] | None = None
     bias: NDArray[np.float64] | None = None
     # Of one step of the random walk.
@@ -134,7 +136,7 @@ class ErrorStage:
         model: ErrorModel | None,
         *,
         noise: Mapping[str, tuple[int, str]],
-        stream: int,
+        stream: int | None,
         default: NDArray[np.float64],
         output: int,
         period: float,
@@ -146,13 +148,14 @@ class ErrorStage:
             sensor: The sensor to declare them in.
             model: The initial values; None declares white noise only.
             noise: As in `SampledSensor`.
-            stream: Number of the random stream.
+            stream: As in `SampledSensor`.
             default: The reading before the first sample, shape (n,).
             output: Index of the discrete state that the sensor shows.
             period: Sample period in seconds.
             unit: Unit of the reading.
         """
-        self._n, self._output, self._period, self._stream = default.size, output, period, stream
+        self._n, self._output, self._period = default.size, output, period
+        self._stream = random_stream(sensor, stream)
         self._counts = [count for count, _ in noise.values()]
         self._more = model is not None
         seed, std = (0, 0.0) if model is None else (model.seed, model.noise)
@@ -195,12 +198,12 @@ class ErrorStage:
     def _calc_settings(self, context: Context, settings: Value) -> None:
         n, start = self._n, 1 + len(self._counts)
         values = context.get_numeric_parameter(self._parameters).value()
-        found = _Settings(int(values[0]), _unless_zero(np.repeat(values[1:start], self._counts)))
+        read = _Settings(int(values[0]), noise=_unless_zero(np.repeat(values[1:start], self._counts)))
         if self._more:
             bias, drift, quantization = values[start : start + 3 * n].reshape(3, n)
             latency, dropout, outlier_probability, outlier_size = values[start + 3 * n :].tolist()
-            found = replace(
-                found,
+            read = replace(
+                read,
                 bias=_unless_zero(bias),
                 drift=_unless_zero(sqrt(self._period) * drift),
                 quantization=_unless_zero(quantization),
@@ -209,7 +212,9 @@ class ErrorStage:
                 outlier_probability=outlier_probability,
                 outlier_size=outlier_size,
             )
-        settings.set_value(found)
+        if read.noise is not None or read.drift is not None or read.dropout or read.outlier_probability:
+            read = replace(read, stream=self._stream())
+        settings.set_value(read)
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
         """Let ``y`` be in transit, throughout."""
@@ -225,7 +230,7 @@ class ErrorStage:
         if not (np.count_nonzero(values[1:]) or (self._more and self._remembers(context))):
             return y
         settings: _Settings = self._settings(context)
-        key = {"seed": settings.seed, "stream": self._stream, "tick": round(context.get_time() / self._period)}
+        key = {"seed": settings.seed, "stream": settings.stream, "tick": round(context.get_time() / self._period)}
         if settings.noise is not None:
             y = y + settings.noise * normal_noise(y.size, **key)
         return self._shown(context, state, y, settings, key) if self._more else y

@@ -47,7 +47,7 @@ class ContactSensor(SampledSensor):
         *,
         period: float,
         threshold: float = 1.0,
-        stream: int = 2,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         """Declare the sensor; ``threshold`` is a force (N), and a parameter of the Context."""

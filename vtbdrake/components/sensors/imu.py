@@ -58,7 +58,7 @@ class Imu(SampledSensor):
         frame: Frame,
         *,
         period: float,
-        stream: int = 0,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         body = frame.body()

@@ -26,7 +26,7 @@ from pydrake.systems.framework import (
 
 from vtbdrake.components.environment.haze import false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
-from vtbdrake.components.sensors.noise import noise_generator
+from vtbdrake.components.sensors.noise import noise_generator, random_stream
 from vtbdrake.components.settings import check_settings
 from vtbdrake.scan import Scan
 from vtbdrake.state import Codec, Element, discrete_state, parameter
@@ -196,7 +196,7 @@ class LaserScanner(LeafSystem):
         *,
         config: LaserScannerConfig | None = None,
         slice_period: float = 0.02,
-        stream: int = 7,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         """Declare the scanner.
@@ -207,7 +207,7 @@ class LaserScanner(LeafSystem):
             caster: The geometry that rays are cast at; several scanners can share it.
             config: Initial values of the parameters.
             slice_period: Length of a slice in s. It limits the frequency; shorter ones cost time.
-            stream: Number of the random stream, which makes the noise of several sensors independent.
+            stream: Number of the random stream, as in `SampledSensor`.
             errors: Errors of the ranges, and the seed; None for exact ranges.
 
         Raises:
@@ -223,7 +223,7 @@ class LaserScanner(LeafSystem):
             if getattr(errors, name):
                 raise ValueError(f"LaserScanner: scans have no {name}; leave it out of the errors")
         self._caster, self._body = caster, int(frame.body().index())
-        self._slice_period, self._stream = float(slice_period), int(stream)
+        self._slice_period, self._stream = float(slice_period), random_stream(self, stream)
         self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self._velocities_port = self.DeclareAbstractInputPort("body_spatial_velocities", Value[list[SpatialVelocity]]())
         self._haze_port = self.DeclareVectorInputPort("haze", 5)
@@ -311,7 +311,8 @@ class LaserScanner(LeafSystem):
             start, slices, fired = now, (), 0
             period, rows, columns, by_columns = _next_scan(settings.config)
         tick = round(now / self._slice_period)
-        generator = noise_generator(seed=int(settings.errors.seed), stream=self._stream, tick=tick, channel=_CHANNEL)
+        stream = self._stream() if self._is_random(context, settings) else 0
+        generator = noise_generator(seed=int(settings.errors.seed), stream=stream, tick=tick, channel=_CHANNEL)
         while True:
             rays = rows * columns
             due = min(rays, int((now + _ROUNDING - start) / period * rays + 0.5))
@@ -333,6 +334,11 @@ class LaserScanner(LeafSystem):
         state.get_mutable_abstract_state(int(self._progress)).set_value(ScanInProgress(slices))
         state.get_mutable_discrete_state().set_value(self._present, [start, period, rows, columns, by_columns, fired])
         return EventStatus.Succeeded()
+
+    def _is_random(self, context: Context, settings: _Settings) -> bool:
+        errors = settings.errors
+        random = settings.config.divergence or errors.noise or errors.outlier_probability or errors.dropout
+        return bool(random) or self._haze_port.HasValue(context)
 
     def _fire(
         self,

@@ -5,10 +5,19 @@ It has no state, so repetitions of a simulation and copies of its Context have t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
+from hashlib import blake2b
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vtbdrake.state.declarations import weakly
+from vtbdrake.state.systems import UNNAMED, class_name
+
+if TYPE_CHECKING:
+    from pydrake.systems.framework import System
 
 # A generator costs more than its samples: many ticks share one.
 _BATCH = 512
@@ -40,6 +49,39 @@ def noise_generator(*, seed: int, stream: int, tick: int, channel: int) -> np.ra
     The stream's ``channel`` is its own: `normal_noise` and `uniform_noise` use the same generator.
     """
     return _generator(seed, stream, tick, channel)
+
+
+def random_stream(system: System, number: int | None) -> Callable[[], int]:
+    """Return a function that returns the random stream of a system: ``number``, or that of `stream_of` for None.
+
+    Raises:
+        ValueError: The number is no stream.
+    """
+    if number is not None and not (0 <= number < 2**64 and number == int(number)):
+        raise ValueError(
+            f"{class_name(system)}: stream is a whole number from 0 to 2^64 - 1, or None for one that follows from the "
+            f"system's name, not {number!r}"
+        )
+    return weakly(system, lambda system: stream_of(system) if number is None else int(number))
+
+
+def stream_of(system: System) -> int:
+    """Return the random stream of a system, a number of 64 bits that follows from its path below the root Diagram.
+
+    So systems of different names have independent noise, and a system has the same noise in every build, copy, thread
+    and process. The name of the root does not count: a world alone has the noise that it has in its testbed.
+
+    Raises:
+        ValueError: The system or a Diagram around it has no name; what Drake calls it changes with every run.
+    """
+    names = system.GetSystemPathname().split("::")[2:]
+    if any(UNNAMED.search(name) for name in names):
+        where = "has no name" if UNNAMED.search(names[-1]) else f"{names[-1]} is in a Diagram without a name"
+        raise ValueError(
+            f"{class_name(system)} {where}, and its random numbers follow from its name: add it by AddNamedSystem, or "
+            "give it a stream= of its own"
+        )
+    return int.from_bytes(blake2b("::".join(names).encode(), digest_size=8).digest(), "big")
 
 
 def _ticks(size: int) -> int:

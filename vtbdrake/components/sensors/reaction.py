@@ -46,7 +46,13 @@ class ForceTorqueSensor(SampledSensor):
     __slots__ = NO_DICT
 
     def __init__(
-        self, plant: MultibodyPlant, joint: Joint, *, period: float, stream: int = 4, errors: ErrorModel | None = None
+        self,
+        plant: MultibodyPlant,
+        joint: Joint,
+        *,
+        period: float,
+        stream: int | None = None,
+        errors: ErrorModel | None = None,
     ) -> None:
         (self._place,) = places(plant, [joint])
         super().__init__(
@@ -89,7 +95,7 @@ class JointTorqueSensors(SampledSensor):
         joints: Sequence[RevoluteJoint],
         *,
         period: float,
-        stream: int = 5,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         from pydrake.multibody.tree import RevoluteJoint

@@ -38,7 +38,7 @@ class SampledSensor(LeafSystem):
         period: float,
         unit: str,
         noise: Mapping[str, tuple[int, str]] | None = None,
-        stream: int = 0,
+        stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
         """Declare the sensor.
@@ -50,7 +50,8 @@ class SampledSensor(LeafSystem):
             unit: Unit of the reading.
             noise: Name of a standard deviation -> (number of entries of y that it applies to, unit). It is 0 without
                 ``errors``.
-            stream: Number of the random stream, which makes the noise of several sensors independent.
+            stream: Number of the random stream; sensors with one seed and one stream have the same noise. None: one of
+                its own, which follows from the name of this system in its Diagram (`stream_of`).
             errors: The measurement errors; None for an exact sensor.
 
         Raises:
@@ -77,7 +78,7 @@ class SampledSensor(LeafSystem):
                 self,
                 errors,
                 noise=noise,
-                stream=int(stream),
+                stream=stream,
                 default=y0,
                 output=self._output,
                 period=self._period,
