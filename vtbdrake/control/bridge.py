@@ -89,7 +89,7 @@ class Bridge(ABC):
             The signals whose commands did not leave, as far as is known; mostly empty.
         """
 
-    def keep(self, signals: Collection[str]) -> None:
+    def keep(self, signals: Collection[str]) -> None:  # noqa: B027 - most take nothing away
         """Keep the right to command signals for which nothing is sent at present, such as under a silent fallback.
 
         By default nothing is done, because nothing takes that right from a bridge that does not send.
