@@ -3,7 +3,7 @@
 The question in the paper's words: s^0 = phi, the heading, in [-45, 45] deg; q(t) = z(t), the elevation; f = z; f_m is
 infinite, and t_m is 300 s. The robot asks its own testbed: the rollouts begin at its belief, in its map of the crater.
 
-The world differs from the map, see `differing`: its ground is rough, its friction and the robot's mass are others.
+The world differs from the map, see `differing`: its ground is wavy, its friction and the robot's mass are others.
 Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
 that only headings count as passable which are so for all of the range. Among boulders, a decimetre can make the
 difference; so each heading can be tried from several samples of the belief, of which the worst counts.
@@ -52,10 +52,10 @@ PATIENCE = 30.0
 STANDING = 2.0
 
 # What a world differs by: ranges of the factors of friction and of the torso's mass, and the standard deviation of its
-# ground in m.
+# ground from the map, in waves of some 2.5 m and more, in m.
 FRICTION_RANGE = (0.9, 1.1)
 MASS_RANGE = (0.9, 1.1)
-ROUGHNESS = 0.03
+WAVINESS = 0.03
 # Of the believed pose: standard deviations of x and y in m, and of yaw in rad.
 POSE_UNCERTAINTY = (0.1, 0.1, 0.0, 0.0, 0.0, 0.02)
 CAUTION = FRICTION_RANGE[0]
@@ -84,7 +84,7 @@ class World:
     """A simulated reality, which differs from the robot's model of it.
 
     Attributes:
-        scenario: The scenario with its crater, its roughness and its friction.
+        scenario: The scenario with its crater, its waves and its friction.
         mass: Factor of the torso's mass.
     """
 
@@ -93,11 +93,11 @@ class World:
 
 
 def differing(seed: int, difference: int) -> World:
-    """Return a world with the crater ``seed``; ``difference`` is the seed of friction, mass and roughness."""
+    """Return a world with the crater ``seed``; ``difference`` is the seed of friction, mass and waves."""
     rng = np.random.default_rng([seed, difference])
     nominal = CraterScenario(seed=seed)
     friction = nominal.friction * float(rng.uniform(*FRICTION_RANGE))
-    world = replace(nominal, friction=friction, roughness=ROUGHNESS, roughness_seed=difference)
+    world = replace(nominal, friction=friction, waviness=WAVINESS, waviness_seed=difference)
     return World(world, mass=float(rng.uniform(*MASS_RANGE)))
 
 

@@ -18,6 +18,7 @@ from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
 from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS, Crater, add_crater
@@ -61,8 +62,8 @@ class CraterScenario(SpaceClimberScenario):
     seed: int = 0
     gullies: bool = True
     boulders: bool = True
-    roughness: float = 0.0
-    roughness_seed: int = 0
+    waviness: float = 0.0
+    waviness_seed: int = 0
     # A simulation ends when the robot has come no further from the axis (by `PROGRESS`) for so long, in s; 0: never.
     patience: float = 0.0
 
@@ -72,8 +73,8 @@ class CraterScenario(SpaceClimberScenario):
             slope_deg=(self.slope_deg == 0.0, "0: the crater's ground has slopes of its own"),
             clearance=(0.0 <= self.clearance <= 0.15, "within [0, 0.15] m"),
             seed=(self.seed >= 0, "not negative"),
-            roughness=(0.0 <= self.roughness <= 0.1, "within [0, 0.1] m"),
-            roughness_seed=(self.roughness_seed >= 0, "not negative"),
+            waviness=(0.0 <= self.waviness <= 0.1, "within [0, 0.1] m"),
+            waviness_seed=(self.waviness_seed >= 0, "not negative"),
             patience=(self.patience >= 0.0, "not negative, in s"),
         )
 
@@ -84,12 +85,12 @@ class CraterScenario(SpaceClimberScenario):
             self.seed,
             gullies=self.gullies,
             boulders=self.boulders,
-            roughness=self.roughness,
-            roughness_seed=self.roughness_seed,
+            waviness=self.waviness,
+            waviness_seed=self.waviness_seed,
         )
 
     def mental(self) -> Self:
-        """Return what the robot simulates when it reasons: a map without roughness, and a faster integrator.
+        """Return what the robot simulates when it reasons: a map without waves, and a faster integrator.
 
         Drake's discrete SAP solver at the DPS's own period slips where a fine integrator does; CENIC at loose
         accuracies and the lagged approximation climb slopes that are steeper than friction allows.
@@ -100,7 +101,7 @@ class CraterScenario(SpaceClimberScenario):
             plant_config=MultibodyPlantConfig(
                 time_step=self.period, contact_model="point", discrete_contact_approximation="sap"
             ),
-            roughness=0.0,
+            waviness=0.0,
         )
 
     def interface(self) -> Interface:
@@ -125,8 +126,10 @@ class CraterScenario(SpaceClimberScenario):
         builder.connect(builder.plant.GetOutputPort("body_poses"), monitor.get_input_port())
 
     def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
-        add_crater(plant, self.crater)
-        return RigidTransform()
+        crater = self.crater
+        add_crater(plant, crater)
+        # Level, on the highest of the places under its feet: no foot begins in the ground.
+        return RigidTransform([0.0, 0.0, float(crater.mesh_height(Morphology().stance[:, :2]).max())])
 
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
         """Declare what the robot believes; the elevation is that of its map plus its height over the ground."""

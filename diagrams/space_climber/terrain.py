@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Box, Convex, Mesh, ProximityProperties
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
+from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 from scipy.special import ndtr
 
@@ -128,15 +129,16 @@ class Crater:
         seed: Determines walls, gullies and boulders.
         gullies: False fills the gullies.
         boulders: False removes the boulders.
-        roughness: Standard deviation of the mesh's vertices around the surface, in m.
-        roughness_seed: Determines the roughness.
+        waviness: Standard deviation of the mesh's vertices around the surface, in m. They are `_FINE` apart or more:
+            these are waves of metres, and each of the triangles, larger than the robot, is smooth.
+        waviness_seed: Determines the waves.
     """
 
     seed: int = 0
     gullies: bool = True
     boulders: bool = True
-    roughness: float = 0.0
-    roughness_seed: int = 0
+    waviness: float = 0.0
+    waviness_seed: int = 0
 
     def wall_slope(self, azimuth: ArrayLike) -> Array:
         """Return a(theta), the largest slope of the wall in rad, at azimuths in rad."""
@@ -150,7 +152,7 @@ class Crater:
         return slope
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return the height of the ground over the floor in m, without boulders and roughness."""
+        """Return the height of the ground over the floor in m, without boulders and waves."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
         r = np.hypot(x, y)
         foot = RIM_RADIUS - 0.5 * np.pi * DEPTH / np.tan(self.wall_slope(np.arctan2(y, x)))
@@ -211,9 +213,16 @@ class Crater:
         clockwise = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
         triangles[clockwise] = triangles[clockwise][:, ::-1]
         z = self.height(*points.T)
-        if self.roughness > 0.0:
-            z = z + self.roughness * np.random.default_rng([self.roughness_seed, 3]).standard_normal(z.size)
+        if self.waviness > 0.0:
+            z = z + self.waviness * np.random.default_rng([self.waviness_seed, 3]).standard_normal(z.size)
         return np.column_stack([points, z]), triangles
+
+    def mesh_height(self, places: ArrayLike) -> Array:
+        """Return the height of the mesh, with its waves, at places (x, y) within it, (n, 2), in m."""
+        vertices, _ = self.mesh
+        # Over the Delaunay triangulation of the same points.
+        z: Array = LinearNDInterpolator(vertices[:, :2], vertices[:, 2])(np.asarray(places, dtype=float))
+        return z
 
     def _map_points(self) -> Array:
         """Return (x, y) of the mesh's vertices, (n, 2): rings, coarse outside the sector, and rows along gullies."""

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem
 from pydrake.systems.primitives import LinearSystem
 
 from tests.testbeds import PENDULUM
@@ -95,6 +95,35 @@ class MassScenario(Scenario):
         builder.sim_sensor("state", mass.get_output_port())
         builder.sim_actuator("force", mass.get_input_port())
         builder.believe("sim.sys.mass.discrete_state_0", of=["dps.estimate"], age=PERIOD)
+
+
+class Fence(LeafSystem):
+    """Ends the simulation when the mass is past a position, in m."""
+
+    __slots__ = NO_DICT
+
+    def __init__(self, position: float) -> None:
+        super().__init__()
+        self._position = position
+        self._state = self.DeclareVectorInputPort("state", BasicVector(2))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(10 * PERIOD, 0.0, self._check)
+
+    def _check(self, context: Context, _: object) -> EventStatus:
+        if self._state.Eval(context)[0] > self._position:
+            return EventStatus.ReachedTermination(self, "the mass has left its track")
+        return EventStatus.Succeeded()
+
+
+@dataclass
+class FencedMassScenario(MassScenario):
+    """The mass on a track that ends."""
+
+    track: float = 1.0
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        fence = builder.add("env", "fence", Fence(self.track))
+        builder.connect(builder.sensors["state"], fence.get_input_port())
 
 
 @dataclass

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
-from tests.reasoning.scenarios import HANG, KILL, MassScenario, SwingUpScenario
+from tests.reasoning.scenarios import HANG, KILL, FencedMassScenario, MassScenario, SwingUpScenario
 from vtbdrake.optimization import Choice, Parameter
 from vtbdrake.reasoning import Belief, Budget, Reasoner, ReasonerError
 from vtbdrake.rollout import Constraint, ProcessExecutor, Pruning, Quality, SerialExecutor, ThreadExecutor
@@ -537,6 +537,18 @@ def test_a_quality_that_ignores_the_decision_is_reported(mass):
     decision = decide(make(horizon=0.01, sample_period=0.01, budget=Budget(rollouts=6)), mass)
     assert decision.keeps_plan
     assert any("all 6 eligible candidates are equally good" in warning for warning in decision.warnings)
+
+
+@pytest.mark.parametrize(("track", "is_reported"), [(-1.0, True), (0.01, True), (0.5, False), (5.0, False)])
+def test_a_start_from_which_every_rollout_ends_at_once_is_reported(track, is_reported):
+    """The mass is past 1 cm after 0.14 s, and past 0.5 m after 1 s at the earliest, a third of the horizon."""
+    scenario = FencedMassScenario(track=track)
+    reasoner = make(scenario, decision=[Parameter("u.switch", 0.5, 1.5)])
+    decision = decide(reasoner, scenario.build(), values={"u.switch": 1.0})
+    assert decision.poor == is_reported
+    if is_reported:
+        assert "all 30 rollouts were ended within" in decision.warnings[0]
+        assert "the mass has left its track" in decision.warnings[0]
 
 
 def test_a_budget_for_the_plan_in_use_alone_is_reported(mass):

@@ -21,6 +21,7 @@ from vtbdrake.reasoning.space import same_values
 from vtbdrake.rollout import Cutoff, RolloutResult
 from vtbdrake.rollout.pruning import PRUNED, STALLED
 from vtbdrake.rollout.start import Start
+from vtbdrake.rollout.task import TERMINATED
 from vtbdrake.testbed.interrupt import Interruptible
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ _KNOWN_BATCHES = 50
 
 # A decision is late if it took more than this many times its budget of wall time.
 _LATE = 1.5
+
+# Rollouts end early if a system ends them before this share of the horizon.
+_EARLY = 0.25
 
 
 class _BudgetSpentError(Exception):
@@ -251,7 +255,7 @@ class DecisionRun:
             end=end,
             message=message if best is not None else f"no candidate is eligible ({_why_none(candidates)}); {message}",
             time=self._time,
-            warnings=tuple(_warnings(candidates, ranked, results, elapsed, budget)),
+            warnings=tuple(_warnings(candidates, ranked, results, elapsed, budget, problem.task.horizon)),
             name=problem.objectives[0].name,
             minimize=problem.objectives[0].minimize,
             starts=tuple(self._starts),
@@ -301,6 +305,7 @@ def _warnings(
     results: Sequence[RolloutResult],
     elapsed: float,
     budget: Budget,
+    horizon: float,
 ) -> Iterator[str]:
     """Yield reasons not to trust a decision.
 
@@ -310,6 +315,7 @@ def _warnings(
         results: All rollouts that have finished.
         elapsed: The wall time of the decision, in seconds.
         budget: Budget of the decision.
+        horizon: The longest duration of a rollout, in seconds.
     """
     failures = [result.message for result in results if result.failed]
     if failures:
@@ -325,5 +331,12 @@ def _warnings(
             f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a worker hangs, or the time from one "
             "sample to the next is too long"
         )
+    if {result.end for result in results} == {TERMINATED}:
+        latest = max(float(result.times[-1]) for result in results)
+        if latest < _EARLY * horizon:
+            yield (
+                f"all {len(results)} rollouts were ended within {latest:.3g} s of {horizon:g} s, the first: "
+                f"{results[0].message}; either nothing helps where they begin, or the horizon is far too long"
+            )
     if len(ranked) > 1 and ranked[0].quality == ranked[-1].quality:
         yield f"all {len(ranked)} eligible candidates are equally good: within the horizon, the quality ignores them"

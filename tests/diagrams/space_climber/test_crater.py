@@ -96,11 +96,11 @@ def test_the_mesh_has_the_slopes_of_the_surface(seed: int) -> None:
     assert np.median(error[fine]) < 0.04
 
 
-def test_roughness_moves_the_vertices_by_its_standard_deviation() -> None:
-    smooth, rough = Crater(2).mesh[0], Crater(2, roughness=0.03, roughness_seed=5).mesh[0]
-    np.testing.assert_array_equal(smooth[:, :2], rough[:, :2])
-    assert np.std(rough[:, 2] - smooth[:, 2]) == pytest.approx(0.03, rel=0.1)
-    assert not np.array_equal(rough, Crater(2, roughness=0.03, roughness_seed=6).mesh[0])
+def test_waves_move_the_vertices_by_their_standard_deviation() -> None:
+    smooth, wavy = Crater(2).mesh[0], Crater(2, waviness=0.03, waviness_seed=5).mesh[0]
+    np.testing.assert_array_equal(smooth[:, :2], wavy[:, :2])
+    assert np.std(wavy[:, 2] - smooth[:, 2]) == pytest.approx(0.03, rel=0.1)
+    assert not np.array_equal(wavy, Crater(2, waviness=0.03, waviness_seed=6).mesh[0])
 
 
 def test_a_seed_determines_the_crater() -> None:
@@ -215,7 +215,7 @@ def test_the_believed_elevation_is_that_of_the_map(mental: VirtualTestbed) -> No
     [
         ({"slope_deg": 5.0}, "slope_deg must be 0"),
         ({"clearance": 0.3}, "clearance must be within"),
-        ({"roughness": -0.01}, "roughness must be within"),
+        ({"waviness": -0.01}, "waviness must be within"),
         ({"seed": -1}, "seed must be not negative"),
     ],
 )

@@ -47,13 +47,13 @@ def test_worlds_differ_within_what_the_robot_expects() -> None:
     assert differing(2, 3) == differing(2, 3)
     assert differing(2, 3) != differing(2, 4)
     assert model(2).friction == pytest.approx(CAUTION * CraterScenario().friction)
-    assert model(2).mental().roughness == 0.0
+    assert model(2).mental().waviness == 0.0
     for fields in COUNTERFACTUALS.values():
         model(2).with_fields(fields)
 
 
 def test_the_robot_decides_while_it_stands_in_a_world_that_differs() -> None:
-    world = World(CraterScenario(seed=1, boulders=False, roughness=0.03, friction=0.55), mass=1.05)
+    world = World(CraterScenario(seed=1, boulders=False, waviness=0.03, friction=0.55), mass=1.05)
     expedition = Expedition(world)
     scenario = replace(model(1), boulders=False)
     with heading_reasoner(scenario, horizon=4.0, executor="serial") as reasoner:
