@@ -39,7 +39,7 @@ from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
 from vtbdrake_diagrams.forest.drives import Track, localize, recorded_drive
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.stand import MAPS, Stand
+from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
 Array = NDArray[np.float64]
 
@@ -106,8 +106,8 @@ class RouteScenario(ForestScenario):
         own = {item.name: getattr(true, item.name) for item in fields(Stand)}
         return MappedStand(**own, errors=self.map, map_seed=self.map_seed)
 
-    def surveyed_map(self) -> WorldModel:
-        return super().stand().map(MAPS[self.map], seed=self.map_seed)
+    def surveyed_map(self, errors: MapErrors) -> WorldModel:
+        return super().stand().map(errors, seed=self.map_seed)
 
 
 def variance(time: float, covariance: Array) -> float:

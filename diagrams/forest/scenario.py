@@ -33,7 +33,7 @@ from vtbdrake_diagrams.forest.ground import Ground
 from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
 from vtbdrake_diagrams.forest.plain import RockField
 from vtbdrake_diagrams.forest.routes import Route
-from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
+from vtbdrake_diagrams.forest.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig, StereoLandmarks, add_stereo
 from vtbdrake_diagrams.forest.vegetation import Vegetation
 
@@ -177,8 +177,8 @@ class CarrierScenario(Scenario):
         """Return the true landmarks."""
 
     @abstractmethod
-    def surveyed_map(self) -> WorldModel:
-        """Return the map of the landmarks that ``map`` and ``map_seed`` describe."""
+    def surveyed_map(self, errors: MapErrors) -> WorldModel:
+        """Return the map of the landmarks by a survey with these errors, of the seed ``map_seed``."""
 
     @abstractmethod
     def add_landscape(self, plant: MultibodyPlant) -> None:
@@ -193,7 +193,7 @@ class CarrierScenario(Scenario):
             GeoJsonError: The file is no map, or one of another place.
         """
         if not self.map_file:
-            return self.surveyed_map()
+            return self.surveyed_map(MAPS[self.map])
         found = load_geojson(self.map_file, deviation=MAPS[self.map].position)
         places, area = found.positions()[:, :2], np.array([self.length, self.width])
         if len(places) and not ((places >= 0.0) & (places <= area)).all(axis=1).any():
@@ -399,8 +399,8 @@ class ForestScenario(CarrierScenario):
     def truth(self) -> WorldModel:
         return self.stand().trees()
 
-    def surveyed_map(self) -> WorldModel:
-        return self.stand().map(MAPS[self.map], seed=self.map_seed)
+    def surveyed_map(self, errors: MapErrors) -> WorldModel:
+        return self.stand().map(errors, seed=self.map_seed)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.forest.world import add_forest
@@ -491,8 +491,8 @@ class PlainScenario(CarrierScenario):
     def truth(self) -> WorldModel:
         return self.rock_field().rocks()
 
-    def surveyed_map(self) -> WorldModel:
-        return self.rock_field().map(MAPS[self.map], seed=self.map_seed)
+    def surveyed_map(self, errors: MapErrors) -> WorldModel:
+        return self.rock_field().map(errors, seed=self.map_seed)
 
     def detector(self) -> ScanLandmarks:
         return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy(), least_height=0.1), self.X_BL)

@@ -135,6 +135,16 @@ def test_landmarks_that_may_be_others_enter_with_less_certainty(view, variance):
     np.testing.assert_allclose(state.covariance[6:, 6:], np.eye(4) / (p**2 / variance + 1.0 / variance), atol=1e-6)
 
 
+def test_landmarks_are_looked_for_as_far_as_they_may_be():
+    """A map with deviations of 1.5 m: all detections are 3 m off together, two deviations, and are matched."""
+    places = np.array([[x, y] for x in (-30.0, -10.0, 10.0, 30.0) for y in (-15.0, 15.0)])
+    tracker = Tracker(spread_out(places, 1.5), correlation=200.0, bias_deviation=1e-6)
+    state, _ = tracker.start(np.zeros(3), np.diag([0.1, 0.1, 0.001]) ** 2)
+    scan = spread_out(places + np.array([3.0, 0.0]), 0.02)
+    _, matches = tracker.update(state, scan)
+    assert matches.is_fused and [i == j for i, j in matches.pairs] == [True] * 8
+
+
 @pytest.mark.parametrize(("deviations", "is_lost"), [(0.5, False), (2.2, True)])
 def test_first_matches_that_fit_badly_lose_the_track(deviations, is_lost):
     places = np.array([[x, y] for x in (-9.0, 0.0, 9.0) for y in (-9.0, -3.0, 3.0, 9.0)])

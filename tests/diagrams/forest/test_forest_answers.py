@@ -1,11 +1,13 @@
 """Tests of row C2: the unit over LCM, and the displacement of a map that nothing shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake_diagrams.forest.answers import over_lcm
-from vtbdrake_diagrams.forest.drives import REACH, Drive, forest, least_error, least_error_along
+from vtbdrake_diagrams.forest.drives import REACH, Drive, best_error_along, forest, least_error, least_error_along
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
 
@@ -49,3 +51,31 @@ def test_least_error_is_by_the_trees_beside_the_path() -> None:
     places = stand.trees().positions()[:, :2]
     near = np.hypot(places[:, 0] - np.clip(np.round(places[:, 0]), 50.0, 59.0), places[:, 1] - 50.0) < REACH
     assert least_error_along({5: drive}, MAPS["poor"]) == pytest.approx(least_error(MAPS["poor"], places[near]))
+
+
+@pytest.mark.one_python
+def test_best_estimates_on_maps_err_as_expected_over_many_maps() -> None:
+    """The RMS over 80 maps of one stand against the formula of Gauss and Markov, for the trees on each map."""
+    scenario = ForestScenario(seed=2, length=60.0, width=60.0, density=300.0)
+    path = np.array([[20.0 + k, 30.0, 0.0] for k in range(20)])
+    drive = Drive(np.arange(20.0), path, path, (Landmarks.empty(),) * 20)
+    surveys = {k: replace(scenario, map_seed=k) for k in range(80)}
+    best = best_error_along(dict.fromkeys(surveys, drive), "poor", scenario=surveys.__getitem__)
+    places = scenario.stand().trees().positions()[:, :2]
+    near = places[np.hypot(places[:, 0] - np.clip(np.round(places[:, 0]), 20.0, 39.0), places[:, 1] - 30.0) < REACH]
+    # A third of the trees is missing on each map: the error is between those by all, and by half of them.
+    assert 0.9 * least_error(MAPS["poor"], near) < best < 1.1 * least_error(MAPS["poor"], near[::2])
+
+
+@pytest.mark.one_python
+def test_of_independent_errors_the_best_estimate_is_the_mean() -> None:
+    scenario = ForestScenario(seed=2, length=60.0, width=60.0, density=300.0)
+    path = np.array([[20.0 + k, 30.0, 0.0] for k in range(20)])
+    drive = Drive(np.arange(20.0), path, path, (Landmarks.empty(),) * 20)
+    errors, exact = (
+        scenario.surveyed_map(one).positions()[:, :2]
+        for one in (MAPS["accurate"], replace(MAPS["accurate"], position=0.0))
+    )
+    near = np.hypot(exact[:, 0] - np.clip(np.round(exact[:, 0]), 20.0, 39.0), exact[:, 1] - 30.0) < REACH
+    mean = np.hypot(*(errors - exact)[near].mean(axis=0))
+    assert best_error_along({2: drive}, "accurate", scenario=lambda seed: scenario) == pytest.approx(mean, rel=1e-9)

@@ -52,6 +52,18 @@ def test_worlds_differ_within_what_the_robot_expects() -> None:
         model(2).with_fields(fields)
 
 
+@pytest.mark.parametrize("seed", [2, 5, 12, 27])
+def test_the_robot_starts_on_the_ground_and_not_in_it(seed: int) -> None:
+    """Waves lift the ground under a foot by up to 9 cm in these worlds; Drake's own contact query is the judge."""
+    world = differing(seed, seed).scenario
+    testbed = world.build()
+    context = testbed.default_context()
+    query = testbed.scene_graph.get_query_output_port().Eval(testbed.scene_graph.GetMyContextFromRoot(context))
+    assert max((pair.depth for pair in query.ComputePointPairPenetration()), default=0.0) < 2e-4
+    lifted = query.ComputeSignedDistancePairwiseClosestPoints(0.002)
+    assert any(pair.distance < 2e-4 for pair in lifted)
+
+
 def test_the_robot_decides_while_it_stands_in_a_world_that_differs() -> None:
     world = World(CraterScenario(seed=1, boulders=False, waviness=0.03, friction=0.55), mass=1.05)
     expedition = Expedition(world)
