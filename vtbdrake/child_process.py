@@ -177,8 +177,8 @@ class ChildProcess:
         self.connection.close()
         try:
             return self.wait(timeout)
-        except TimeoutError as error:
-            _log.error("%s and is killed", error)
+        except TimeoutError:
+            _log.error("%s (process %d) has not ended in time, and is killed", self.name, self.pid)
             return self.kill()
 
     def kill(self) -> int:

@@ -177,7 +177,13 @@ def deploy(
     if start is not None:
         target.restore(context, start)
     target.write(context, values or {})
+    from vtbdrake.recording.recorder import Recorder, RecordingError
+
+    recorder = None
     with deployment.runtime(target, bridge, context=context, **options) as runtime, ExitStack() as stack:
+        if runtime.slow_parts.statistics:
+            _log.info("waiting for the processes of the slow parts %s", ", ".join(runtime.slow_parts.statistics))
+            runtime.slow_parts.wait_until_ready()
         bridge.open()
         stack.callback(bridge.close)
         if claim:
@@ -187,14 +193,15 @@ def deploy(
 
             stack.enter_context(LiveService(runtime, url))
         if record is not None:
-            from vtbdrake.recording.recorder import Recorder
-
             recorder = stack.enter_context(Recorder(runtime, record))
+            recorder.wait_until_ready()
         try:
             yield runtime
         finally:
             # After Ctrl-C or an error in `Runtime.run`, the loop has done so already.
             if not any(fault.kind == "told" for fault in runtime.guards.latched):
                 runtime.send_fallback("the deployment ended")
-    if record is not None:
-        _log.info("recorded to %s; %d cycles lost", record, recorder.lost)
+    if recorder is not None:
+        if recorder.lost:
+            raise RecordingError(f"{recorder.lost} of {runtime.cycles} cycles of the loop are not in the log {record}")
+        _log.info("recorded to %s, without a loss", record)

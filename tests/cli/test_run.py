@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -201,8 +202,19 @@ def test_run_ends_in_time_and_writes_files(hub: Hub, tmp_path: Path) -> None:
     assert told.period == PERIOD
     # One command in each cycle but those before the machine spoke, and the farewell.
     assert told.cycles + 1 >= len(ear.listen()) / 2 > 1
-    assert f"recorded to {tmp_path / 'log.lcm'}; 0 cycles lost" in errors
+    assert f"recorded to {tmp_path / 'log.lcm'}, without a loss" in errors
     assert (tmp_path / "log.lcm").stat().st_size > 0
+
+
+def test_log_that_lacks_cycles_is_an_error(hub: Hub, tmp_path: Path) -> None:
+    with MachineProcess(ServoMachineScenario(), hub.url):
+        options = ("--url", hub.url, "--seconds", 1.0, "--no-live", "--record", tmp_path / "log.lcm")
+        with start(SERVO, *options, *FAR) as program:
+            resource.prlimit(program.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))  # as a disk that is full
+            output, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 1
+    assert "deadlines missed" in output
+    assert re.search(r"^Error: \d+ of \d+ cycles of the loop are not in the log .*log\.lcm$", errors, re.MULTILINE)
 
 
 def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:

@@ -114,7 +114,7 @@ def test_killed_worker_is_noticed_and_drops_are_counted():
 
 def test_end_of_the_worker_is_logged_once(caplog):
     worker = BackgroundProcess(fail, 3, name="failure")
-    select.select((worker,), (), (), TIMEOUT)
+    assert worker.wait_for_frames(TIMEOUT) == []
     assert worker.take() == worker.take() == [] and not worker.alive
     assert caplog.text.count(f"failure (process {worker.pid}) is lost: ") == 1
     assert worker.close() == 3

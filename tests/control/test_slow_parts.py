@@ -15,11 +15,15 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from tests.control.scripted import PERIOD, ScriptedBridge
 from tests.control.slow import SlowScenario, busy, chaotic, deadly, gated, moving, picky, processes
+from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.slow_worker import pack, unpack
 from vtbdrake.control.stepping import RESULT
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed import DpsAlone, SlowPart
 
@@ -213,6 +217,35 @@ def test_loop_goes_on_without_the_processes():
         real.run(200)
         assert real.counts.results == before and real.counts.missed >= 9
         assert len(real.bridge.sent) == 250
+
+
+def test_loop_begins_when_its_slow_parts_are_ready():
+    protocol = Protocol(
+        sense=[iiwa_status({"position": "joint_position_measured"})], act=[iiwa_command({"velocity": "joint_torque"})]
+    )
+    deployment = Deployment(protocol=protocol, period=PERIOD, check_age=False)
+    with SlowScenario().deploy("memq://", deployment=deployment, clock=SimulatedClock()) as runtime:
+        assert runtime.slow_parts.wait(0.0)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "reason"),
+    [(lambda: os._exit(3), r"died \(exit code 3\)"), (signal.pause, r"it is not ready within 0\.5 s")],
+)
+def test_slow_part_that_does_not_start_is_an_error(prepare, reason):
+    class Unprepared:
+        def __call__(self, sample):
+            raise AssertionError
+
+    function = Unprepared()
+    function.prepare = prepare
+    target = DpsAlone(SlowScenario(function=function))
+    bridge = ScriptedBridge(target.interface, SimulatedClock(), moving)
+    with (
+        Runtime(target, bridge, period=PERIOD, clock=SimulatedClock()) as runtime,
+        pytest.raises(ProcessStartError, match=rf"the slow part dps\.perception does not start: .*{reason}"),
+    ):
+        runtime.slow_parts.wait_until_ready(0.5 if prepare is signal.pause else TIMEOUT)
 
 
 def test_no_process_is_left():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from vtbdrake.child_process import ending_signals, logging_in_thread
+from vtbdrake.child_process import ProcessStartError, ending_signals, logging_in_thread
 from vtbdrake.cli import FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
@@ -29,6 +29,7 @@ from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
+from vtbdrake.recording.recorder import RecordingError
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
@@ -89,8 +90,8 @@ def run(
 
     The method deployment() of the scenario describes the channels and the guards. The DPS commands as soon as all its
     sensor signals are fresh and plausible and the machine is ready. After a fault the fallbacks command, until vtbdrake
-    reset. At the end they command once. The exit code is 1 if the machine was not ready, or if the fallbacks were
-    commanding at the end.
+    reset. At the end they command once. The exit code is 1 if the machine was not ready, if the fallbacks were
+    commanding at the end, or if the log lacks cycles.
 
     \b
     Example:
@@ -104,6 +105,7 @@ def run(
     loop = scenario.deploy(
         url, start=snapshot, values=settings(values), deployment=deployment, claim=claim, live=live, record=record
     )
+    incomplete: RecordingError | None = None
     try:
         # SIGTERM ends the loop as Ctrl-C does.
         with ending_signals(signal.default_int_handler), logging_in_thread(), loop as runtime:
@@ -111,8 +113,10 @@ def run(
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 click.echo(real_time)
                 _run(runtime, wait=wait, seconds=seconds)
-    except (BridgeError, RunawayError) as error:
+    except (BridgeError, RunawayError, ProcessStartError) as error:
         raise FailedError(one_line(error)) from error
+    except RecordingError as error:
+        incomplete = error
     click.echo(runtime.statistics)
     for path, counts in runtime.slow_parts.statistics.items():
         click.echo(f"slow part {path}: {counts}")
@@ -121,6 +125,8 @@ def run(
             write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
     finally:
         _report_faults(runtime.guards, begin)
+    if incomplete is not None:
+        raise FailedError(one_line(incomplete)) from incomplete
 
 
 def _report_faults(guards: Guards, begin: float) -> None:

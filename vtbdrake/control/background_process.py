@@ -21,6 +21,9 @@ _LENGTH = struct.Struct("<Q")
 _CHUNK = 1 << 18
 _BUFFER = 1 << 20  # bytes of a socket's send buffer; the system may grant less
 
+START_TIMEOUT = 120.0
+"""Seconds within which a background process must have started; a computer with much else to do needs many of them."""
+
 
 class FrameConnection:
     """The worker's end of the connection, which carries frames of bytes; its calls block."""
@@ -64,8 +67,9 @@ class FrameConnection:
 class BackgroundProcess:
     """A child process that runs ``function(connection, *arguments)``, with a `FrameConnection`.
 
-    No call waits for the worker, except `drain` and `close`; to start one takes some milliseconds. It has ordinary
-    scheduling on all processors, whatever the loop has. `close` ends it, and so does the end of this process.
+    No call waits for the worker, except `wait_until_ready`, `wait_for_frames`, `drain` and `close`; to start one takes
+    some milliseconds. It has ordinary scheduling on all processors, whatever the loop has. `close` ends it, and so does
+    the end of this process.
 
     Args:
         function: A function of a `FrameConnection` and the arguments; it returns or raises EOFError when no more frames
@@ -77,6 +81,7 @@ class BackgroundProcess:
 
     def __init__(self, function: Callable[..., None], *arguments: Any, name: str, backlog: int = 1 << 24) -> None:
         self.dropped = 0  # the number of frames that were dropped
+        self.ready = False  # whether the worker is known to have imported its function
         self._backlog = backlog
         self._unsent: deque[memoryview] = deque()
         self._unsent_bytes = 0
@@ -180,7 +185,26 @@ class BackgroundProcess:
             if not size:
                 self._lose("it has closed the connection")
             while (frame := self._frames.frame()) is not None:
-                self._received.append(frame)
+                if self.ready:
+                    self._received.append(frame)
+                self.ready = True  # The first frame says so.
+
+    def wait_until_ready(self, timeout: float = START_TIMEOUT) -> bool:
+        """Wait until the worker has imported its function; return False if it has ended or is late."""
+        return self._wait(lambda: self.ready, timeout)
+
+    def wait_for_frames(self, timeout: float) -> list[bytes]:
+        """Return the frames that the worker has sent, waiting for the first; none if it has ended or is late."""
+        self._wait(lambda: bool(self._received), timeout)
+        return self.take()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
+        end = time.monotonic() + timeout
+        while not condition() and self.alive and (left := end - time.monotonic()) > 0.0:
+            select.select((self._socket,), (self._socket,) if self._unsent else (), (), left)
+            self._receive()
+            self.flush()
+        return condition()
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when frames arrive, or when the worker is lost."""
@@ -227,7 +251,9 @@ def _serve(connection: socket.socket, function: Callable[..., None], arguments: 
     # The loop may have reserved processors, where nothing else should run.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    frames = FrameConnection(connection)
     try:
-        function(FrameConnection(connection), *arguments)
+        frames.send()
+        function(frames, *arguments)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # The loop's process has closed the connection, or has ended.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import select
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +11,8 @@ from typing import Any
 
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.background_process import BackgroundProcess
+from vtbdrake.child_process import ProcessStartError
+from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.clock import Clock
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, pack, supervise, unpack
 from vtbdrake.control.statistics import Histogram
@@ -104,11 +104,19 @@ class SlowParts:
         for part in self._parts:
             part.send()
 
+    def wait_until_ready(self, timeout: float = START_TIMEOUT) -> None:
+        """Wait until every worker is ready for its first request, so that no result will be missing; see `deploy`.
+
+        Raises:
+            ProcessStartError: One has ended, or is not ready within ``timeout`` seconds.
+        """
+        for part in self._parts:
+            part.wait_until_ready(timeout)
+
     def wait(self, timeout: float) -> bool:
         """Wait until every worker has an answer, or is ready for its first request.
 
-        Call it before the first cycle, if no result should be missing; and between the cycles of a loop on a simulated
-        clock, which leaves no time to compute.
+        Call it between the cycles of a loop on a simulated clock, which leaves no time to compute.
 
         Returns:
             False if one has no answer within ``timeout`` seconds.
@@ -219,17 +227,24 @@ class _Part:
             if not self._supervisor.post(*pack((self._requested, arrays))):
                 _log.error("the slow part %s: its processes have ended, and all results will be missing", self.path)
 
+    def wait_until_ready(self, timeout: float) -> None:
+        end, restarts = time.monotonic() + timeout, self.statistics.restarts
+        while not self._ready:
+            answers = self._supervisor.wait_for_frames(max(0.0, end - time.monotonic()))
+            for answer in answers:
+                self._handle(*unpack(answer))
+            if not answers or self.statistics.restarts > restarts:
+                reason = self._last_failure or f"it is not ready within {timeout:g} s"
+                raise ProcessStartError(
+                    f"the slow part {self.path} does not start: {reason}; see the output of its process above, and "
+                    "what its function imports and prepares"
+                )
+
     def wait(self, timeout: float) -> bool:
-        end = time.monotonic() + timeout
-        while (self._requested is not None or not self._ready) and not self._answers:
-            left = end - time.monotonic()
-            if left <= 0.0 or not self._supervisor.alive:
-                return False
-            descriptor = [self._supervisor.fileno()]
-            select.select(descriptor, descriptor if self._supervisor.unsent else [], [], left)
-            self._supervisor.flush()
-            self._answers += self._supervisor.take()
-        return True
+        if self._answers or (self._ready and self._requested is None):
+            return True
+        self._answers = self._supervisor.wait_for_frames(timeout)
+        return bool(self._answers)
 
     def close(self) -> None:
         self._supervisor.close()

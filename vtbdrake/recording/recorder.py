@@ -14,7 +14,8 @@ from typing import Any, Self
 
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
+from vtbdrake.child_process import ProcessStartError
+from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
@@ -54,13 +55,18 @@ _MAX_HASHED = 1 << 14  # bytes of an array in a digest
 _POLL_PERIOD = 0.02  # s; the socket buffers more than arrives meanwhile
 
 
+class RecordingError(RuntimeError):
+    """A recording that lacks cycles of the loop."""
+
+
 class Recorder:
     """Records a loop to a file from now on, until it is closed; a context manager.
 
     The loop only forms the bytes; a worker process writes them. If that process dies, or the disk is full, the loop
     goes on: cycles that are not in the file are counted (`lost`), logged, and missing in the log as a whole.
 
-    Starting takes some milliseconds: do it before `Runtime.run`, or in the loop's thread between two cycles.
+    Starting takes some milliseconds: do it before `Runtime.run`, or in the loop's thread between two cycles. Until the
+    worker process has started (`wait_until_ready`), what it should write waits for it.
 
     Args:
         runtime: The loop. A loop whose state a snapshot cannot hold is rejected, see Raises.
@@ -145,6 +151,18 @@ class Recorder:
     def pid(self) -> int:
         """Return the process id of the worker process."""
         return self._worker.pid
+
+    def wait_until_ready(self, timeout: float = START_TIMEOUT) -> None:
+        """Wait until the worker process has started.
+
+        Raises:
+            ProcessStartError: It has ended, or has not started within ``timeout`` seconds: nothing would be recorded.
+        """
+        if not self._worker.wait_until_ready(timeout):
+            raise ProcessStartError(
+                f"the process {self.pid}, which writes {self.path}, does not start within {timeout:g} s: nothing would "
+                "be recorded; see its output above, and whether the computer is overloaded"
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -231,7 +249,8 @@ class Recorder:
         self._runtime.unwatch(self)
         if self._runtime.bridge.tap == self._tap:
             self._runtime.bridge.tap = self._next_tap
-        # Makes room for the last frame.
+        # A process that is still starting has not written anything; then this makes room for the last frame.
+        self._worker.wait_until_ready()
         self._worker.drain()
         self._take_losses()
         message = lcmt_vtb_end()

@@ -208,6 +208,7 @@ class Scenario(ABC):
                 runtime.take_over()
                 runtime.run(seconds=5.0)
 
+        The block begins when the processes of slow parts and recorder are ready: no result and no cycle is missed.
         The DPS runs without its simulated world, and commands from `Runtime.take_over` on. At the end of the block, the
         fallbacks command once, and the connection is closed.
 
@@ -230,6 +231,8 @@ class Scenario(ABC):
             DeploymentError: The DPS cannot run safely on its machine.
             ProtocolError: The deployment has no protocol, or it does not fit the signals.
             BridgeError: There is no bus at this URL.
+            ProcessStartError: The process of a slow part, or that of the recorder, does not start.
+            RecordingError: At the end of the block: the log lacks cycles.
         """
         from vtbdrake.deployment import deploy
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import pickle
-import select
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
+from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import SWITCH, Cycle
 from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, CalibrationError, calibrate
@@ -35,7 +34,6 @@ from vtbdrake.testbed.switch import REAL
 
 _log = logging.getLogger(__name__)
 
-_START_TIMEOUT = 120.0  # s in which the worker process builds a world
 _MAX_WAITING = 100  # blocks of rows that may wait for the worker process; older ones are skipped
 # This many windows without a result, if they are this share of all windows, cause a warning.
 _BLIND_WINDOWS, _BLIND_SHARE = 50, 0.2
@@ -144,11 +142,10 @@ class ResidualMonitor:
 
     @staticmethod
     def _await_estimates(worker: BackgroundProcess) -> dict[int, tuple[str, ...]]:
-        select.select((worker,), (), (), _START_TIMEOUT)
-        frames = worker.take()
+        frames = worker.wait_for_frames(START_TIMEOUT)
         if not frames:
             worker.kill()
-            raise ResidualError(f"the worker process has ended, or did not start within {_START_TIMEOUT:g} s")
+            raise ResidualError(f"the worker process has ended, or did not start within {START_TIMEOUT:g} s")
         answer = pickle.loads(frames[0])
         if isinstance(answer, str):
             worker.close()
