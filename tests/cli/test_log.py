@@ -13,7 +13,7 @@ from tests.cli.program import error_of, run
 from tests.recording.servo import Servo
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
-from vtbdrake.recording.log_format import LOG, LogError, event
+from vtbdrake.recording.log_format import CYCLE, LOG, LogError, event
 from vtbdrake.recording.log_reader import LogEvents, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
@@ -47,14 +47,18 @@ def test_replay_on_the_testbed_and_with_other_values(path: Path) -> None:
     assert program.exit_code == 0 and "not compared" in program.stdout
 
 
-def test_a_damaged_log_is_replayed_up_to_the_damage_and_reported(
-    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("cut", ["in an event", "between two events"])
+def test_cut_log_is_replayed_up_to_its_end_and_counts_as_incomplete(
+    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, cut: str
 ) -> None:
     damaged = tmp_path / "damaged.lcm"
-    damaged.write_bytes(path.read_bytes()[:-300])
+    size = LogEvents(path).on(CYCLE)[-3][3] if cut == "between two events" else -300
+    damaged.write_bytes(path.read_bytes()[:size])
     program = run("replay", damaged, *SCENARIO)
-    assert program.exit_code == 0 and "identical" in program.stdout
-    assert "the file ends in the middle of an event" in caplog.text
+    assert program.exit_code == 1 and "identical" in program.stdout
+    assert "the recorder was not closed: later cycles may be missing" in program.stdout
+    assert "Error: not everything was compared: the recorder was not closed" in program.stderr
+    assert ("the file ends in the middle of an event" in caplog.text) == (cut == "in an event")
 
 
 def test_cycles_behind_a_gap_count_as_not_compared(path: Path, tmp_path: Path) -> None:
@@ -64,7 +68,7 @@ def test_cycles_behind_a_gap_count_as_not_compared(path: Path, tmp_path: Path) -
     (tmp_path / "gap.lcm").write_bytes(content)
     program = run("replay", tmp_path / "gap.lcm", *SCENARIO)
     assert program.exit_code == 1 and "identical" in program.stdout
-    assert "the rest of the log was not compared: the replay ends where the log lacks" in program.stderr
+    assert "not everything was compared: the replay ends where the log lacks" in program.stderr
 
 
 def of_scenario(name: str, path: Path, folder: Path) -> Path:

@@ -26,7 +26,7 @@ from vtbdrake.recording.log_codec import find_events
 from vtbdrake.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, encode_changes, event
 from vtbdrake.recording.log_reader import ControlLog, LogEvents, read_log
 from vtbdrake.recording.recorder import Recorder
-from vtbdrake.recording.replay import replay
+from vtbdrake.recording.replay import IDENTICAL, replay
 
 ROOT = Path(__file__).resolve().parents[2]
 CYCLES = 20
@@ -135,7 +135,8 @@ def test_log_that_was_not_closed_is_reported(
     log = read(tmp_path, whole[: ends(reference)[9]])
     assert not log.closed and not log.damages and len(log) == 10
     assert "the recorder was not closed" in caplog.text
-    assert replay(log).identical
+    report = replay(log)
+    assert report.outcome == IDENTICAL and "the recorder was not closed" in str(report) and not report.identical
 
 
 def test_cycles_lost_at_the_end_are_a_gap(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
@@ -156,7 +157,9 @@ def test_events_of_a_repeated_cycle_count_once(whole: bytes, reference: ControlL
     log = read(tmp_path, whole[: bounds[13]] + whole[bounds[7] :])
     assert [i for i, _ in log.changes] == [i for i, _ in reference.changes] == [0, 10]
     assert log.faults == reference.faults and log.digests == reference.digests
-    assert len(log.damages) == 6 and replay(log).identical
+    report = replay(log)
+    assert len(log.damages) == 6 and report.outcome == IDENTICAL
+    assert report.ended == f"the log is damaged {log.damages[0]}" and not report.identical
 
 
 def test_damaged_end_is_ignored(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
@@ -286,7 +289,7 @@ def test_killed_loop_leaves_its_recording(tmp_path: Path) -> None:
     log = read_log(path)
     assert not log.closed and not log.gaps and not log.damages
     assert len(log) == 500 and os.path.getsize(path) == len(log.events.content)
-    assert replay(log).identical
+    assert replay(log).outcome == IDENTICAL
 
 
 # -- impossible logs whose checksums are right

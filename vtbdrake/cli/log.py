@@ -39,7 +39,9 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 def replay(
     log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
-    """Replay a LOG and compare: the exit code is 1 unless all actuator commands in it are the same, to the last bit.
+    """Replay a LOG and compare: the exit code is 1 unless all actuator commands are the same, to the last bit.
+
+    It is 1 as well if the log is not whole: cut off, damaged, or of a loop whose recorder was not closed.
 
     With --set, a variable has another value throughout, and nothing is compared.
 
@@ -68,7 +70,7 @@ def replay(
     if report.outcome == DIFFERENT:
         raise FailedError(one_line(f"the replay differs: {report.first_difference}"))
     if report.ended and not values:
-        raise FailedError(f"the rest of the log was not compared: {report.ended}")
+        raise FailedError(f"not everything was compared: {report.ended}")
 
 
 @click.command()

@@ -49,6 +49,7 @@ _log = logging.getLogger(__name__)
 CLOCK_JUMP = 0.1
 """Change of the time of day against the loop's clock between two cycles, in seconds, that is reported as a jump."""
 
+_NOT_CLOSED = "the recorder was not closed: later cycles may be missing"
 _NO_EVENTS = np.empty((0, 4), np.int64)
 
 
@@ -169,7 +170,16 @@ class ControlLog:
         lines += _shortened([f"damage {damage}" for damage in self.damages])
         lines += _shortened([f"missing: {gap}" for gap in self.gaps])
         lines += _shortened([f"the clock jumps at cycle {self.numbers[i]}" for i in self.clock_jumps])
-        return "\n".join(lines if self.closed else [*lines, "the recorder was not closed: later cycles may be missing"])
+        return "\n".join(lines if self.closed else [*lines, _NOT_CLOSED])
+
+    @property
+    def incomplete(self) -> str:
+        """Return what the log lacks of the recorded run; empty if it is whole."""
+        if self.gaps:
+            return f"the log lacks {self.gaps[0]}"
+        if not self.closed:
+            return _NOT_CLOSED
+        return f"the log is damaged {self.damages[0]}" if self.damages else ""
 
     @property
     def scenario(self) -> Scenario:

@@ -74,7 +74,7 @@ class ReplayReport:
     # ``different``, or ``not compared`` (the replay had other values)
     outcome: str
     cycles: int  # number of replayed cycles
-    ended: str  # why not all cycles of the log were replayed; empty if they were
+    ended: str  # why not all cycles of the recorded run were replayed, or may be missing; empty if all were
     first_difference: Difference | None  # the first difference; None if there is none
     # largest absolute difference by vector actuator signal; inf where an actuator command is missing on one side or not
     # finite
@@ -91,7 +91,7 @@ class ReplayReport:
 
     @property
     def identical(self) -> bool:
-        """Return whether the whole log was replayed and everything is the same to the last bit."""
+        """Return whether the whole recorded run was replayed and everything is the same to the last bit."""
         return self.outcome == IDENTICAL and not self.ended
 
     def __str__(self) -> str:
@@ -141,7 +141,7 @@ def replay(
     return ReplayReport(
         outcome=outcome,
         cycles=run.count,
-        ended=run.ended,
+        ended=run.ended or log.incomplete,
         first_difference=found[0] if outcome == DIFFERENT else None,
         max_difference={} if values else _largest_differences(log, run.actuation),
         digests=len(run.digests),
