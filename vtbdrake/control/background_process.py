@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import select
@@ -252,8 +253,9 @@ def _serve(connection: socket.socket, function: Callable[..., None], arguments: 
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     frames = FrameConnection(connection)
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        frames.send()  # If nobody reads it any more, what was sent before is still to be handled.
     try:
-        frames.send()
         function(frames, *arguments)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # The loop's process has closed the connection, or has ended.
