@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -82,3 +83,13 @@ def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
         if not isinstance(value, kind):
             raise ValueError(f"give {name} as {form}; {value!r} does not fit")
     return found
+
+
+def suggestion(address: str, known: Iterable[str]) -> str:
+    """Return the end of an error message that suggests addresses similar to ``address``."""
+    known = list(dict.fromkeys(known))  # A variable and an output port may share an address.
+    near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
+    if near:
+        return "; did you mean " + " or ".join(near) + "?"
+    tops = sorted({".".join(name.split(".")[:2]) for name in known})
+    return "; addresses begin with " + ", ".join(tops) if tops else ""

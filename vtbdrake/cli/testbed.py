@@ -11,6 +11,7 @@ import click
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.cli import BadInputError, FailedError, one_line
 from vtbdrake.cli.options import (
     Setting,
@@ -26,7 +27,6 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.state import Snapshot, Variable, Variables
-from vtbdrake.state.variables import suggestion
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.testbed import MODES
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 
-from vtbdrake.argument_checks import as_array
+from vtbdrake.argument_checks import as_array, suggestion
 
 X = "x"
 A = "a"
@@ -279,16 +278,6 @@ def check_address(address: object) -> None:
     """
     if not isinstance(address, str):
         raise AddressError(f"an address is a text, such as 'plant.box.mass', not {address!r}")
-
-
-def suggestion(address: str, known: Iterable[str]) -> str:
-    """Return the end of an error message that suggests addresses similar to ``address``."""
-    known = list(dict.fromkeys(known))  # A variable and an output port may share an address.
-    near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
-    if near:
-        return "; did you mean " + " or ".join(near) + "?"
-    tops = sorted({".".join(name.split(".")[:2]) for name in known})
-    return "; addresses begin with " + ", ".join(tops) if tops else ""
 
 
 def _entry(variable: Variable, index: int) -> Variable:

@@ -11,12 +11,13 @@ from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfi
 from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_plant, is_python, leaves
-from vtbdrake.state.variables import X, check_address, suggestion
+from vtbdrake.state.variables import X, check_address
 from vtbdrake.testbed.dps_state import DpsReader
 from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake.testbed.signal import Interface

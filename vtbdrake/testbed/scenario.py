@@ -19,7 +19,7 @@ import numpy as np
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import System
 
-from vtbdrake.state.variables import suggestion
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import lcm
@@ -218,6 +219,13 @@ def test_impossible_set_is_rejected(shared: Rig, values: dict[str, Any], reason:
         shared.during(asked, shared.url, "set", values)
     assert reason in str(error.value)
     assert not any(change.kind == "write" for cycle in shared.cycles for change in cycle.changes)
+
+
+def test_misspelt_address_is_answered_without_loading_drake(hub: Hub) -> None:
+    with served(hub.url) as (rig, service):
+        with pytest.raises(LiveError, match=r"did you mean dps\.gain"):
+            rig.during(asked, hub.url, "get", ["dps.gian"])
+        assert "libdrake" not in Path(f"/proc/{service.pid}/maps").read_text()
 
 
 def test_failed_drake_assertion_is_an_answer(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:

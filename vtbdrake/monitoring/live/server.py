@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.control.background_process import FrameConnection
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.connections import LcmLink
@@ -222,9 +223,6 @@ class LiveServer:
     def _unknown(self, address: str) -> str:
         if address in self._addresses:
             return f"{address} is a port: it can be read, not set"
-        # Imports Drake, for a misspelt address only.
-        from vtbdrake.state.variables import suggestion
-
         return f"there is no variable and no port {address!r}{suggestion(address, self._addresses)}"
 
     def _publish_values(self, frame: bytes, start: int) -> int:
