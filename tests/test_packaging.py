@@ -101,7 +101,7 @@ def test_wheel_holds_the_package_compiled_and_nothing_else(content: dict[str, st
     names = {name for name in content if not name.startswith("vtbdrake-0.1.0.dist-info/")}
     rest = {file for file in files if not file.endswith((".pyx", ".pxd"))}
     assert names == rest | {source.with_suffix(EXT_SUFFIX).as_posix() for source in [*COMPILED, SHARED]}
-    assert "vtbdrake/py.typed" in names
+    assert {"vtbdrake/py.typed", "vtbdrake_diagrams/py.typed"} <= names
 
 
 def test_wheel_is_for_this_python_and_platform(wheel: Path, content: dict[str, str]) -> None:

@@ -75,6 +75,8 @@ def negative(_: float) -> float:
         ([*BOUNDARY, "--resolution", "0.5", "--coarse", "0.1"], "0 < resolution <= coarse"),
         ([*BOUNDARY, "--resolution", "0.5"], "Missing option '--coarse'"),
         (["get", "a", "--url", "nonsense"], "such as tcpq://127.0.0.1:7700, not 'nonsense'"),
+        (["run", SERVO, "--url", "memq://"], "'memq://' is private to this process and reaches no other"),
+        (["diagram", PENDULUM, "-o", "pendulum.xyz"], "expected a file name that ends in .svg, not 'pendulum.xyz'"),
         (["watch", "a", "--url", ""], "such as tcpq://127.0.0.1:7700, not ''"),
         (
             ["machine", SERVO, "--url", "tcpq://127.0.0.1:99999"],

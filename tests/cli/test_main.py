@@ -51,3 +51,11 @@ def test_current_directory_is_searched_last(tmp_path: Path) -> None:
         )
         assert (result.returncode, result.stdout) == (2, "")
         assert "wave has no scenario 'Mine'" in result.stderr
+
+
+@pytest.mark.parametrize("command", [[], ["study"]])
+def test_summaries_of_commands_are_whole(command: list[str]) -> None:
+    lines = run(*command, "--help").stdout.splitlines()
+    summaries = lines[lines.index("Commands:") + 1 :]
+    assert len(summaries) >= 2 and all(line.endswith((".", "?")) for line in summaries)
+    assert not any(line.endswith("...") for line in summaries)

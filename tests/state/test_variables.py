@@ -251,11 +251,18 @@ class Filter(LeafSystem):
     def __init__(self, size=2):
         super().__init__()
         gain = self.DeclareNumericParameter(BasicVector([1.0, 2.0, 3.0]))
-        self.DeclareContinuousState(2)
+        state = self.DeclareContinuousState(2)
         self.variables = (
             parameter("gain", gain, shape=(size,), start=1, unit="1/s", bounds=(0.0, 10.0)),
-            continuous_state("estimate", start=1, unit="m"),
+            continuous_state("estimate", state, start=1, unit="m"),
         )
+
+
+def test_second_vector_of_continuous_state_is_rejected():
+    with pytest.raises(
+        ValueError, match=r"x: a system has one vector of continuous state, number 0, not 1: give start="
+    ):
+        continuous_state("x", 1)
 
 
 def test_declared_variables_reach_their_entries_only():

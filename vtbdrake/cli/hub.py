@@ -60,11 +60,11 @@ _POSITIVE = click.IntRange(min=1)
     "--cpu N", "Processor to run on, if the system grants it. May be repeated.", name="cpus", type=int, multiple=True
 )
 def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
-    """Relay LCM messages over TCP until Ctrl-C, for networks without multicast.
+    """Relay LCM messages over TCP, for networks without multicast.
 
-    Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on VTB_SET and on
-    VTB_RESET. LCM has no authentication: on loopback only this user and root may connect, beyond it every machine that
-    reaches the address.
+    It runs until Ctrl-C. Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on
+    VTB_SET and on VTB_RESET. LCM has no authentication: on loopback only this user and root may connect, beyond it
+    every machine that reaches the address.
 
     Prints the URL for clients, and publishes statistics as JSON on VTB_HUB.
 

@@ -25,7 +25,7 @@ _addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRE
 @url_option
 @timeout_option
 def set_(values: tuple[Setting, ...], url: str, timeout: float) -> None:
-    """Set variables of a DPS that runs by vtbdrake run: all of them between two cycles, or none.
+    """Set variables of a running DPS, all in one cycle or none.
 
     A value is a number or a JSON list of numbers. The exit code is 1 if they are rejected, or without an answer.
 
@@ -42,7 +42,9 @@ def set_(values: tuple[Setting, ...], url: str, timeout: float) -> None:
 @url_option
 @timeout_option
 def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
-    """Print variables and output ports of a DPS that runs by vtbdrake run, as they are between two cycles.
+    """Print variables and output ports of a running DPS once.
+
+    All are read between the same two cycles of vtbdrake run.
 
     \b
     Example:
@@ -61,10 +63,10 @@ def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
 @option("--count N", "End after N lines.  [default: endless]", type=click.IntRange(min=1))
 @timeout_option
 def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
-    """Print variables and output ports of a DPS that runs by vtbdrake run, until Ctrl-C or its end.
+    """Print variables and output ports of a running DPS repeatedly.
 
-    Each line is a JSON object with the time of the DPS in seconds and the values by address. A value that is not
-    finite is null.
+    It prints until Ctrl-C, or until vtbdrake run ends. Each line is a JSON object with the time of the DPS in seconds
+    and the values by address. A value that is not finite is null.
 
     \b
     Example:
@@ -83,7 +85,7 @@ def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, t
 @url_option
 @timeout_option
 def reset(url: str, timeout: float) -> None:
-    """Let a DPS that runs by vtbdrake run command again, after a fault that is over.
+    """Let a running DPS command again after a fault that is over.
 
     Prints the faults that had latched. The exit code is 1 if a cause persists, or without an answer.
 

@@ -39,9 +39,10 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 def replay(
     log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
-    """Replay a LOG and compare: the exit code is 1 unless all actuator commands are the same, to the last bit.
+    """Compute a LOG again and compare, to the last bit.
 
-    It is 1 as well if the log is not whole: cut off, damaged, or of a loop whose recorder was not closed.
+    The exit code is 1 unless all actuator commands are the same. It is 1 as well if the log is not whole: cut off,
+    damaged, or of a loop whose recorder was not closed.
 
     With --set, a variable has another value throughout, and nothing is compared.
 
@@ -77,7 +78,9 @@ def replay(
 @_log
 @click.argument("out", callback=converted(output(*EXPORTS)))
 def export(log: Path, out: Path) -> None:
-    """Write a LOG as MCAP (for Foxglove), CSV or Parquet, by the suffix of OUT.
+    """Write a LOG as MCAP (for Foxglove), CSV or Parquet.
+
+    The suffix of OUT says which.
 
     \b
     Example:

@@ -93,10 +93,11 @@ def machine(
     priority: int,
     **fields: Any,
 ) -> None:
-    """Simulate the physical robot of a scenario over LCM, until Ctrl-C.
+    """Simulate the physical robot of a scenario over LCM.
 
-    The method deployment() of the scenario describes the channels. VTB_MACHINE takes requests for faults as JSON, such
-    as {"fault": "drop", "fraction": 0.5} or {"request": "normal"}. The status is published on VTB_MACHINE_STATUS.
+    It runs until Ctrl-C. The method deployment() of the scenario describes the channels. VTB_MACHINE takes requests for
+    faults as JSON, such as {"fault": "drop", "fraction": 0.5} or {"request": "normal"}. The status is published on
+    VTB_MACHINE_STATUS.
 
     \b
     Example:

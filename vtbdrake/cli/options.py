@@ -150,6 +150,8 @@ def parse_url(text: str) -> str:
     provider, separator, _ = text.partition("://")
     if not (provider and separator):
         raise click.BadParameter(f"expected the URL of an LCM bus, such as tcpq://127.0.0.1:7700, not {text!r}")
+    if provider == "memq":
+        raise click.BadParameter(f"{text!r} is private to this process and reaches no other: name a hub or a network")
     try:
         _ = urlsplit(text).port
     except ValueError as error:

@@ -86,12 +86,12 @@ def run(
     record: Path | None,
     statistics: Path | None,
 ) -> None:
-    """Run the DPS of a scenario on its machine, without its simulated world, until Ctrl-C.
+    """Run the DPS of a scenario on its machine.
 
-    The method deployment() of the scenario describes the channels and the guards. The DPS commands as soon as all its
-    sensor signals are fresh and plausible and the machine is ready. After a fault the fallbacks command, until vtbdrake
-    reset. At the end they command once. The exit code is 1 if the machine was not ready, if the fallbacks were
-    commanding at the end, or if the log lacks cycles.
+    It runs without its simulated world, until Ctrl-C. The method deployment() of the scenario describes the channels
+    and the guards. The DPS commands as soon as all its sensor signals are fresh and plausible and the machine is ready.
+    After a fault the fallbacks command, until vtbdrake reset. At the end they command once. The exit code is 1 if the
+    machine was not ready, if the fallbacks were commanding at the end, or if the log lacks cycles.
 
     \b
     Example:

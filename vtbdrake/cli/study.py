@@ -42,7 +42,7 @@ def _risk(text: str) -> str | Risk:
 
 @click.group()
 def study() -> None:
-    """Solve a problem, recorded rollout by rollout in a file that can be resumed.
+    """Solve a problem, recorded in a file that can be resumed.
 
     \b
     Example:
@@ -161,7 +161,7 @@ def run(
 @_file
 @option("--csv FILE", "Write all points with their attributes.", parse=output(".csv"))
 def show(file: Path, csv: Path | None) -> None:
-    """Show the results of a study, its waiting points and its attributes."""
+    """Show the results, waiting points and attributes of a study."""
     with Study.open(file) as opened:
         click.echo(opened.summary())
         queue, attributes = opened.queue, opened.attributes

@@ -79,7 +79,7 @@ def _plain(variable: Variable, context: Context) -> dict[str, Any]:
 @click.command()
 @scenario_argument
 @option("--mode", "The positions of the switches.", type=click.Choice(list(MODES)), default="sim")
-@option("-o --output FILE", "Write to FILE, not to the terminal.", name="out", parse=output())
+@option("-o --output FILE", "Write to FILE, not to the terminal.", name="out", parse=output(".svg"))
 def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
     """Draw a testbed as SVG: DPS, switches, both worlds (Figure 4).
 

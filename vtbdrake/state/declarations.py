@@ -52,8 +52,19 @@ def discrete_state(name: str, index: int, **options: Unpack[_Options]) -> Elemen
     return Element(name, DISCRETE, int(index), **options)
 
 
-def continuous_state(name: str, **options: Unpack[_Options]) -> Element:
-    """Name a piece of the continuous state: part of x in s = [x, a]; see `parameter`."""
+def continuous_state(name: str, index: int = 0, **options: Unpack[_Options]) -> Element:
+    """Name a piece of the continuous state: part of x in s = [x, a]; see `parameter`.
+
+    Args:
+        name: Last part of the address.
+        index: What ``DeclareContinuousState`` returned: 0, as a system has one vector of continuous state.
+        options: See `parameter`; ``start`` tells where the piece begins in that vector.
+
+    Raises:
+        ValueError: The index is not 0.
+    """
+    if int(index) != 0:
+        raise ValueError(f"{name}: a system has one vector of continuous state, number 0, not {index}: give start=")
     return Element(name, CONTINUOUS, 0, **options)
 
 

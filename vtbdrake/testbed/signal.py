@@ -197,6 +197,12 @@ def _brief(value: Any) -> str:
 class Interface:
     """All signals of a DPS: sensor signals in, actuator signals out, commands u in.
 
+    Args:
+        sense: Sensor signals; each is an input port of the DPS.
+        act: Actuator signals; each is an output port of the DPS, and has an ``idle`` value.
+        commands: Commands u, what an operator or a task asks of the DPS: vectors, each an input port of the DPS whose
+            value is the variable ``u.<name>`` of the testbed.
+
     Raises:
         SignalError: Two signals have one name, an actuator signal has no idle value, or a command is abstract.
     """
