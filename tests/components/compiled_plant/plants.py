@@ -71,6 +71,40 @@ def climber(time_step: float) -> MultibodyPlant:
     return plant
 
 
+def random_plant(time_step: float, seed: int) -> MultibodyPlant:
+    """A tree of five links with random joints, frames, motors, effort limits and rotors; it floats for odd seeds."""
+    random = np.random.default_rng(seed)
+    plant = MultibodyPlant(time_step)
+    bodies = [plant.world_body()]
+    if seed % 2:
+        bodies = [plant.AddRigidBody("base", inertia(random.uniform(1.0, 5.0), random.uniform(-0.2, 0.2, 3)))]
+    for k in range(5):
+        parent = bodies[random.integers(len(bodies))]
+        body = plant.AddRigidBody(f"link_{k}", inertia(random.uniform(0.2, 2.0), random.uniform(-0.2, 0.2, 3)))
+        frames = [
+            plant.AddFrame(FixedOffsetFrame(f"{side}_{k}", of.body_frame(), _random_pose(random)))
+            for side, of in (("inner", parent), ("outer", body))
+        ]
+        kind = RevoluteJoint if random.random() < 0.7 else PrismaticJoint
+        joint = plant.AddJoint(kind(f"joint_{k}", *frames, _direction(random), damping=random.choice([0.0, 0.3])))
+        if random.random() < 0.7:
+            motor = plant.AddJointActuator(f"motor_{k}", joint, random.choice([0.5, np.inf]))
+            motor.set_default_rotor_inertia(random.choice([0.0, 1e-3]))
+            motor.set_default_gear_ratio(random.uniform(1.0, 30.0))
+        bodies.append(body)
+    plant.Finalize()
+    return plant
+
+
+def _random_pose(random: np.random.Generator) -> RigidTransform:
+    return RigidTransform(RollPitchYaw(random.uniform(-1.5, 1.5, 3)), random.uniform(-0.3, 0.3, 3))
+
+
+def _direction(random: np.random.Generator) -> np.ndarray:
+    axis = random.normal(size=3)
+    return axis / np.linalg.norm(axis)
+
+
 PLANTS = [cart_pole, acrobot, arm, floating, climber]
 
 

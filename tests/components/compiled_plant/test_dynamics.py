@@ -8,7 +8,17 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, SpatialInertia
 
-from tests.components.compiled_plant.plants import PLANTS, arm, cart_pole, climber, floating, inertia, simulate, states
+from tests.components.compiled_plant.plants import (
+    PLANTS,
+    arm,
+    cart_pole,
+    climber,
+    floating,
+    inertia,
+    random_plant,
+    simulate,
+    states,
+)
 from vtbdrake.components.compiled_plant import PlantDynamics, plant_dynamics, plant_step
 from vtbdrake.state.systems import pose_from_array
 
@@ -47,6 +57,29 @@ def test_steps_are_those_of_the_discrete_plant(make):
         assert float(overrun) <= 0.0
         x = following.full().ravel()
         assert relative(x, expected) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_plants_move_as_those_of_drake(seed):
+    plant = random_plant(0.0, seed)
+    context = plant.CreateDefaultContext()
+    dynamics = plant_dynamics(plant, context)
+    for x, u in states(plant, 3):
+        plant.SetPositionsAndVelocities(context, x)
+        plant.get_actuation_input_port().FixValue(context, u)
+        expected = plant.EvalTimeDerivatives(context).CopyToVector()
+        assert relative(dynamics(x, u).full(), expected) < 1e-11
+    plant = random_plant(0.002, seed)
+    context = plant.CreateDefaultContext()
+    step = plant_step(plant, context)
+    random = np.random.default_rng(seed)
+    x = plant.GetPositionsAndVelocities(context)
+    x[plant.num_positions() :] = 0.3 * random.normal(size=plant.num_velocities())
+    plant.SetPositionsAndVelocities(context, x)
+    u = random.normal(size=(20, plant.num_actuated_dofs()))
+    for k, expected in enumerate(simulate(plant, context, u, 20)):
+        x = step(x, u[k])[0].full().ravel()
+        assert relative(x, expected) < 1e-11
 
 
 def test_explicit_damping_would_be_another_step():
@@ -229,6 +262,12 @@ def test_effort_limits_hold(u):
     plant.get_actuation_input_port().FixValue(context, [u])
     expected = plant.EvalTimeDerivatives(context).CopyToVector()
     assert relative(plant_dynamics(plant, context)(np.zeros(4), u).full(), expected) < 1e-12
+
+
+def test_actuation_that_is_not_a_number_stays_one():
+    """Drake's plant fails at such a value; here it is seen in the result, whatever the effort limit."""
+    plant = cart_pole(0.0)
+    assert np.isnan(plant_dynamics(plant, plant.CreateDefaultContext())(np.zeros(4), np.nan).full()[2:]).all()
 
 
 def test_overrun_tells_exactly_when_drakes_stop_acts():

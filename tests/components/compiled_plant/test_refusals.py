@@ -6,18 +6,27 @@ import re
 
 import numpy as np
 import pytest
+from pydrake.common.value import AbstractValue
 from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    ExternallyAppliedSpatialForce,
+    MultibodyPlant,
+)
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
+    LinearBushingRollPitchYaw,
     LinearSpringDamper,
     PdControllerGains,
     PrismaticJoint,
     RevoluteJoint,
+    RevoluteSpring,
     UniversalJoint,
 )
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 
 from tests.components.compiled_plant.plants import cart_pole, inertia
 from vtbdrake.components.compiled_plant import (
@@ -56,6 +65,19 @@ def _controller(plant):
     plant.GetJointActuatorByName("motor_b").set_controller_gains(PdControllerGains(p=1.0, d=0.1))
 
 
+def _second_motor(plant):
+    plant.AddJointActuator("helper", plant.GetJointByName("joint_b"))
+
+
+def _bushing(plant):
+    frames = [plant.GetBodyByName(name).body_frame() for name in ("a", "b")]
+    plant.AddForceElement(LinearBushingRollPitchYaw(*frames, *[np.ones(3)] * 4))
+
+
+def _revolute_spring(plant):
+    plant.AddForceElement(RevoluteSpring(plant.GetJointByName("joint_a"), 0.0, 5.0))
+
+
 def _weightless(plant):
     plant.set_gravity_enabled(plant.GetBodyByName("a").model_instance(), False)
 
@@ -66,6 +88,9 @@ def _weightless(plant):
         (_other_joint, "the joint wrist is of type universal"),
         (_coupler, "there are 1 constraints"),
         (_spring, "a force element of type LinearSpringDamper"),
+        (_bushing, "a force element of type LinearBushingRollPitchYaw"),
+        (_revolute_spring, "a force element of type RevoluteSpring"),
+        (_second_motor, r"the joint joint_b has 2 actuators \(motor_b, helper\): give it one"),
         (_controller, "the actuator motor_b has a PD controller"),
         (_weightless, "gravity is disabled for the model instances DefaultModelInstance"),
     ],
@@ -76,6 +101,39 @@ def test_part_is_refused_by_name(change, reason):
     plant.Finalize()
     with pytest.raises(UnsupportedPlantError, match=reason):
         plant_dynamics(plant, plant.CreateDefaultContext())
+
+
+@pytest.mark.parametrize("time_step", [0.0, 0.01])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("applied_generalized_force", [0.0, 1.0]),
+        ("applied_spatial_force", AbstractValue.Make([ExternallyAppliedSpatialForce()])),
+        ("DefaultModelInstance_actuation", [0.0, 1.0]),
+        ("DefaultModelInstance_desired_state", np.zeros(4)),
+    ],
+)
+def test_other_input_is_refused_by_name(name, value, time_step):
+    plant = two_bodies(time_step)
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    plant.get_actuation_input_port().FixValue(context, [1.0, 2.0])
+    assert plant_dynamics(plant, context).size1_in("u") == 2
+    plant.GetInputPort(name).FixValue(context, value)
+    with pytest.raises(UnsupportedPlantError, match=f"the input port {name} is connected or has a fixed value"):
+        plant_dynamics(plant, context)
+
+
+def test_connected_force_is_refused_by_name():
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(two_bodies())
+    plant.Finalize()
+    force = builder.AddSystem(ConstantVectorSource([0.0, 1.0]))
+    builder.Connect(force.get_output_port(), plant.get_applied_generalized_force_input_port())
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    with pytest.raises(UnsupportedPlantError, match="the input port applied_generalized_force"):
+        compiled_world(plant, plant.GetMyContextFromRoot(root))
 
 
 @pytest.mark.parametrize("time_step", [0.0, 0.01])

@@ -104,6 +104,27 @@ def test_rollout_that_diverges_is_marked():
     assert rollouts([[1.0], [0.0]], np.zeros((2, 1))).valid.tolist() == [False, True]
 
 
+@pytest.mark.parametrize(
+    "cost", [lambda x, u: casadi.fmin(x, 1.0), lambda x, u: casadi.fmax(-1.0, casadi.fmin(x, 1.0))]
+)
+@pytest.mark.parametrize("compile", [False, True])
+def test_cost_that_drops_a_nan_does_not_hide_it(cost, compile):
+    x, u = casadi.SX.sym("x", 1), casadi.SX.sym("u", 1)
+    step = casadi.Function("step", [x, u], [casadi.log(x) + u, -1.0], ["x", "u"], ["x_next", "overrun"])
+    rollouts = PlantRollouts(
+        step, control=np.ones((3, 1)), cost=cost, final_cost=lambda x: cost(x, 0.0), compile=compile
+    )
+    batch = rollouts([[1.0], [-1.0], [np.nan], [1.0]], [[2.0], [2.0], [2.0], [np.nan]])
+    assert np.isfinite(batch.costs).all()
+    assert batch.valid.tolist() == [True, False, False, False]
+
+
+def test_control_that_the_plant_holds_back_has_to_be_finite():
+    """An effort limit makes a finite torque even of an infinite one."""
+    batch = rollouts_of(cart_pole(0.01))(np.zeros(4), [[1.0] * KNOTS, [np.inf] * KNOTS, [np.nan] * KNOTS])
+    assert batch.valid.tolist() == [True, False, False]
+
+
 @pytest.mark.parametrize("compile", [False, True])
 def test_gradient_is_that_of_the_costs(compile):
     rollouts = rollouts_of(cart_pole(0.01), compile=compile)

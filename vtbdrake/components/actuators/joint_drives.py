@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from vtbdrake.components.casadi_system.kernel import Expression, Kernel
+from vtbdrake.components.casadi_system.kernel import Kernel, clamp
 from vtbdrake.state import Element, discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 
@@ -168,7 +168,7 @@ def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
     limit, rate, viscous, coulomb, coulomb_velocity = casadi.vertsplit(values[: 5 * n], n)
     motor, last = casadi.vertsplit(memory, n)
     reach = rate * period
-    reference = _held(_held(u, -limit, limit), last - reach, last + reach)
+    reference = clamp(clamp(u, -limit, limit), last - reach, last + reach)
     # 1 where the time constant is 0.
     gain = -casadi.expm1(-period / values[5 * n])
     following = motor + gain * (reference - motor)
@@ -177,11 +177,6 @@ def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
     friction = viscous * v + coulomb * casadi.tanh(v / casadi.fmax(coulomb_velocity, _TINY))
     y = casadi.vertcat(following - friction, following, reference)
     return Kernel("drives", [values, memory, u, x], y, compile=False)
-
-
-def _held(value: Expression, lower: Expression, upper: Expression) -> Expression:
-    """Limit an expression; NaN, which fmin and fmax would drop, stays NaN."""
-    return casadi.if_else(value > upper, upper, casadi.if_else(value < lower, lower, value))
 
 
 def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:

@@ -26,6 +26,11 @@ TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = 
 _GENERATING = threading.Lock()
 
 
+def clamp(value: Expression, lower: Expression, upper: Expression) -> Expression:
+    """Return a value within two limits; NaN, which fmin and fmax would drop, stays NaN."""
+    return casadi.if_else(value > upper, upper, casadi.if_else(value < lower, lower, value))
+
+
 class Kernel:
     """y(z), for z of shape (n,) and y of shape (m,).
 

@@ -17,6 +17,7 @@ from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
 from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context
 
+from vtbdrake.components.casadi_system.kernel import clamp
 from vtbdrake.components.compiled_plant.links import (
     FLOATING,
     PRISMATIC,
@@ -243,10 +244,7 @@ class PlantDynamics:
     def actuation(self, u: Expression) -> Expression:
         """Return tau of the actuation u, which is held within the actuators' effort limits, as Drake does."""
         limits = [self._effort[i] for i in range(self.nu)]
-        held = [
-            casadi.fmax(-limit, casadi.fmin(limit, u[i])) if np.isfinite(limit) else u[i]
-            for i, limit in enumerate(limits)
-        ]
+        held = [clamp(u[i], -limit, limit) if np.isfinite(limit) else u[i] for i, limit in enumerate(limits)]
         return self._actuation @ casadi.vertcat(casadi.SX(0, 1), *held)
 
     # -- kinematics

@@ -42,7 +42,7 @@ class Link:
         X_PF: Pose of F in the frame of the parent.
         inertia: M_LMo_M of the link L, [angular; linear], shape (6, 6).
         damping: Damping of the joint, shape (nv, 1).
-        reflected_inertia: Reflected inertia of the joint's actuators, shape (nv, 1).
+        reflected_inertia: Reflected inertia of the joint's actuator, shape (nv, 1).
     """
 
     parent: int
@@ -217,13 +217,12 @@ class _Reader:
                     raise ValueError(f"{address} cannot be an input: the frame {other.name()} is attached to it.")
 
     def _reflected_inertias(self) -> dict[int, Expression]:
-        """Return the sum of the reflected inertias of each joint's actuators, by the joint's index."""
+        """Return the reflected inertia of each joint's actuator, by the joint's index."""
         found: dict[int, Expression] = {}
         for index in self._plant.GetJointActuatorIndices():
             actuator = self._plant.get_joint_actuator(index)
             rotor = self._input(f"{self._address(actuator)}.rotor_inertia", actuator.rotor_inertia(self._context))
-            joint = int(actuator.joint().index())
-            found[joint] = found.get(joint, 0) + actuator.gear_ratio(self._context) ** 2 * rotor
+            found[int(actuator.joint().index())] = actuator.gear_ratio(self._context) ** 2 * rotor
         return found
 
     def _input(self, address: str, value: ArrayLike) -> Expression:
@@ -257,10 +256,18 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
             yield f"the joint {joint.name()} is of type {joint.type_name()}"
         elif joint.is_locked(context):
             yield f"the joint {joint.name()} is locked"
+    drives: dict[str, list[str]] = {}
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
         if actuator.has_controller():
             yield f"the actuator {actuator.name()} has a PD controller"
+        drives.setdefault(actuator.joint().name(), []).append(actuator.name())
+    for joint_name, names in drives.items():
+        if len(names) > 1:
+            # Drake sums their torques in a continuous plant, but takes those of the last in a discrete one; of their
+            # reflected inertias it takes the last in both.
+            yield f"the joint {joint_name} has {len(names)} actuators ({', '.join(names)}): give it one"
+    yield from _other_inputs(plant, context)
     if plant.num_constraints():
         yield f"there are {plant.num_constraints()} constraints between bodies or joints"
     if plant.deformable_model().num_bodies():
@@ -272,6 +279,15 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
         instances = {plant.GetModelInstanceName(ModelInstanceIndex(body.model_instance())) for body in grounded}
         yield f"gravity is disabled for the model instances {', '.join(sorted(instances))}"
     yield from _contacts(plant, context)
+
+
+def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+    """Yield the input ports that act on the plant beside its actuation, which is an argument."""
+    harmless = plant.get_actuation_input_port(), plant.get_geometry_query_input_port()
+    for k in range(plant.num_input_ports()):
+        port = plant.get_input_port(k)
+        if k not in [int(other.get_index()) for other in harmless] and port.HasValue(context):
+            yield f"the input port {port.get_name()} is connected or has a fixed value"
 
 
 def _contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:

@@ -23,17 +23,23 @@ class RolloutBatch:
     Attributes:
         costs: The costs, shape (n,).
         overruns: The largest one of all steps, shape (n,); see `plant_step`.
+        extents: The sum of all |x| and |u| of a rollout, shape (n,): finite if all states and controls are. A cost may
+            drop a NaN, as fmin and fmax do.
         final: The last states, shape (n, nx).
     """
 
     costs: Array
     overruns: Array
+    extents: Array
     final: Array
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Return which rollouts are finite and stay clear of the joint stops, as the plant itself would, shape (n,)."""
-        return np.isfinite(self.costs) & (self.overruns <= 0.0)
+        """Return which rollouts are finite and stay clear of the joint stops, as the plant itself would, shape (n,).
+
+        Finite are all states, all controls and the cost.
+        """
+        return np.isfinite(self.costs) & np.isfinite(self.extents) & (self.overruns <= 0.0)
 
 
 class PlantRollouts:
@@ -46,8 +52,9 @@ class PlantRollouts:
     Several threads may call it at once.
 
     Attributes:
-        function: (x0, knots, inputs) -> cost, overrun, final: the rollout of one candidate as a `casadi.Function`, for
-            CasADi's solvers; its knots have the shape (nu, K). It is interpreted, and has derivatives.
+        function: (x0, knots, inputs) -> cost, overrun, extent, final: the rollout of one candidate as a
+            `casadi.Function`, for CasADi's solvers; its knots have the shape (nu, K). It is interpreted, and has
+            derivatives.
     """
 
     def __init__(
@@ -77,12 +84,13 @@ class PlantRollouts:
             raise ValueError(f"control is a finite matrix of shape (steps, knots), but is {control!r}.")
         self.function = _rollout(step, B, cost, final_cost)
         symbols = self.function.mx_in()
-        value, overrun, final = self.function.call(symbols)
+        results = self.function.call(symbols)
+        value = results[0]
         slope = casadi.vec(casadi.gradient(value, symbols[1]))
         self._inputs = {name: self.function.numel_in(name) for name in self.function.name_in()[2:]}
         self._knots = self.function.size2_in("knots"), self.function.size1_in("knots")
         translate = TRANSLATIONS[compile]
-        self._packed = translate(casadi.Function("plant_rollout", symbols, [casadi.vertcat(value, overrun, final)]))
+        self._packed = translate(casadi.Function("plant_rollout", symbols, [casadi.vertcat(*results)]))
         self._sloped = casadi.Function("plant_rollout_slope", symbols, [casadi.vertcat(value, slope)])
         self._translate = translate
         self._buffers: dict[int, Buffers] = {}
@@ -106,7 +114,7 @@ class PlantRollouts:
             if n not in self._buffers:
                 self._buffers[n] = Buffers(self._packed.map(n), may_fail=False)
         result = self._evaluate(self._buffers[n], n, x0, z, inputs).reshape(n, -1)
-        return RolloutBatch(result[:, 0], result[:, 1], result[:, 2:])
+        return RolloutBatch(result[:, 0], result[:, 1], result[:, 2], result[:, 3:])
 
     def gradient(self, x0: ArrayLike, knots: ArrayLike, **inputs: ArrayLike) -> tuple[float, Array]:
         """Return the cost of one candidate and its derivative by the knots, exact to rounding.
@@ -161,12 +169,14 @@ def _rollout(
     cost: Callable[[Expression, Expression], Expression],
     final_cost: Callable[[Expression], Expression] | None,
 ) -> casadi.Function:
-    """Return the function (x0, knots, inputs) -> cost, overrun, final."""
+    """Return the function (x0, knots, inputs) -> cost, overrun, extent, final."""
     x, u, *given = step.sx_in()
-    spent, worst = casadi.SX.sym("spent"), casadi.SX.sym("worst")
+    spent, worst, extent = (casadi.SX.sym(name) for name in ("spent", "worst", "extent"))
     x_next, overrun = step.call([x, u, *given])
-    before = casadi.vertcat(x, spent, worst)
-    after = casadi.vertcat(x_next, spent + cost(x, u), casadi.fmax(worst, overrun))
+    before = casadi.vertcat(x, spent, worst, extent)
+    after = casadi.vertcat(
+        x_next, spent + cost(x, u), casadi.fmax(worst, overrun), extent + casadi.norm_1(casadi.vertcat(x, u))
+    )
     one = casadi.Function("one", [before, u, *given], [after], {"cse": True})
     names = step.name_in()[2:]
     x0, knots = casadi.MX.sym("x0", x.numel()), casadi.MX.sym("knots", u.numel(), B.shape[1])
@@ -175,16 +185,15 @@ def _rollout(
     controls = knots @ casadi.DM(B.T)
     # B may be sparse (a spline has local support), but its zeros cost less than an index.
     last = one.fold(steps)(
-        casadi.vertcat(x0, 0.0, -np.inf), controls, *(casadi.repmat(value, 1, steps) for value in inputs)
+        casadi.vertcat(x0, 0.0, -np.inf, 0.0), controls, *(casadi.repmat(value, 1, steps) for value in inputs)
     )
-    final = last[: x.numel()]
-    total = last[x.numel()]
+    final, total, largest, magnitude = casadi.vertsplit(last, [0, *range(x.numel(), x.numel() + 4)])
     if final_cost is not None:
         total += casadi.Function("final_cost", [x], [final_cost(x)])(final)
     return casadi.Function(
         "rollout",
         [x0, knots, *inputs],
-        [total, last[x.numel() + 1], final],
+        [total, largest, magnitude + casadi.norm_1(final), final],
         ["x0", "knots", *names],
-        ["cost", "overrun", "final"],
+        ["cost", "overrun", "extent", "final"],
     )
