@@ -53,10 +53,10 @@ class TimedRuntime(Runtime):
         self.lateness: list[float] = []
         self.worked = 0.0
 
-    def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
+    def cycle(self, *, due: float | None = None, lateness: float = 0.0, poll: bool = True) -> Cycle:
         steps, cycles = self.statistics.histograms["step"], self.statistics.histograms["cycle"]
         stepped, cycled, begin = steps.total, cycles.total, self.clock.now()
-        done = super().cycle(lateness=lateness, poll=poll)
+        done = super().cycle(due=due, lateness=lateness, poll=poll)
         took = self.clock.now() - begin
         self.overheads.append(took - (steps.total - stepped))
         self.commanded.append(lateness + cycles.total - cycled)
@@ -79,7 +79,8 @@ class Rig:
         self.drain()
         # How long the system holds up the loop is to be measured: it must not end the measurement.
         patient = [replace(signal, max_age=PATIENCE) for signal in target.interface.sense]
-        guards = Guards(replace(target.interface, sense=patient), PERIOD, max_missed=inf)
+        interface = replace(target.interface, sense=patient)
+        guards = Guards(interface, PERIOD, max_missed=inf, pace_tolerance=inf)
         runtime = TimedRuntime(target, self.bridge, period=PERIOD, pace=pace, continuity=CONTINUITY, guards=guards)
         runtime.run(cycles=WARM_UP)
         runtime.switch("real")

@@ -125,7 +125,7 @@ def swing_up_on_machine(
     period, states = scenario.period, []
     with (
         Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True, period=period),
+        MachineProcess(scenario, hub.url, lock_step=True),
         scenario.deploy(hub.url, record=record) as runtime,
     ):
         perceived = runtime.target.reader(PERCEIVED)

@@ -69,7 +69,7 @@ def over_lcm(scenario: ForestScenario, *, cycles: int = CYCLES) -> OverLcm:
     context = dps.default_context()
     with (
         Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        MachineProcess(scenario, hub.url, lock_step=True),
         scenario.deploy(
             hub.url, target=dps, context=context, deployment=Deployment.of(scenario).in_lock_step("imu")
         ) as loop,

@@ -53,9 +53,9 @@ def start(*arguments: object, priority: int = 0) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def snapshot_in_motion(path: Path) -> Snapshot:
+def snapshot_in_motion(path: Path, *, lock_step: bool = False) -> Snapshot:
     """Of the whole testbed, where its DPS has been at work for a while."""
-    testbed = ServoMachineScenario().build()
+    testbed = ServoMachineScenario(lock_step=lock_step).build()
     simulator = testbed.simulator()
     testbed.write(simulator.get_mutable_context(), {"u.target": [0.1, -0.05], "dps.gain": 3.0})
     simulator.AdvanceTo(0.05)
@@ -65,7 +65,7 @@ def snapshot_in_motion(path: Path) -> Snapshot:
 
 
 def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
-    scenario = ServoMachineScenario()
+    scenario = ServoMachineScenario(lock_step=True)
     testbed = scenario.build()
     context = testbed.default_context()
     testbed.restore(context, snapshot)
@@ -84,12 +84,12 @@ def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
 
 
 def test_dps_alone_commands_like_the_testbed(tmp_path: Path) -> None:
-    snapshot = snapshot_in_motion(tmp_path / "s")
+    snapshot, lock_step = snapshot_in_motion(tmp_path / "s", lock_step=True), ("--field", "lock_step=true")
     with Hub(port=0) as hub:
         expected = commands_of_the_whole_testbed(hub, snapshot)
     with Hub(port=0) as hub, MachineProcess(ServoMachineScenario(), hub.url, lock_step=True):
         ear = Ear(hub.url)
-        with start(SERVO, "--url", hub.url, "--snapshot", tmp_path / "s") as program:
+        with start(SERVO, *lock_step, "--url", hub.url, "--snapshot", tmp_path / "s") as program:
             ear.listen(lambda: len(ear.torques) >= 2 * CYCLES)
             program.send_signal(signal.SIGINT)
             output, errors = program.communicate(timeout=PATIENCE)

@@ -357,3 +357,75 @@ def test_command_taken_back_leaves_no_trace(commands: list[tuple[float, bool]]) 
         else:
             one.take_back()
         assert one.last_sent == other.last_sent
+
+
+# -- times between commands
+
+
+@given(
+    rate=positive,
+    acceleration=st.one_of(st.floats(1.0, 1e4), st.just(inf)),
+    bound=st.one_of(st.floats(0.01, 3.0), st.just(inf)),
+    commands=st.lists(st.tuples(entry, st.sampled_from([0.0, 1e-5, 0.02, 0.3, 0.999, 1.0, 1.7, 40.0])), max_size=60),
+)
+def test_commands_at_any_times_keep_rate_and_range(
+    rate: float, acceleration: float, bound: float, commands: list[tuple[float, float]]
+) -> None:
+    one = limiter(rate=rate, acceleration=acceleration, lower=-bound, upper=bound)
+    one.limit([0.0], 0.0)
+    now, counted, before = 0.0, 0.0, 0.0
+    for command, periods in commands:
+        now += periods * T
+        sent = one.limit([command], now).item()
+        most = rate * min(now - counted, T) if now > counted else 0.0
+        rounding = 8 * EPS * max(abs(sent), abs(before)) + 1e-6 * most
+        assert abs(sent - before) <= most + rounding
+        assert -bound <= sent <= bound
+        if now - counted > 1e-3 * T:
+            counted = now
+        before = sent
+
+
+@given(
+    acceleration=st.floats(1.0, 1e4),
+    commands=st.lists(st.tuples(st.floats(-5.0, 5.0), st.floats(0.01, 2.0)), max_size=60),
+)
+def test_commands_at_any_times_keep_the_acceleration(acceleration: float, commands: list[tuple[float, float]]) -> None:
+    one = limiter(acceleration=acceleration)
+    one.limit([0.0], 0.0)
+    now, before, velocity = 0.0, 0.0, 0.0
+    for command, periods in commands:
+        now += periods * T
+        sent = one.limit([command], now).item()
+        time = min(periods, 1.0) * T
+        change = (sent - before) / time - velocity
+        assert abs(change) <= acceleration * time * (1 + 1e-5) + 8 * EPS * max(abs(sent), abs(before)) / time
+        before, velocity = sent, (sent - before) / time
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_motion_comes_to_rest_in_the_range_at_any_times(seed: int) -> None:
+    """Where the limits contradict each other, the velocity changes by no more than it may in a whole period."""
+    random = np.random.default_rng(seed)
+    acceleration, upper = 10.0 ** random.uniform(1.0, 4.0), random.uniform(0.001, 0.1)
+    one = limiter(acceleration=acceleration, upper=upper)
+    one.limit([0.0], 0.0)
+    now, before, velocity = 0.0, 0.0, 0.0
+    for _ in range(3000):
+        share = random.choice([random.uniform(0.01, 1.0), 1.0])
+        now += share * T
+        sent = one.limit([1.0], now).item()
+        new = (sent - before) / (share * T)
+        rounding = 8 * EPS * upper / (share * T)
+        assert abs(new - velocity) <= acceleration * T * (1 + 1e-5) + rounding
+        assert sent <= upper
+        before, velocity = sent, new
+        if sent == upper:
+            break
+    assert sent == pytest.approx(upper, rel=1e-3)
+
+
+def test_clock_that_is_set_back_holds_for_one_command() -> None:
+    one = limiter(rate=1.0)
+    sent = [one.limit([1.0], at).item() for at in (0.0, T, -3600.0, -3600.0 + T)]
+    assert sent == pytest.approx([T, 2 * T, 2 * T, 3 * T])

@@ -12,6 +12,7 @@ from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import FallbackController, Silence, Zero
 from vtbdrake.control.guards import Guards
+from vtbdrake.control.pace import SETTLED
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import SwitchRefusedError
@@ -37,7 +38,7 @@ def make(*, alone=False, sensors=still, rate=2.0, lateness=(), **more):
 def switched(**settings):
     """A runtime on real, whose command departs from the measured speed."""
     runtime, bridge, clock = make(**{"continuity": {"velocity": ("speed", 5.0)}, **settings})
-    runtime.cycle()
+    runtime.run(cycles=SETTLED + 1) if runtime.pace else runtime.cycle()
     runtime.switch("real")
     return runtime, bridge, clock
 
@@ -535,10 +536,10 @@ def test_paced_loop_delayed_beyond_patience_has_missed_cycles(held_up, missed, a
     runtime, bridge, clock = switched(rate=0.0, pace="position")
     # While it waits for a message, or while it works.
     held = "poll" if asleep else "publish"
-    call = getattr(bridge, held)
+    call, before = getattr(bridge, held), runtime.cycles
 
     def stopped(argument=0.0):
-        if runtime.cycles == 5:
+        if runtime.cycles == before + 4:
             clock.advance(held_up * PERIOD)
             setattr(bridge, held, call)
         return call(argument)

@@ -85,7 +85,7 @@ def test_camera_of_a_machine_guides_as_in_a_simulation(tmp_path: Path) -> None:
     deployment = scenario.deployment().in_lock_step("speed")
     with (
         Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        MachineProcess(scenario, hub.url, lock_step=True),
         scenario.deploy(hub.url, record=tmp_path / "look.lcm", deployment=deployment) as runtime,
     ):
         runtime.take_over()

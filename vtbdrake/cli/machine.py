@@ -42,7 +42,9 @@ def _parse_noise(text: str) -> tuple[str, float]:
 @scenario_argument
 @url_option
 @option(
-    "--period S", "The period of a cycle, in seconds; each cycle publishes the state once.", default=_DEFAULT.period
+    "--period S",
+    "The period of a cycle, in seconds; each cycle publishes the state once.  [default: that of the deployment]",
+    type=float,
 )
 @option("--lock-step", "Begin a cycle with a command on every channel, not by the clock.", is_flag=True)
 @option("--cycles N", "End after N cycles.  [default: endless]", type=click.IntRange(min=0))

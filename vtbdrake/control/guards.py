@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
-from math import inf, isnan
+from math import inf, isnan, nan
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -40,9 +40,9 @@ class Guards:
 
     In every cycle, `check` limits the commands of the actuator signals that are on real, unless there is a fault: a
     sensor signal that is stale or implausible; a DPS that raised; a command that is missing, not finite or of a wrong
-    size; too many missed deadlines in a row; a machine that must not be commanded. A fault *latches* in the same cycle:
-    from then on the fallbacks command all signals that are on real, until `reset`. While nothing is on real, faults are
-    reported, but nothing latches.
+    size; too many missed deadlines in a row; messages that pace the loop at another pace than its period; a machine
+    that must not be commanded. A fault *latches* in the same cycle: from then on the fallbacks command all signals that
+    are on real, until `reset`. While nothing is on real, faults are reported, but nothing latches.
 
     A signal with a limit of its rate or acceleration needs `start` before it is commanded. A signal that has neither a
     start nor a sent command is not sent at all: there is nothing to hold.
@@ -64,10 +64,14 @@ class Guards:
         max_delay: By sensor signal, in seconds; see `SensorMonitor`.
         max_missed: More deadlines missed in a row are a fault. So are more commands in a row that did not leave, but
             of those never more than `MOST_UNSENT` are allowed.
+        pace_tolerance: For a loop that messages pace, the largest difference between their pace and the period,
+            relative to the period (see `PaceMonitor`); more is a fault. The default covers clocks that differ by some
+            per cent. Infinite: no pace is a fault.
         log_size: Number of faults that `log` keeps.
 
     Attributes:
         period: Period of the loop, in seconds.
+        pace_tolerance: As given.
         limiters: The limiter of each actuator signal, with its counts.
         monitors: The monitor of each sensor signal.
         log: The newest faults, each once while it lasts.
@@ -87,6 +91,7 @@ class Guards:
         jump_tolerance: Mapping[str, ArrayLike] | None = None,
         max_delay: Mapping[str, float] | None = None,
         max_missed: float = 10,
+        pace_tolerance: float = 0.1,
         log_size: int = 1000,
     ) -> None:
         fallback, jump_tolerance, max_delay = dict(fallback or {}), dict(jump_tolerance or {}), dict(max_delay or {})
@@ -95,7 +100,10 @@ class Guards:
         _reject_unknown("max_delay", max_delay, interface.sense)
         if isnan(max_missed) or max_missed < 0:
             raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
+        if not pace_tolerance > 0.0:
+            raise ValueError(f"pace_tolerance is a positive share of the period, not {pace_tolerance}")
         self.period = period
+        self.pace_tolerance = pace_tolerance
         self.limiters: dict[str, RateLimiter | PassThrough] = {
             s.name: RateLimiter(s, period=period) if s.is_vector else PassThrough() for s in interface.act
         }
@@ -165,6 +173,8 @@ class Guards:
         error: BaseException | None = None,
         missed: int = 0,
         blocked: str | None = None,
+        pace: str | None = None,
+        at: float = nan,
         others: Mapping[str, ReceivedSignal] = _NONE,
     ) -> Verdict:
         """Judge one cycle. The returned commands count as sent, unless `note_unsent` is called before the next cycle.
@@ -178,13 +188,16 @@ class Guards:
             error: The error that the DPS raised, if it did.
             missed: Number of deadlines missed in a row, up to now.
             blocked: Why the machine is not to be commanded, if it is not.
+            pace: How the pace of the cycles differs from the period, if it does.
+            at: Time of the commands in seconds, on the clock by which their rates are limited: a command counts for
+                the time since the last one, at most for a period. NaN: every command counts for a period.
             others: Sensor signals that are not on real; fallbacks may use them.
         """
         if self._unconfirmed:
             self.note_unsent(())
         self._unconfirmed = True
         self._activate(tuple(active if active is not None else self._active if error else actuation))
-        causes = self._general_faults(now, error, missed, blocked)
+        causes = self._general_faults(now, error, missed, blocked, pace)
         causes += self._depart_anew(now, received, others)
         wanted = []
         if error is None:
@@ -206,10 +219,10 @@ class Guards:
             if not self._active:
                 self._accept_steady()
         if self._latched:
-            return Verdict(self._fall_back(now, {**others, **received}), False, self._faults)
+            return Verdict(self._fall_back(now, {**others, **received}, at), False, self._faults)
         self._last = now
         self._silent = frozenset()
-        return Verdict({name: limiter.send(values) for name, limiter, values in wanted}, True, self._faults)
+        return Verdict({name: limiter.send(values, at) for name, limiter, values in wanted}, True, self._faults)
 
     def note_unsent(self, names: Collection[str]) -> None:
         """Record which commands of the last verdict did not leave: they do not count as sent.
@@ -227,14 +240,17 @@ class Guards:
         self._unsent = {name: self._unsent.get(name, 0) + 1 for name in self._active if name not in left}
         self._departing -= left
 
-    def latch(self, reason: str, now: float, received: Mapping[str, ReceivedSignal]) -> Verdict:
-        """Latch for a reason from outside, whether or not anything is on real; return the verdict of a cycle."""
+    def latch(self, reason: str, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> Verdict:
+        """Latch for a reason from outside, whether or not anything is on real; return the verdict of a cycle.
+
+        ``at`` is as in `check`.
+        """
         self._depart_anew(now, received, _NONE)
         told = Fault(now, None, "told", reason)
         self.log.append(told)
         if not self._latched:
             self._latch((told,))
-        return Verdict(self._fall_back(now, received), False, (*self._faults, told))
+        return Verdict(self._fall_back(now, received, at), False, (*self._faults, told))
 
     def reset(
         self, now: float, received: Mapping[str, ReceivedSignal], against: Collection[str] = ()
@@ -273,7 +289,9 @@ class Guards:
                 self._departing -= {name}
             self._active = names
 
-    def _general_faults(self, now: float, error: BaseException | None, missed: int, blocked: str | None) -> list[Fault]:
+    def _general_faults(
+        self, now: float, error: BaseException | None, missed: int, blocked: str | None, pace: str | None
+    ) -> list[Fault]:
         faults = []
         if error is not None:
             faults.append(Fault(now, None, "raised", f"the DPS raised {error_text(error)}"))
@@ -282,6 +300,8 @@ class Guards:
             faults.append(Fault(now, None, "missed", reason))
         if blocked is not None:
             faults.append(Fault(now, None, "blocked", f"the machine must not be commanded: {blocked}"))
+        if pace is not None:
+            faults.append(Fault(now, None, "pace", pace))
         return faults
 
     def _depart_anew(
@@ -330,7 +350,7 @@ class Guards:
         self._failed.clear()
         _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
 
-    def _fall_back(self, now: float, received: Mapping[str, ReceivedSignal]) -> dict[str, Any]:
+    def _fall_back(self, now: float, received: Mapping[str, ReceivedSignal], at: float) -> dict[str, Any]:
         """Return the fallbacks' commands, within the limits."""
         dt = self.period if self._last is None else now - self._last
         self._last = now
@@ -343,7 +363,7 @@ class Guards:
             if monitor.arrived > -inf
         }
         actuation = {
-            name: self._fallback_command(name, now, sensed, known, dt)
+            name: self._fallback_command(name, now, sensed, known, dt, at)
             for name in self._active
             if self.limiters[name].has_start
         }
@@ -352,7 +372,7 @@ class Guards:
         return sent
 
     def _fallback_command(
-        self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float
+        self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float, at: float
     ) -> Any:
         limiter: Any = self.limiters[name]
         last_sent = limiter.last_sent
@@ -362,13 +382,13 @@ class Guards:
                     self._begun.add(fallback)
                     fallback.begin()
                 command = fallback.command(last_sent, sensed, known, dt)
-                return command if command is NO_COMMAND else limiter.limit(command)
+                return command if command is NO_COMMAND else limiter.limit(command, at)
             except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
                 if fallback not in self._failed:
                     self._failed.add(fallback)
                     reason = f"{type(fallback).__name__} cannot command {name}: {type(error).__name__}: {error}"
                     self.log.append(Fault(now, name, "fallback", reason))
-        return limiter.limit(last_sent)
+        return limiter.limit(last_sent, at)
 
 
 def _reject_unknown(what: str, given: Iterable[str], signals: Iterable[Signal]) -> None:

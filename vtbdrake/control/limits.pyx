@@ -4,7 +4,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from libc.math cimport fabs, floor, isfinite, sqrt
+from libc.math cimport INFINITY, NAN, fabs, floor, isfinite, sqrt
 from libc.stdint cimport int64_t
 
 cimport numpy as cnp
@@ -18,6 +18,8 @@ cdef double LARGEST = np.finfo(float).max
 cdef double FAR = 1e150
 # Relative to a command: a smaller difference comes from rounding and does not count as limiting.
 cdef double ROUNDING = 1e-12
+# Of a period. Times are rounded: one that is shorter by no more is a whole period. Much shorter ones do not count yet.
+cdef double SAME_TIME = 1e-6, SHORTEST = 1e-3
 LIMITS = ("range", "rate", "acceleration")
 cdef enum: NONE = -1, RANGE, RATE, ACCELERATION  # positions in LIMITS
 
@@ -122,28 +124,30 @@ LimitCount.__doc__ = """The effect of a limit: the number of entries of commands
 cdef class RateLimiter:
     """Keeps the commands of a vector actuator signal within its limits of range, rate and acceleration.
 
-    With the period T, the command c, the last sent command s and the step x before it, the step that is sent,
-    w = s' - s, satisfies, entry by entry,
+    A command counts for the time since the last sent one, at most for a period T, so that commands in quick succession
+    move no faster. With r = min(time, T) / T, the command c, the last sent command s and the velocity v / T before it,
+    what is sent, s' = s + r w, satisfies, entry by entry,
 
-        |w| <= rate T,    |w - x| <= acceleration T^2,    lower <= s' <= upper,
+        |w| <= rate T,    |w - v| <= r a    with a = acceleration T^2,    lower <= s' <= upper,
 
-    and stops in time: afterwards, steps that shrink by a = acceleration T^2 each come to rest within the range. Since w
-    is followed by w - a, w - 2 a, ..., the total way of a step is
+    and stops in time: afterwards, periods whose steps shrink by a each come to rest within the range. Since w is
+    followed by w - a, w - 2 a, ..., the total way is
 
-        f(w) = sum_{j >= 0} max(0, w - j a),
+        f(w) = r w + sum_{j >= 1} max(0, w - j a),
 
-    and the largest step towards an end at the distance d is the solution of f(w) = d: with the whole number m for which
-    a m (m + 1) / 2 <= d < a (m + 1) (m + 2) / 2,
+    and the largest w towards an end at the distance d is the solution of f(w) = d: with the largest whole number m for
+    which a m (m - 1 + 2 r) / 2 <= d,
 
-        w = d / (m + 1) + a m / 2,
+        w = (d + a m (m + 1) / 2) / (m + r),
 
-    which is the known approach speed sqrt(2 acceleration d) in steps. No other limiter is more generous: a sequence of
-    commands passes unchanged if and only if it can be continued for ever within the limits. The three limits never
-    contradict each other, because the command before respected them, too.
+    which is the known approach speed sqrt(2 acceleration d) in steps. For commands once per period no other limiter is
+    more generous: a sequence passes unchanged if and only if it can be continued for ever within the limits. Then the
+    limits never contradict each other, because the command before respected them, too. Where shorter times make them do
+    so, close to an end of the range, the range holds, and v changes by up to a.
 
     Args:
         signal: The actuator signal with its limits.
-        period: T, the time from one command to the next, in seconds.
+        period: T, the time that a command counts for at most, in seconds.
 
     Attributes:
         needs_start: Whether there is a limit of rate or acceleration, which needs something to depart from.
@@ -156,8 +160,9 @@ cdef class RateLimiter:
     cdef readonly bint needs_start, has_start
     cdef bint had_start
     cdef Py_ssize_t size
+    cdef double period, at, at_before  # the time of the last command; the same before it
     cdef double[::1] steps, changes, lower, upper
-    cdef double[:, ::1] state, state_before  # s and x of above; the same before the last command
+    cdef double[:, ::1] state, state_before  # s and v of above; the same before the last command
     cdef int64_t[3] numbers
     cdef double[3] largest
 
@@ -172,7 +177,7 @@ cdef class RateLimiter:
                 f"signal {signal.name}: its rate {signal.rate} and acceleration {signal.acceleration} leave no step at "
                 f"a period of {period} s"
             )
-        self.size, self.steps, self.changes = signal.size, steps, changes
+        self.size, self.steps, self.changes, self.period = signal.size, steps, changes, period
         self.lower = np.maximum(signal.vector(signal.lower), -FAR)
         self.upper = np.minimum(signal.vector(signal.upper), FAR)
         self.needs_start = np.isfinite(steps).any() or np.isfinite(changes).any()
@@ -194,6 +199,8 @@ cdef class RateLimiter:
     def start_from(self, value):
         """Let the next command depart from ``value`` (shape (size,)), at rest; out of range, from the range's end.
 
+        The next command counts for a whole period.
+
         Raises:
             ActuationError: The value has another size or is not finite.
         """
@@ -204,6 +211,7 @@ cdef class RateLimiter:
         for i in range(self.size):
             self.state[0, i] = min(max(entries[i], self.lower[i]), self.upper[i])
             self.state[1, i] = 0.0
+        self.at = -INFINITY
         self.has_start = True
 
     def release(self):
@@ -213,16 +221,17 @@ cdef class RateLimiter:
     def take_back(self):
         """Treat the last command as never sent. Call it at most once after each `send`."""
         self.state[...] = self.state_before
+        self.at = self.at_before
         self.has_start = self.had_start
 
-    def limit(self, command):
-        """Return what may be sent for ``command``, both of shape (size,); it counts as sent.
+    def limit(self, command, double at=NAN):
+        """Return what may be sent for ``command``, both of shape (size,); it counts as sent. See `send` for ``at``.
 
         Raises:
             ActuationError: The command has another size or is not finite, or a limit of rate or acceleration has no
                 start.
         """
-        return self.send(self.checked(command))
+        return self.send(self.checked(command), at)
 
     def checked(self, command):
         """Return ``command`` as an array of finite doubles, shape (size,), without sending anything.
@@ -245,15 +254,19 @@ cdef class RateLimiter:
                 raise ActuationError("not finite", f"is not finite: {command.tolist()}")
         return command
 
-    def send(self, command):
+    def send(self, command, double at=NAN):
         """Return what may be sent for a `checked` command; it counts as sent.
+
+        Args:
+            command: The command.
+            at: The time of the command in seconds, on a clock of the caller; NaN: a period after the last one.
 
         Raises:
             ActuationError: A limit of rate or acceleration has no start.
         """
         cdef double* entries = entries_of(command, self.size)
         cdef double* sent
-        cdef double s
+        cdef double s, way, r
         cdef cnp.npy_intp size = self.size
         cdef Py_ssize_t i
         if entries is NULL:
@@ -263,31 +276,47 @@ cdef class RateLimiter:
             if self.needs_start:
                 raise ActuationError("not started", "has a limit of its rate or acceleration, and nothing to depart from")
             self.start_from(command)
+        r = self._share(at)
+        self.at_before = self.at
+        if r > 0.0 or at < self.at:  # or if the clock was set back
+            self.at = at
         result = cnp.PyArray_SimpleNew(1, &size, cnp.NPY_DOUBLE)
         sent = <double*>cnp.PyArray_DATA(result)
         for i in range(self.size):
             s = self.state[0, i]
             self.state_before[0, i], self.state_before[1, i] = s, self.state[1, i]
-            self.state[0, i] = sent[i] = self._limited(entries[i], i)
-            self.state[1, i] = sent[i] - s
+            self.state[0, i] = sent[i] = self._limited(entries[i], i, r)
+            way = sent[i] - s
+            if r > 0.0:
+                self.state[1, i] = way / r
         return result
 
-    cdef double _limited(self, double c, Py_ssize_t i) noexcept:
-        """Return one entry of the actuator command to send."""
-        cdef double s = self.state[0, i], x = self.state[1, i], change = self.changes[i]
-        cdef double w = c - s, sent, amount
+    cdef double _share(self, double at) noexcept:
+        """Return the time since the last command as a share of the period, 0 to 1; shorter ones than 0.001 add up."""
+        cdef double r = (at - self.at) / self.period
+        if not r < 1.0 - SAME_TIME:  # also for NaN
+            return 1.0
+        return r if r > SHORTEST else 0.0
+
+    cdef double _limited(self, double c, Py_ssize_t i, double r) noexcept:
+        """Return one entry of the actuator command to send, for a time of r periods."""
+        cdef double s = self.state[0, i], step = self.steps[i], change = self.changes[i]
+        cdef double way = c - s, sent, amount
+        cdef double before = r * self.state[1, i]
         cdef int acted = NONE
-        if fabs(w) > self.steps[i]:
-            w, acted = self.steps[i] if w > 0.0 else -self.steps[i], RATE
-        if fabs(w - x) > change:
-            w, acted = x + change if w > x else x - change, ACCELERATION
-        # The range comes last: where rounding makes limits contradict each other, it holds exactly.
-        if w > _longest_step(self.upper[i] - s, change):
-            w, acted = _longest_step(self.upper[i] - s, change), RANGE
-        elif w < -_longest_step(s - self.lower[i], change):
-            w, acted = -_longest_step(s - self.lower[i], change), RANGE
-        # Unless a limit acted, c passes as it is, without the rounding of s + w.
-        sent = min(max(s + w if acted != NONE else c, self.lower[i]), self.upper[i])
+        # An infinite limit stays infinite for r = 0.
+        step = step * r if isfinite(step) else step
+        if fabs(way) > step:
+            way, acted = step if way > 0.0 else -step, RATE
+        if isfinite(change) and fabs(way - before) > change * r * r:
+            way, acted = before + change * r * r if way > before else before - change * r * r, ACCELERATION
+        # The range comes last: where limits contradict each other, it holds exactly.
+        if way > _longest_way(self.upper[i] - s, change, r):
+            way, acted = _longest_way(self.upper[i] - s, change, r), RANGE
+        elif way < -_longest_way(s - self.lower[i], change, r):
+            way, acted = -_longest_way(s - self.lower[i], change, r), RANGE
+        # Unless a limit acted, c passes as it is, without the rounding of s + way.
+        sent = min(max(s + way if acted != NONE else c, self.lower[i]), self.upper[i])
         amount = fabs(sent - c)
         if acted != NONE and amount > ROUNDING * (fabs(s) + fabs(c)):
             self.numbers[acted] += 1
@@ -295,12 +324,12 @@ cdef class RateLimiter:
         return sent
 
 
-cdef double _longest_step(double d, double a) noexcept:
-    """Return the step w with f(w) = d; see `RateLimiter`."""
-    if d <= a:
+cdef double _longest_way(double d, double a, double r) noexcept:
+    """Return r w for the w with f(w) = d; see `RateLimiter`."""
+    if not isfinite(a) or d <= a * r:
         return d
-    cdef double m = floor(0.5 * (sqrt(1.0 + 8.0 * d / a) - 1.0))
-    return d / (m + 1.0) + 0.5 * a * m
+    cdef double m = floor(0.5 * (1.0 - 2.0 * r + sqrt((1.0 - 2.0 * r) ** 2 + 8.0 * d / a)))
+    return r * (d + 0.5 * a * m * (m + 1.0)) / (m + r)
 
 
 class PassThrough:
@@ -329,7 +358,7 @@ class PassThrough:
         """Treat the last command as never sent."""
         self.last_sent = self._sent_before
 
-    def limit(self, command):
+    def limit(self, command, at=NAN):
         """Return ``command``; it counts as sent.
 
         Raises:
@@ -347,7 +376,7 @@ class PassThrough:
             raise ActuationError("size", "is None")
         return command
 
-    def send(self, command):
+    def send(self, command, at=NAN):
         """Return ``command``; it counts as sent."""
         self._sent_before, self.last_sent = self.last_sent, command
         return command

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
-from math import floor, inf, isnan
+from math import floor, inf, isnan, nan
 from typing import Any, Self
 
 from pydrake.systems.framework import Context
@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
 from vtbdrake.control.guards import MOST_UNSENT, Guards
+from vtbdrake.control.pace import PaceMonitor
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepping import RESET, Cycle, Stepped
@@ -46,6 +47,11 @@ class Runtime(Stepped):
     actuator commands and sends them. The DPS's time is exactly the number of its steps times the period: a missed
     cycle is left out and counted, and never caught up with, so that no burst of old commands is sent.
 
+    A loop that messages pace checks that they come once per period: by its clock, or by the machine's time stamps if
+    the signal has no ``max_age`` (in lock-step, where the machine waits). Another pace prevents a switch to real, and
+    is a fault afterwards; how much may differ is an option of the guards. The rates of commands are limited by the time
+    that has passed since the last ones, so they hold even if the pace is wrong, or if cycles are run by hand.
+
     A testbed starts with its switches as they stand in ``context``. The DPS alone starts idle: it is stepped, and
     commands, from its switch to ``real`` on.
 
@@ -62,8 +68,8 @@ class Runtime(Stepped):
         context: Where the target starts; its default context if None. It belongs to the runtime from then on.
         clock: By default the wall clock, which wakes up 0.1 ms early; a `SimulatedClock` makes tests deterministic.
         guards: Guards made for the same period and signals; by default those that follow from the interface.
-        pace: By default the clock starts the cycles. With the name of a sensor signal, every message of it starts one
-            (lock-step with the machine), or the clock, if none comes for ``patience`` periods. If the machine's cycle
+        pace: By default the clock starts the cycles. With the name of a sensor signal, every message of it starts one,
+            or the clock, if none comes for ``patience`` periods. If the machine's cycle
             takes several messages, name a signal of the last one: the first message that contains the signal starts
             the cycle, which gets the values of later messages from the cycle before.
         patience: Number of periods, see ``pace``. It must cover the machine's jitter and be shorter than the sensor
@@ -121,6 +127,10 @@ class Runtime(Stepped):
         self.blocked_by = blocked_by
         self.cycles = 0
         self.pace = pace
+        self._pace_monitor = None
+        if pace is not None:
+            self._pace_monitor = PaceMonitor(pace, period, tolerance=self.guards.pace_tolerance)
+        self._paced = 0  # The count of the newest message that has begun a cycle.
         self._patience = patience * period
         self._watchers = list(watchers)
         self._read_at = self.clock.now()  # when all that had arrived was read
@@ -178,7 +188,7 @@ class Runtime(Stepped):
                     due, lateness = (deadline, 0.0) if begins else self._await(deadline)
                     begins = False
                     # A loop that is paced by messages has just received them.
-                    self.cycle(lateness=lateness, poll=self.pace is None)
+                    self.cycle(due=due, lateness=lateness, poll=self.pace is None)
                     interruptible.check()
                     done += 1
                     if until():
@@ -236,14 +246,16 @@ class Runtime(Stepped):
         self.statistics.miss(behind)
         return due + (behind + 1) * self.period
 
-    def cycle(self, *, lateness: float = 0.0, poll: bool = True) -> Cycle:
+    def cycle(self, *, due: float | None = None, lateness: float = 0.0, poll: bool = True) -> Cycle:
         """Run one cycle now and return its record.
 
         Args:
+            due: When the cycle was due, on the clock in seconds; None: now.
             lateness: Time since the cycle was due, in seconds.
             poll: Whether to poll the bridge first.
         """
         begin = self.clock.now()
+        due = begin if due is None else due
         if poll:
             self.bridge.poll()
         if begin - self._read_at > self._longest_gap:
@@ -251,6 +263,7 @@ class Runtime(Stepped):
         elif lateness > self.period or self.statistics.run:
             self._read_backlog()
         now = self._read_at = self.clock.now()
+        pace = self._check_pace()
         self._serve()
         self.take_commands()
         self.feed()
@@ -267,6 +280,8 @@ class Runtime(Stepped):
             error=error,
             missed=self.statistics.run + self._overrun(lateness, stepped - begin),
             blocked=self.blocked_reason() if active else None,
+            pace=pace,
+            at=self._time_of_commands(due, stepped),
             others=self.bridge.sensed,
         )
         unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
@@ -330,6 +345,32 @@ class Runtime(Stepped):
             worked = 0.0
         return int((lateness + worked) / self.period)
 
+    @property
+    def _in_lock_step(self) -> bool:
+        """Whether the machine's time may stand still, so that it is told by the stamps of the messages that pace."""
+        return self.pace is not None and self.guards.monitors[self.pace].max_age == inf
+
+    def _check_pace(self) -> str | None:
+        """Note the message that has begun this cycle; return how the pace differs from the period, or None."""
+        if self.pace is None or self._pace_monitor is None:
+            return None
+        received = self.bridge.sensed[self.pace]
+        if received.count != self._paced:
+            self._paced = received.count
+            self._pace_monitor.note(received.sent if self._in_lock_step else received.arrived)
+        problem = self._pace_monitor.problem
+        self.statistics.off_pace += problem is not None
+        return problem
+
+    def _time_of_commands(self, due: float, now: float) -> float:
+        """Return the time by which the rates of this cycle's commands are limited.
+
+        Cycles of the clock are due at least a period apart, however late they are.
+        """
+        if self.pace is None:
+            return due
+        return self.bridge.sensed[self.pace].sent if self._in_lock_step else now
+
     def _note_foreign(self) -> None:
         """Count other publishers' commands while this loop commands, and log them at most once per second."""
         foreign, now = self.bridge.foreign, self.clock.now()
@@ -344,11 +385,22 @@ class Runtime(Stepped):
 
     def send_fallback(self, reason: str) -> None:
         """Latch the guards and send the fallback commands once, as the last commands of a loop that ends."""
-        verdict = self.guards.latch(reason, self.clock.now(), self.watched)
+        now = self.clock.now()
+        verdict = self.guards.latch(reason, now, self.watched, at=nan if self._in_lock_step else now)
         # The verdict covers the signals that were on real in the last cycle and have been commanded before.
         last = {name: command for name, command in verdict.actuation.items() if name in self.active}
         if last:
             self.bridge.publish(last)
+
+    @property
+    def pace_problem(self) -> str | None:
+        """Why the pace of the messages that begin cycles prevents a switch to real, or None.
+
+        In lock-step it is known only after the switch, because the machine waits for commands.
+        """
+        if self._pace_monitor is None:
+            return None
+        return self._pace_monitor.problem or (None if self._in_lock_step else self._pace_monitor.unknown)
 
     def blocked_reason(self) -> str | None:
         """Return why the machine must not be commanded (it is not ready, or commands do not reach it), or None."""

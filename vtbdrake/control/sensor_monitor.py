@@ -26,7 +26,8 @@ class Fault:
     time: float  # time of detection on the loop's clock, in seconds
     signal: str | None  # name of the faulty signal; None if the fault concerns all
     # of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``, ``not
-    # finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``blocked`` or ``told``
+    # finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``pace``, ``blocked`` or
+    # ``told``
     kind: str
     reason: str  # description in one sentence
 

@@ -150,7 +150,7 @@ class Threshold:
 
 
 QUANTITIES = ("lateness", "step", "cycle")
-_COUNTS = ("misses", "run", "longest_run", "foreign")
+_COUNTS = ("misses", "run", "longest_run", "foreign", "off_pace")
 
 
 class LoopStatistics:
@@ -168,6 +168,7 @@ class LoopStatistics:
         run: Number of misses in a row, up to now.
         longest_run: Number of misses in the longest such row.
         foreign: Number of commands of other publishers that were heard while the loop commanded.
+        off_pace: Number of cycles in which the messages that begin them came at another pace than the period.
     """
 
     def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
@@ -185,6 +186,7 @@ class LoopStatistics:
         self.run = 0
         self.longest_run = 0
         self.foreign = 0
+        self.off_pace = 0
         self._missed = False
         self._recorders = tuple((self.histograms[name].record, self.thresholds[name]) for name in QUANTITIES)
 
@@ -217,11 +219,15 @@ class LoopStatistics:
 
     @property
     def level(self) -> str:
-        """The worst so far: ``error`` or ``warning`` if a duration exceeded such a threshold, otherwise ``ok``."""
+        """The worst so far.
+
+        ``error`` or ``warning`` if a duration exceeded such a threshold, ``error`` if the pace was another than the
+        period, otherwise ``ok``.
+        """
         thresholds = self.thresholds.values()
-        return (
-            "error" if any(t.errors for t in thresholds) else "warning" if any(t.warnings for t in thresholds) else "ok"
-        )
+        if self.off_pace or any(t.errors for t in thresholds):
+            return "error"
+        return "warning" if any(t.warnings for t in thresholds) else "ok"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the statistics as plain data, fit for JSON."""
@@ -254,6 +260,10 @@ class LoopStatistics:
             lines.append(form.format(name, *cells, threshold.warnings, threshold.errors))
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
         lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level}")
+        if self.off_pace:
+            lines.append(
+                f"ALARM: in {self.off_pace} cycles the messages that begin them came at another pace than the period"
+            )
         if self.foreign:
             lines.append(
                 f"ALARM: other publishers commanded the machine, too: {self.foreign} of their commands were heard"

@@ -46,7 +46,8 @@ def prepare(
 
     A sensor signal that becomes real must be fresh and plausible. If an actuator signal is to be on real, so must all
     sensor signals on real, and the one that its command departs from. The command of an actuator signal that becomes
-    real must continue what is measured. The machine must be ready and connected, and have no other commander.
+    real must continue what is measured. The machine must be ready and connected, and have no other commander. Messages
+    that pace the loop must come once per period.
 
     Raises:
         ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
@@ -72,6 +73,8 @@ def prepare(
         blocked = runtime.blocked_reason()
         if blocked is not None:
             reasons.append(f"the machine must not be commanded: {blocked}")
+        if runtime.pace_problem is not None:
+            reasons.append(runtime.pace_problem)
         competing = runtime.bridge.competing_publisher
         if becoming and competing is not None:
             reasons.append(competing)

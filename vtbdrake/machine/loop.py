@@ -99,7 +99,7 @@ class MachineLoop:
         self._link.open()
 
     def _reset_statistics(self) -> None:
-        self.statistics = LoopStatistics(self.machine.config.period)
+        self.statistics = LoopStatistics(self.machine.period)
         self.state_to_command = Histogram()
         self.lost = 0.0
 
@@ -183,7 +183,7 @@ class MachineLoop:
 
     def _behind(self, begin: float, now: float) -> tuple[float, int]:
         """Return the time of cycle 0 on the clock, and the number of cycles to do; the world catches up."""
-        period = self.machine.config.period
+        period = self.machine.period
         due = int((now - begin) / period + 1e-6) + 1 - self.machine.cycle
         steps = max(1, min(due, int(_CATCH_UP / period)))
         lost = max(0, due - steps) * period
@@ -232,7 +232,7 @@ class MachineLoop:
 
     def _send_status(self) -> None:
         config = self.machine.config
-        self._next_status = self.machine.cycle + max(1, round(config.status_period / config.period))
+        self._next_status = self.machine.cycle + max(1, round(config.status_period / self.machine.period))
         self._link.publish((config.status_channel, json.dumps(asdict(self.machine.status())).encode()))
 
     # -- requests

@@ -45,7 +45,7 @@ class MachineConfig:
         ValueError: A value is out of its range.
     """
 
-    period: float = 1e-3  # s, of a cycle
+    period: float | None = None  # s, of a cycle; None: that of the scenario's deployment
     values: Mapping[str, Any] = field(default_factory=dict)  # variables of the world to set, by address
     perturb: float = 0.0  # largest relative change, see `perturbed_values`; `values` are set afterwards
     noise: Mapping[str, float] = field(default_factory=dict)  # vector sensor signal -> standard deviation, in its unit
@@ -61,7 +61,8 @@ class MachineConfig:
 
     def __post_init__(self) -> None:
         positive, finite = "must be a positive time in seconds", "must be a time of at least 0 s"
-        for name in ("period", "timeout", "status_period"):
+        self._check(self.period is None or 0.0 < self.period < inf, "period", positive)
+        for name in ("timeout", "status_period"):
             self._check(0.0 < getattr(self, name) < inf, name, positive)
         self._check(self.max_latency > 0.0, "max_latency", f"{positive}, or inf to accept any")
         for name in ("sense_latency", "act_latency"):
@@ -108,6 +109,7 @@ class Machine:
 
     Attributes:
         protocol: Its LCM protocol.
+        period: The period of a cycle, in seconds.
         cycle: The number of cycles it has done.
         perturbed: The values of variables that differ from the scenario's, by address.
 
@@ -119,6 +121,7 @@ class Machine:
     def __init__(self, scenario: Scenario, config: MachineConfig | None = None, *, epoch: int = 0) -> None:
         self.config = config = config or MachineConfig()
         self.protocol = protocol_of(scenario)
+        self.period = period = config.period or scenario.deployment().period
         self.world = world = WorldAlone(scenario)
         self.cycle = 0
         self._epoch = epoch
@@ -132,13 +135,13 @@ class Machine:
         self._simulator.Initialize()
 
         self._lines = {
-            side: DelayLine(delay=whole_cycles(latency, config.period), period=config.period, random=random)
+            side: DelayLine(delay=whole_cycles(latency, period), period=period, random=random)
             for side, latency, random in ((SENSE, config.sense_latency, sense), (ACT, config.act_latency, act))
         }
         self._brake = HoldingBrake(world, config.brake)
         self._feed = world.feed(self._context)
         self._actuation = dict(self._brake.idle)  # What acts, by actuator signal.
-        self._sensors = _Sensors(world, self.protocol, config, noise, actuation=self._actuation)
+        self._sensors = _Sensors(world, self.protocol, period, config.noise, noise, actuation=self._actuation)
         signals = {signal.name: signal for signal in world.interface.act}
         self._received = {name: ReceivedSignal() for name in signals}
         self._readers = {
@@ -150,13 +153,13 @@ class Machine:
         self._accepted = dict.fromkeys(signals, -inf)  # The cycle of the last accepted command.
         self._commands: dict[str, Any] = dict.fromkeys(signals)
         self._latencies: dict[str, LatencyMonitor] = {}
-        self._patience = whole_cycles(config.timeout, config.period)
+        self._patience = whole_cycles(config.timeout, period)
         self._silent: list[str] = []
 
     @property
     def time(self) -> float:
         """Return the time of its world, in seconds."""
-        return self.cycle * self.config.period
+        return self.cycle * self.period
 
     @property
     def channels(self) -> list[str]:
@@ -218,7 +221,7 @@ class Machine:
             # A signal may be missing in the messages that arrive; its last command becomes stale.
             stale = self._accepted[name] < oldest and not coasting
             self._apply(name, self._brake.actuation(name, command, stale))
-        self._simulator.AdvanceTo((self.cycle + 1) * self.config.period)
+        self._simulator.AdvanceTo((self.cycle + 1) * self.period)
         self.cycle += 1
 
     def _accept(self, name: str, received: ReceivedSignal) -> None:
@@ -337,17 +340,18 @@ class _Sensors:
         self,
         world: WorldAlone,
         protocol: Protocol,
-        config: MachineConfig,
+        period: float,
+        deviations: Mapping[str, float],
         random: np.random.Generator,
         *,
         actuation: Mapping[str, Any],
     ) -> None:
         signals = {signal.name: signal for signal in world.interface.sense}
         vectors = [signal.name for signal in signals.values() if signal.is_vector]
-        for name in config.noise:
+        for name in deviations:
             if name not in vectors:
                 raise ValueError(f"noise is added to vector sensor signals ({', '.join(vectors)}), not to {name!r}")
-        self._noise = config.noise
+        self._noise = deviations
         self._random = random
         self._actuation = actuation  # Kept up to date by the machine.
         carriers = reported_signals(world.interface, protocol.reported)
@@ -355,8 +359,7 @@ class _Sensors:
         self._reported = {signal.name: name for name, signal in carriers.items()}
         self._maps = [(map, map.encoder([known[name] for name in map.signals])) for map in protocol.sense]
         self._cycles = {
-            map.channel: max(1, round(protocol.periods.get(map.channel, config.period) / config.period))
-            for map in protocol.sense
+            map.channel: max(1, round(protocol.periods.get(map.channel, period) / period)) for map in protocol.sense
         }
         self._due = dict.fromkeys(self._cycles, 0)  # The cycle of the next message: it may be skipped, and sent later.
         self._ports = {name: world.diagram.GetOutputPort(f"sense.{name}") for name in vectors}

@@ -261,7 +261,7 @@ def deployed(target: DpsAlone | VirtualTestbed, context: Context, **options: Any
     deployment = Deployment.of(scenario).in_lock_step("imu")
     with (
         Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        MachineProcess(scenario, hub.url, lock_step=True),
         target.scenario.deploy(hub.url, target=target, context=context, deployment=deployment, **options) as runtime,
     ):
         yield runtime, hub.url

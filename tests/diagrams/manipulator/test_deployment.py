@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def commands(scenario: ManipulatorScenario, snapshot: Snapshot, *, alone: bool, 
     target = DpsAlone(scenario) if alone else scenario.build()
     context = target.default_context()
     target.restore(context, snapshot)
-    runtime: Runtime = Deployment.of(scenario).runtime(target, bridge, context=context, clock=clock)
+    runtime: Runtime = Deployment.of(scenario, pace="").runtime(target, bridge, context=context, clock=clock)
     bridge.poll()
     runtime.switch("real")
     runtime.run(cycles=cycles)
@@ -139,7 +140,9 @@ def test_first_command_after_hub_restart_continues_reported_torque() -> None:
         port = int(first.url.rpartition(":")[2])
         bridge = protocol_of(scenario).bridge(scenario.interface(), first.url)
         bridge.open()
-        runtime: Runtime = Deployment.of(scenario).runtime(DpsAlone(scenario), bridge)
+        # The arm tells its state when the test does.
+        guards = {**scenario.deployment().guards, "pace_tolerance": inf}
+        runtime: Runtime = Deployment.of(scenario, guards=guards).runtime(DpsAlone(scenario), bridge)
         arm, limit = FakeArm(first.url), time.monotonic() + PATIENCE
         while runtime.prepare("real").reasons:
             arm.tell(carried)

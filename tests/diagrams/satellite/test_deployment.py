@@ -30,7 +30,7 @@ def test_poses_from_a_satellite_are_dated_by_the_clock_of_the_dps(perception: st
     deployment = Deployment.of(scenario).in_lock_step("joint_position")
     with (
         Hub(port=0) as hub,
-        MachineProcess(scenario, hub.url, lock_step=True, period=PERIOD),
+        MachineProcess(scenario, hub.url, lock_step=True),
         scenario.deploy(hub.url, target=dps, context=own, deployment=deployment) as runtime,
     ):
         assert runtime.slow_parts.wait(TIMEOUT)

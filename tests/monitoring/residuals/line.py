@@ -127,7 +127,7 @@ class Together:
         values: Mapping[str, Any] | None = None,
     ) -> None:
         self.line = Line(scenario, machine)
-        period = machine.config.period
+        period = machine.period
         self.driver = loop(DpsAlone(scenario), self.line, period, **(values or {}))
         self.shadow: Runtime | None = None
         if shadowing is not None:

@@ -1,0 +1,279 @@
+"""The pace of a loop that messages begin: rates go by elapsed time, and another pace than the period is an alarm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.control.servo_machine import COMMAND, ServoMachineScenario
+from tests.control.test_loop import Ear
+from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.guards import Guards
+from vtbdrake.control.pace import SETTLED, WINDOW, PaceMonitor
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.deployment import Deployment
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.testbed import DpsAlone
+
+RATE = 2.0  # m/s^2, of the commanded velocity
+
+
+def monitor(*times: float, tolerance: float = 0.1) -> PaceMonitor:
+    """A monitor that has seen messages with these times between them, in periods."""
+    found = PaceMonitor("position", PERIOD, tolerance=tolerance)
+    for at in np.cumsum([7.0, *times]):
+        found.note(float(at) * PERIOD)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("times", "wrong"),
+    [
+        ([1.0] * WINDOW, False),
+        ([0.95] * WINDOW, False),  # a clock that differs by 5 %
+        ([1.05] * WINDOW, False),
+        ([0.5] * WINDOW, True),
+        ([2.0] * WINDOW, True),
+        ([0.05] * WINDOW, True),
+        ([0.86] * SETTLED, False),  # the first one may have been late by three periods
+        ([0.7] * SETTLED, True),
+        ([0.1, 1.9] * WINDOW, False),  # in pairs
+        ([0.1, 0.9] * WINDOW, True),  # in pairs, too quick
+        ([1.0] * (WINDOW - 10) + [9.0] + [0.1] * 9, False),  # a hub that stalled
+        ([1.0, 1.0, 2.0] * WINDOW, False),  # a quarter of the messages is lost
+        ([1.0] * WINDOW + [0.2] * (WINDOW // 2), False),
+        ([1.0] * WINDOW + [0.2] * (WINDOW // 2 + 1), True),
+        ([0.2] * WINDOW + [1.0] * WINDOW, False),
+        ([nan, 1.0] * WINDOW, False),
+    ],
+)
+def test_pace_differs_if_most_times_and_their_mean_do(times: list[float], wrong: bool) -> None:
+    assert (monitor(*times).problem is not None) == wrong
+
+
+def test_pace_is_unknown_at_first() -> None:
+    assert "19 of 20" in str(monitor(*[0.2] * (SETTLED - 1)).unknown)
+    assert monitor(*[0.2] * (SETTLED - 1)).problem is None
+    assert monitor(*[0.2] * SETTLED).unknown is None
+    assert "every 0.2 ms, but the period of the DPS is 1 ms" in str(monitor(*[0.2] * SETTLED).problem)
+    assert monitor(tolerance=inf).unknown is None
+    assert monitor(*[0.2] * WINDOW, tolerance=inf).problem is None
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, nan])
+def test_tolerance_of_the_pace_must_be_positive(tolerance: float) -> None:
+    with pytest.raises(ValueError, match="pace_tolerance is a positive share"):
+        Guards(ServoScenario().interface(), PERIOD, pace_tolerance=tolerance)
+
+
+class PacingBridge(ScriptedBridge):
+    """A machine whose messages come ``interval`` seconds apart; a poll waits for the next one at most."""
+
+    def __init__(self, clock: SimulatedClock, *, interval: float, stamped: float | None = None) -> None:
+        super().__init__(ServoScenario().interface(), clock, lambda t: {"position": [0.05, 0.0], "speed": [0.0, 0.0]})
+        self.interval = interval
+        self.stamped = stamped  # the time between two messages by the machine's own clock
+        self.due = 0.0
+        self.number = 0
+
+    def poll(self, timeout: float = 0.0) -> int:
+        now = self._clock.now()
+        if now < self.due and not timeout:
+            return 0
+        self._clock.wait_until(min(max(self.due, now), now + timeout))
+        if self._clock.now() < self.due:
+            return 0
+        self.number += 1
+        self.due = self._clock.now() + self.interval
+        stamp = nan if self.stamped is None else self.number * self.stamped
+        for name, value in self.sensors(self._clock.now()).items():
+            self.sensed[name].accept(np.asarray(value), self._clock.now(), stamp)
+        return 1
+
+
+def paced(
+    interval: float, *, alone: bool = True, lock_step: bool = False, stamped: float | None = None, **options: Any
+) -> tuple[Runtime, PacingBridge, SimulatedClock]:
+    scenario, clock = ServoScenario(rate=RATE), SimulatedClock()
+    target = DpsAlone(scenario) if alone else scenario.build()
+    bridge = PacingBridge(clock, interval=interval, stamped=stamped)
+    interface = scenario.interface()
+    if lock_step:
+        interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
+    runtime = Runtime(
+        target,
+        bridge,
+        period=PERIOD,
+        clock=clock,
+        pace="position",
+        patience=1e6 if lock_step else 3.0,
+        guards=Guards(interface, PERIOD, **options),
+        continuity={"velocity": ("speed", 50.0)},
+    )
+    runtime.write({"u.target": [0.6, -0.4], "dps.gain": 1.0})
+    return runtime, bridge, clock
+
+
+def rates(bridge: ScriptedBridge) -> np.ndarray:
+    """The largest rate of each step of the commands, by the clock."""
+    times = np.array([time for time, _ in bridge.sent])
+    commands = np.array([command["velocity"] for _, command in bridge.sent])
+    return np.asarray(np.abs(np.diff(commands, axis=0)).max(axis=1) / np.diff(times))
+
+
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("interval", [0.05, 0.2, 0.5, 1.0, 2.0])
+def test_rate_of_commands_holds_by_the_clock_at_any_pace(interval: float, alone: bool) -> None:
+    runtime, bridge, clock = paced(interval * PERIOD, alone=alone, pace_tolerance=inf)
+    runtime.take_over(timeout=1.0)
+    begin = clock.now()
+    runtime.run(seconds=0.15)
+    assert rates(bridge).max() <= RATE * (1.0 + 1e-9)
+    # As quick as allowed: in 0.15 s by 0.3 m/s, or at half the pace by as much as half of the periods allow.
+    reached = bridge.sent[-1][1]["velocity"][0]
+    assert reached == pytest.approx(RATE * (clock.now() - begin) * min(1.0, 1.0 / interval), rel=0.03)
+
+
+def test_rate_of_commands_holds_in_bursts() -> None:
+    runtime, bridge, clock = paced(PERIOD, pace_tolerance=inf)
+    runtime.take_over(timeout=1.0)
+    random = np.random.default_rng(3)
+    for _ in range(200):
+        bridge.interval = PERIOD * random.choice([0.0, 1e-4, 0.01, 0.3, 0.9, 2.5])
+        runtime.run(cycles=1)
+    times = np.array([time for time, _ in bridge.sent])
+    steps = np.abs(np.diff([command["velocity"] for _, command in bridge.sent], axis=0)).max(axis=1)
+    # The limiter waits for a thousandth of a period before it counts any time.
+    assert (steps <= RATE * np.minimum(np.diff(times) + 1e-3 * PERIOD, PERIOD) * (1.0 + 1e-9)).all()
+    assert steps.sum() > 0.5 * RATE * np.minimum(np.diff(times), PERIOD).sum()
+
+
+def test_cycles_run_by_hand_move_no_faster_than_the_clock() -> None:
+    scenario, clock = ServoScenario(rate=RATE), SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, lambda t: {"position": [0.05, 0.0], "speed": [0.0, 0.0]})
+    runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock, continuity={"velocity": ("speed", 50.0)})
+    runtime.write({"u.target": [0.6, -0.4]})
+    runtime.cycle()
+    runtime.switch("real")
+    for _ in range(100):
+        runtime.run(cycles=1)  # begins at once
+        clock.advance(0.1 * PERIOD)
+    commands = np.array([command["velocity"] for _, command in bridge.sent])
+    assert np.abs(np.diff(commands, axis=0)).max() <= 0.1 * RATE * PERIOD * (1.0 + 1e-9)
+    assert commands[-1, 0] == pytest.approx(RATE * PERIOD * (1.0 + 0.1 * 99))
+
+
+@pytest.mark.parametrize("interval", [0.2, 0.5, 2.0])
+@pytest.mark.parametrize("alone", [True, False])
+def test_switch_is_refused_at_another_pace(interval: float, alone: bool) -> None:
+    runtime, bridge, _ = paced(interval * PERIOD, alone=alone)
+    with pytest.raises(SwitchRefusedError, match=f"position come every {interval:g} ms, but the period"):
+        runtime.take_over(timeout=0.5)
+    assert bridge.sent == []
+    assert runtime.statistics.level == "error"
+    assert "came at another pace than the period" in str(runtime.statistics)
+
+
+@pytest.mark.parametrize("interval", [0.95, 1.0, 1.05])
+def test_clock_that_differs_by_some_per_cent_is_accepted(interval: float) -> None:
+    runtime, bridge, _ = paced(interval * PERIOD)
+    runtime.take_over(timeout=0.5)
+    runtime.run(cycles=500)
+    assert runtime.guards.latched == () and runtime.statistics.level == "ok"
+    assert len(bridge.sent) == 501
+
+
+@pytest.mark.parametrize("interval", [0.2, 2.0])
+def test_pace_that_changes_latches_until_it_is_right_again(interval: float) -> None:
+    runtime, bridge, _ = paced(PERIOD)
+    runtime.take_over(timeout=0.5)
+    runtime.run(cycles=100)
+    bridge.interval = interval * PERIOD
+    runtime.run(cycles=WINDOW)
+    assert [fault.kind for fault in runtime.guards.latched] == ["pace"]
+    with pytest.raises(SwitchRefusedError, match="give the machine and the deployment the same period"):
+        runtime.reset()
+    bridge.interval = PERIOD
+    runtime.run(cycles=WINDOW)
+    runtime.reset()
+    runtime.run(cycles=WINDOW)
+    assert runtime.guards.latched == ()
+
+
+@pytest.mark.parametrize("interval", [1e-2, 1.0, 1e3])
+def test_in_lock_step_the_stamps_of_the_machine_tell_the_time(interval: float) -> None:
+    runtime, bridge, _ = paced(interval * PERIOD, lock_step=True, stamped=PERIOD)
+    runtime.take_over(timeout=0.5)
+    runtime.run(cycles=100)
+    commands = np.array([command["velocity"][0] for _, command in bridge.sent])
+    assert commands == pytest.approx(RATE * PERIOD * np.arange(1.0, 102.0).clip(max=275.0))
+    assert runtime.guards.latched == ()
+
+
+def test_in_lock_step_another_period_of_the_machine_latches() -> None:
+    runtime, bridge, _ = paced(PERIOD, lock_step=True, stamped=0.2 * PERIOD)
+    runtime.take_over(timeout=0.5)
+    runtime.run(cycles=SETTLED)
+    commands = np.array([command["velocity"] for _, command in bridge.sent])
+    assert np.abs(np.diff(commands, axis=0)).max() <= 0.2 * RATE * PERIOD * (1.0 + 1e-9)
+    assert [fault.kind for fault in runtime.guards.latched] == ["pace"]
+
+
+def test_in_lock_step_without_stamps_every_message_is_a_period() -> None:
+    runtime, bridge, _ = paced(0.1 * PERIOD, lock_step=True)
+    runtime.take_over(timeout=0.5)
+    runtime.run(cycles=100)
+    assert bridge.sent[-1][1]["velocity"][0] == pytest.approx(101 * RATE * PERIOD)
+
+
+def test_pace_is_reported_while_nothing_is_on_real() -> None:
+    runtime, bridge, _ = paced(0.2 * PERIOD, alone=False)
+    runtime.run(cycles=WINDOW)
+    assert [fault.kind for fault in runtime.guards.log] == ["pace"]
+    runtime.switch("shadow")
+    runtime.run(cycles=5)
+    assert runtime.guards.latched == () and bridge.sent == []
+
+
+def test_commands_once_per_period_are_limited_as_without_times() -> None:
+    sent = []
+    for at in (nan, 0.0):
+        guards = Guards(ServoScenario(rate=RATE).interface(), PERIOD)
+        guards.start("velocity", [0.0, 0.0])
+        received = {name: ReceivedSignal(np.zeros(2), arrived=0.0, count=1) for name in ("position", "speed")}
+        commands = []
+        for k in range(200):
+            wanted = {"velocity": np.sin(0.02 * k * np.array([1.0, 3.0]))}
+            verdict = guards.check(0.0, received, wanted, at=at + k * PERIOD)
+            commands.append(verdict.actuation["velocity"])
+        sent.append(commands)
+    assert np.array_equal(*sent)
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_rate_holds_against_a_real_machine_that_is_five_times_quicker(alone: bool) -> None:
+    scenario = ServoMachineScenario(rate=RATE)
+    target = DpsAlone(scenario) if alone else scenario.build()
+    deployment = Deployment.of(scenario, period=5.0 * PERIOD)
+    with Hub(port=0, protect=[COMMAND]) as hub, MachineProcess(scenario, hub.url, period=PERIOD):
+        ear = Ear(hub.url)
+        values = {"u.target": [0.6, -0.4], "dps.gain": 1.0}
+        with scenario.deploy(hub.url, target=target, deployment=deployment, values=values) as runtime:
+            runtime.take_over()
+            runtime.run(cycles=200)
+        heard = len(ear.listen(lambda: len(ear.utimes) > 200)) // 2
+    times = 1e-6 * np.array(ear.utimes[:heard])
+    commands = np.array(ear.torques).reshape(-1, 2)[:heard]
+    # Between any two commands, by their own stamps, of which each may come late by a cycle.
+    for later in range(1, heard):
+        moved = np.abs(commands[later] - commands[:later]).max(axis=1)
+        assert (moved <= RATE * (times[later] - times[:later] + 2.0 * PERIOD)).all()
+    assert np.abs(commands[-2]).max() > 0.1
