@@ -22,6 +22,10 @@ from vtbdrake.components.shadows import sunlit
 BOXES = [((0.0, 0.0, -0.2), (2.0, 2.0, 0.4)), ((0.3, 0.2, 0.5), (0.4, 0.4, 0.01)), ((-0.4, -0.3, 0.9), (0.5, 0.5, 0.5))]
 
 
+# m, between the points of the wall.
+SPACING = 1.94 / 149
+
+
 @pytest.fixture(scope="module")
 def scene() -> tuple[SceneGraph, QueryObject]:
     check_rendering()
@@ -55,11 +59,10 @@ def test_shadows_are_those_of_the_geometry(scene: tuple, angle_deg: float) -> No
     # Beside the wall, the lit top of the box.
     top = np.column_stack((0.24 * grid[:, 0] - 0.4, 0.24 * grid[:, 1] - 0.3, np.full(len(grid), 1.15)))
     points = np.vstack((wall, top))
-    share = sunlit(scene[1], renderer="sun", points_W=points, direction=direction, reach=50.0)
-    # At edges, the two may differ by some pixels of the sun's image.
-    pixel = 3.0 / 512
-    surely = np.any([meets_box(points, -direction, *box, -3 * pixel) for box in BOXES], axis=0)
-    perhaps = np.any([meets_box(points, -direction, *box, 3 * pixel) for box in BOXES[1:]], axis=0)
+    spacing = np.full(len(points), SPACING)
+    share = sunlit(scene[1], renderer="sun", points_W=points.T, spacing=spacing, direction=direction, reach=50.0)
+    surely = np.any([meets_box(points, -direction, *box, -2 * SPACING) for box in BOXES], axis=0)
+    perhaps = np.any([meets_box(points, -direction, *box, 2 * SPACING) for box in BOXES[1:]], axis=0)
     lit = ~perhaps & ((np.abs(points[:, :2]) < 0.95).all(axis=1))
     assert share[surely].max(initial=0.0) == 0.0
     assert lit.mean() > 0.5
@@ -69,5 +72,6 @@ def test_shadows_are_those_of_the_geometry(scene: tuple, angle_deg: float) -> No
 
 
 def test_no_points_have_no_shadows(scene: tuple) -> None:
-    nothing = sunlit(scene[1], renderer="sun", points_W=np.zeros((0, 3)), direction=(0.0, 0.0, -1.0), reach=50.0)
+    none = {"points_W": np.zeros((3, 0)), "spacing": np.zeros(0)}
+    nothing = sunlit(scene[1], renderer="sun", **none, direction=(0.0, 0.0, -1.0), reach=50.0)
     assert nothing.shape == (0,)

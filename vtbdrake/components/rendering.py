@@ -11,7 +11,7 @@ import copy
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,23 +93,20 @@ class Illumination:
         """Return whether there is light beside the sun's."""
         return (bool(self.light) and self.light[10] > 0.0) or self.lamp > 0.0
 
-    def renderers(self) -> dict[str, RenderEngine]:
-        """Return two of Drake's VTK renderers, without a display: one in sunlight, one in all other light."""
+    def renderer(self, name: str) -> RenderEngine:
+        """Return one of Drake's VTK renderers, without a display: `SUN` in sunlight, `FILL` in all other light."""
         from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams
 
         sky = RenderEngineVtkParams().default_clear_color
         sun, *fill = light_sources(self.light) if self.light else [LightParameter()]
         if self.lamp > 0.0:
             fill += [LightParameter(type="point", intensity=self.lamp, attenuation_values=[0.0, 0.0, 1.0])]
-        backgrounds = {SUN: np.asarray(self.light[11:14] if self.light else sky), FILL: np.zeros(3)}
-        made = {}
-        for name, lights in {SUN: [sun], FILL: fill or [LightParameter(intensity=0.0)]}.items():
-            for light in lights:
-                light.intensity *= self.exposure
-            background = np.minimum(self.exposure * backgrounds[name], 1.0)
-            params = RenderEngineVtkParams(backend="EGL", lights=lights, default_clear_color=background)
-            made[name] = MakeRenderEngineVtk(params)
-        return made
+        lights = [sun] if name == SUN else fill or [LightParameter(intensity=0.0)]
+        for light in lights:
+            light.intensity *= self.exposure
+        background = np.asarray(self.light[11:14] if self.light else sky) if name == SUN else np.zeros(3)
+        shown = np.minimum(self.exposure * background, 1.0)
+        return MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL", lights=lights, default_clear_color=shown))
 
 
 class RenderedScene:
@@ -121,13 +118,14 @@ class RenderedScene:
     def __init__(self) -> None:
         self._version: GeometryVersion | None = None
         self._illumination: Illumination | None = None
+        self._renderers: list[str] = []
 
     def __deepcopy__(self, memo: object) -> RenderedScene:
         # Each Context has its own, made at its first image: a renderer belongs to one thread at a time.
         return RenderedScene()
 
     def view(self, query: QueryObject, illumination: Illumination) -> QueryObject:
-        """Return the scene of ``query`` for rendering with `SUN` and `FILL`, in its present poses.
+        """Return the scene of ``query`` for rendering with `SUN`, `FILL` and `darker`, in its present poses.
 
         The inside of primitive shapes can be found by ``ComputeSignedDistanceToPoint``.
 
@@ -140,16 +138,32 @@ class RenderedScene:
         if self._version is None or not self._version.IsSameAs(inspector.geometry_version(), Role.kPerception):
             self._build(inspector)
         if illumination != self._illumination:
-            for name, renderer in illumination.renderers().items():
-                if self._scene_graph.HasRenderer(self._context, name):
-                    self._scene_graph.RemoveRenderer(self._context, name)
-                self._scene_graph.AddRenderer(self._context, name, renderer)
-            self._illumination = illumination
+            for name in self._renderers:
+                self._scene_graph.RemoveRenderer(self._context, name)
+            self._illumination, self._renderers = illumination, []
+            for name in (SUN, FILL):
+                self._add(name, illumination.renderer(name))
         poses = FramePoseVector()
         for theirs, ours in self._frames:
             poses.set_value(ours, query.GetPoseInWorld(theirs))
         self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
         return self._scene_graph.get_query_output_port().Eval(self._context)
+
+    def darker(self, name: str, factor: float) -> str:
+        """Return the name of a renderer like `SUN` or `FILL` in the last view, with an exposure divided by ``factor``.
+
+        It is made when it is first asked for.
+        """
+        darker = f"{name}/{factor:g}"
+        if darker not in self._renderers:
+            assert self._illumination is not None
+            light = replace(self._illumination, exposure=self._illumination.exposure / factor)
+            self._add(darker, light.renderer(name))
+        return darker
+
+    def _add(self, name: str, renderer: RenderEngine) -> None:
+        self._scene_graph.AddRenderer(self._context, name, renderer)
+        self._renderers.append(name)
 
     def _build(self, inspector: SceneGraphInspector) -> None:
         """Copy all geometry with a perception role; the ids are plain numbers, which keep nothing alive."""
@@ -177,3 +191,4 @@ class RenderedScene:
         self._scene_graph, self._source, self._frames = scene_graph, source, tuple(frames.items())
         self._context = scene_graph.CreateDefaultContext()
         self._version, self._illumination = copy.copy(inspector.geometry_version()), None
+        self._renderers = []

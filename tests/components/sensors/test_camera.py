@@ -19,6 +19,8 @@ from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, SpatialIner
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+from scipy.ndimage import distance_transform_edt
+from scipy.stats import norm
 
 from vtbdrake.components.environment import Haze, Light, LightConfig
 from vtbdrake.components.rendering import RenderingError
@@ -39,7 +41,15 @@ FRONT = LightConfig(direction=[1.0, 0.0, 0.0], shadows=False)
 class Scene:
     """A grey box (0.2 x 0.4 x 0.2) whose front is 2 m ahead of the camera, and moves to the left with 0.5 m/s."""
 
-    def __init__(self, light: LightConfig | None = FRONT, haze: Haze | None = None, *, size: float = 1.0, **options):
+    def __init__(
+        self,
+        light: LightConfig | None = FRONT,
+        haze: Haze | None = None,
+        *,
+        size: float = 1.0,
+        plate: bool = False,
+        **options,
+    ):
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         plant = self.plant
@@ -47,6 +57,9 @@ class Scene:
         joint = plant.AddJoint(PrismaticJoint("slide", plant.world_frame(), body.body_frame(), [0.0, 1.0, 0.0]))
         X_BG = RigidTransform([DISTANCE + 0.1, 0.0, 0.0])
         plant.RegisterVisualGeometry(body, X_BG, Box(0.2, size * 0.4, size * 0.2), "box", [0.5, 0.5, 0.5, 1.0])
+        if plate:  # Between the sun and the box, beside the camera's view.
+            X_WP = RigidTransform([1.5, -0.35, 0.2])
+            plant.RegisterVisualGeometry(plant.world_body(), X_WP, Box(0.01, 0.2, 0.2), "plate", [0.5, 0.5, 0.5, 1.0])
         frame = plant.AddFrame(FixedOffsetFrame("camera", plant.world_frame(), X_WC))
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
         plant.Finalize()
@@ -214,6 +227,54 @@ def test_noise_has_the_variance_of_a_linear_camera() -> None:
     assert (shown[..., 3] == 255).all()
 
 
+def test_noise_does_not_darken_what_is_saturated() -> None:
+    # Twice the full scale, and 10 deviations above it.
+    light = LightConfig(direction=[1.0, 0.0, 0.0], intensity=4.0, shadows=False)
+    scene = Scene(light, size=20.0, photon_noise=8.0, errors=ErrorModel(noise=20.0, seed=1))
+    (shown,) = images(scene, scene.context(), [0.01])
+    assert shown.min() == 255
+
+
+@pytest.mark.parametrize("brightness", [0.98, 1.0, 1.02, 1.1])
+def test_pixels_about_full_scale_are_clipped_normal_numbers(brightness: float) -> None:
+    light = LightConfig(direction=[1.0, 0.0, 0.0], intensity=2.0 * brightness, shadows=False)
+    scene = Scene(light, size=20.0, errors=ErrorModel(noise=10.0, seed=1))
+    (shown,) = images(scene, scene.context(), [0.01])
+    # The normal distribution above and below full scale; the brightness itself is rendered to about 1 %.
+    z = 25.5 * (brightness - 1.0)
+    below = -10.0 * (z * norm.cdf(-z) - norm.pdf(z))
+    assert (255.0 - shown[..., :3]).mean() == pytest.approx(below, abs=1.3)
+
+
+@pytest.mark.parametrize("intensity", [3.0, 8.0, 30.0, 90.0])
+def test_haze_veils_what_would_be_saturated_without_it(intensity: float) -> None:
+    b, airlight = 2.2, 0.1
+    light = LightConfig(direction=[1.0, 0.0, 0.0], intensity=intensity, shadows=False)
+    scene = Scene(light, haze=Haze(extinction=b, airlight=(airlight,) * 3), size=20.0)
+    left = np.exp(-b * DISTANCE)
+    expected = 255.0 * (0.5 * intensity * left + airlight * (1.0 - left))
+    assert scene.render(scene.context())[57, 83] == pytest.approx(expected, rel=0.02, abs=1.0)
+
+
+def test_bright_airlight_saturates_only_where_it_is_deep() -> None:
+    b, airlight = 0.1, 3.0
+    scene = Scene(haze=Haze(extinction=b, airlight=(airlight,) * 3), size=1.0)
+    seen, left = scene.render(scene.context()), np.exp(-b * DISTANCE)
+    assert seen[57, 83] == pytest.approx(255.0 * (0.5 * left + airlight * (1.0 - left)), abs=1.0)
+    assert seen[0, 0] == 255
+
+
+def test_edges_of_shadows_are_as_bright_as_their_light() -> None:
+    seen = {}
+    for intensity in (1.0, 6.0):
+        light = LightConfig(direction=[1.0, 0.4, -0.2], intensity=intensity)
+        scene = Scene(light, size=20.0, plate=True)
+        seen[intensity] = scene.render(scene.context())
+    assert (seen[1.0] == 0).any() and len(np.unique(seen[1.0])) > 5
+    # Each count is right to half a one.
+    np.testing.assert_allclose(seen[6.0], np.minimum(6 * seen[1.0], 255), atol=6 * 0.5 + 0.5 + 2.0)
+
+
 def test_black_stays_black_without_noise_sources() -> None:
     scene = Scene(photon_noise=8.0)
     (shown,) = images(scene, scene.context(), [0.01])
@@ -338,3 +399,56 @@ def test_lone_box_is_not_in_its_own_shadow(angle_deg: float) -> None:
     shaded, flat = (scene.render(scene.context()) for scene in seen)
     assert flat.max() > 0
     np.testing.assert_array_equal(shaded, flat)
+
+
+def posts(count: int = 40) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return centres and sizes of posts up to 190 m ahead of a camera that looks along x."""
+    rng = np.random.default_rng(0)
+    distances = np.concatenate([rng.uniform(4.0, 15.0, 9), rng.uniform(4.0, 190.0, count - 9)])
+    angles, widths, heights = (rng.uniform(*limits, count) for limits in ((-0.6, 0.6), (0.1, 0.6), (0.3, 6.0)))
+    centers = np.column_stack((distances * np.cos(angles), distances * np.sin(angles), heights / 2.0))
+    return list(zip(centers, np.column_stack((widths, widths, heights)), strict=True))
+
+
+@pytest.mark.parametrize("direction", [(0.3, 0.5, -0.8), (-0.5, 0.5, -0.4), (0.2, 1.0, -0.15)])
+def test_shadows_on_ground_up_to_the_horizon_are_right_to_a_pixel(direction: tuple[float, ...]) -> None:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    world, grey = plant.world_body(), [0.5, 0.5, 0.5, 1.0]
+    plant.RegisterVisualGeometry(world, RigidTransform([0.0, 0.0, -0.5]), Box(800.0, 800.0, 1.0), "ground", grey)
+    for k, (center, size) in enumerate(posts()):
+        plant.RegisterVisualGeometry(world, RigidTransform(center), Box(*size), f"post {k}", grey)
+    plant.Finalize()
+    X_WC = RigidTransform(RollPitchYaw(-np.pi / 2 - 0.1, 0.0, -np.pi / 2), [0.0, 0.0, 2.0])
+    info = CameraInfo(320, 240, 0.8)
+    camera = Camera(plant, plant.world_frame(), X_FC=X_WC, period=PERIOD, info=info, depth=True, far=400.0)
+    builder.AddNamedSystem("camera", camera)
+    light = builder.AddNamedSystem("light", Light(LightConfig(direction=list(direction))))
+    connect_camera(builder, camera, scene_graph, light=light)
+    simulator = Simulator(builder.Build())
+    simulator.Initialize()
+    context = camera.GetMyContextFromRoot(simulator.get_context())
+    image = camera.GetOutputPort("color_image").Eval(context).data[..., 0]
+    depth = camera.GetOutputPort("depth_image").Eval(context).data[..., 0]
+    # The truth: rays from the ground that each pixel shows to the sun.
+    u, v = np.meshgrid(np.arange(320) + 0.5 - info.center_x(), np.arange(240) + 0.5 - info.center_y())
+    rays = np.dstack((u / info.focal_x(), v / info.focal_y(), np.ones_like(u)))
+    points = rays * np.where(np.isfinite(depth), depth, 0.0)[..., np.newaxis] @ X_WC.rotation().matrix().T
+    points += X_WC.translation()
+    ground = np.isfinite(depth) & (np.abs(points[..., 2]) < 2e-3) & (depth < 200.0)
+    points[..., 2] = 0.0
+    shaded = np.zeros(depth.shape, dtype=bool)
+    for center, size in posts():
+        first, second = (((center + side * size / 2) - points) / -np.array(direction) for side in (-1.0, 1.0))
+        enters, leaves = np.minimum(first, second).max(axis=2), np.maximum(first, second).min(axis=2)
+        shaded |= (enters < leaves) & (leaves > 1e-6)
+        # The lowest row of pixels of a post.
+        ground &= (np.abs(points - center) > size / 2 + 0.01).any(axis=2)
+    lit = ground & ~shaded
+    dark = image < 0.5 * np.median(image[lit])
+    wrong = ground & (dark != shaded)
+    away = np.where(shaded, distance_transform_edt(~lit), distance_transform_edt(~(ground & shaded)))
+    assert np.sum(ground & shaded) > 2000
+    # With the sun 8 deg above the horizon, a pixel across the light is up to 7 pixels on the ground.
+    assert np.sum(away[wrong] > 1.5) < 0.005 * np.sum(ground & shaded)
+    assert np.sum(wrong) < 0.1 * np.sum(ground & shaded)

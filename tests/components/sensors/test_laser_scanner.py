@@ -226,6 +226,16 @@ def test_noise_is_that_of_the_error_model_and_repeatable() -> None:
         assert not np.allclose(first.ranges, third.ranges, atol=1e-4)
 
 
+def test_limits_are_those_of_the_measured_ranges() -> None:
+    """A wall at 4 m, 0.4 deviations of the noise from the limits."""
+    for limits in ({"max_range": 4.02}, {"min_range": 3.98}):
+        config = replace(CONFIG, reflectivity=1.0, azimuth=0.02, elevation=0.02, **limits)
+        scan = world(wall(), config=config, errors=ErrorModel(noise=0.05)).scans(0.2, X_WT=at(4.5))[-1]
+        assert config.min_range <= scan.ranges.min() and scan.ranges.max() <= config.max_range
+        # 66 % of normal errors are below 0.4 deviations.
+        assert len(scan.ranges) == pytest.approx(0.655 * 988, rel=0.1)
+
+
 def test_outliers_are_as_many_and_as_large_as_declared() -> None:
     of = world(wall(), errors=ErrorModel(outlier_probability=0.2, outlier_size=0.3))
     scans = of.scans(1.0, X_WT=at(4.5))

@@ -44,7 +44,7 @@ def extinction_of_visibility(visibility: float) -> float:
 
 
 def hazed(
-    image: NDArray[np.float64], *, distance: NDArray[np.float64], extinction: float, airlight: ArrayLike
+    image: NDArray[np.floating], *, distance: NDArray[np.float64], extinction: float, airlight: ArrayLike
 ) -> NDArray[np.float64]:
     """Return what a camera sees of a scene through homogeneous haze.
 

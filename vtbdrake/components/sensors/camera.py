@@ -53,6 +53,8 @@ if TYPE_CHECKING:
 # Channels of a camera's stream of random numbers.
 _PIXEL_CHANNEL, _DROPOUT_CHANNEL = 0, 2
 _FULL_SCALE = 255.0
+# What is too bright is rendered again with these parts of the exposure.
+_BRACKET = (4.0, 16.0, 64.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,16 +96,18 @@ class Camera(LeafSystem):
     less.
 
     The world is rendered by VTK in the light of the port ``light`` (without it, a white light from the camera, before
-    Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail, bright
-    ones saturate. The sun throws shadows that are right to a pixel or two (`sunlit`); a lamp and the Earth throw none.
-    Exposure times have no length: there is no motion blur. Haze is added to the 8-bit image, by the distance along
-    each ray. A surface within the distance ``near`` of the camera is not seen.
+    Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail. The sun
+    throws shadows that are right to about a pixel (`sunlit`); a lamp and the Earth throw none. Exposure times have no
+    length: there is no motion blur. Haze veils by the distance along each ray. A surface within the distance ``near``
+    of the camera is not seen.
 
     The count y of a pixel is that of the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
     count m, n of N(0, 1), full scale S = 255, and g the gain:
 
-        y = round(m + sigma n),   sigma^2 = (g noise)^2 + g photon_noise^2 m / S
+        y = clip(round(m + sigma n), 0, S),   sigma^2 = (g noise)^2 + g photon_noise^2 m / S
 
+    A pixel saturates last: m is the sum of all light after shadows and haze, and may exceed S, up to 64 S. What is
+    brighter than S is rendered again with a quarter of the exposure, as often as needed, so that m is known to 1 %.
     noise is the standard deviation of the read noise, and photon_noise that of the shot noise of a pixel at full scale,
     both at gain 1, in counts. So gain brightens both, exposure only the image. Errors are otherwise those of the
     `ErrorModel`: latency in periods, and drop-out, after which the last image stays; all a function of the seed.
@@ -236,8 +240,10 @@ class Camera(LeafSystem):
         Raises:
             RenderingError: This machine cannot render, or the camera is inside a body.
         """
-        color, _ = self._see(context)
-        return _color_image(color)
+        expected, _ = self._see(context)
+        image = ImageRgba8U(self._width, self._height)
+        image.mutable_data[:] = _counts(expected)
+        return image
 
     def resume(self, context: Context, image: ImageRgba8U | ImageDepth32F) -> None:
         """Continue like a camera that has shown ``image`` last, which also counts as the images in transit."""
@@ -259,8 +265,8 @@ class Camera(LeafSystem):
         values: NDArray[np.float64] = context.get_numeric_parameter(0).value()
         return values
 
-    def _see(self, context: Context) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
-        """Return the colour image without noise, (h, w, 4), and the depth image, (h, w), if there is one."""
+    def _see(self, context: Context) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return the expected counts before saturation, (h, w, 3), and the depth image, (h, w), if there is one."""
         values = self._parameters(context)
         light = tuple(self._light_port.Eval(context).tolist()) if self._light_port.HasValue(context) else ()
         haze = self._haze_port.Eval(context) if self._haze_port.HasValue(context) else np.zeros(5)
@@ -270,19 +276,21 @@ class Camera(LeafSystem):
         view = scene.view(query, illumination)
         X_WC = _pose_of(query, self._frame_number) @ pose_from_array(values[:6])
         self._check_outside(view, X_WC.translation())
-        camera = _RenderCamera(view, CameraInfo(self._width, self._height, *values[6:10]), self._near, self._far, X_WC)
-        color = camera.color(SUN)
+        info = CameraInfo(self._width, self._height, *values[6:10])
+        camera = _RenderCamera(scene, view, info, self._near, self._far, X_WC)
+        # Where nothing changes a pixel that is saturated, there is no need to know how bright it is.
+        bracket = _BRACKET if illumination.shadows or haze[0] or values[13] or values[14] else ()
+        expected = camera.color(SUN, bracket)
         depth = camera.depth() if illumination.shadows or haze[0] or self._depth is not None else None
         if depth is not None and illumination.shadows:
-            _shade(color, camera, depth, direction=light[:3], reach=self._far)
+            _shade(expected, camera, depth, direction=light[:3], reach=self._far)
         if illumination.fills:
-            color[..., :3] += np.minimum(camera.color(FILL)[..., :3], 255 - color[..., :3])
+            expected += camera.color(FILL, bracket)
         if depth is not None and haze[0]:
-            distance = depth * np.linalg.norm(camera.rays_C, axis=2)
-            airlight = np.minimum(_FULL_SCALE * illumination.exposure * haze[2:], _FULL_SCALE)
-            mixed = hazed(color[..., :3].astype(float), distance=distance, extinction=haze[0], airlight=airlight)
-            color[..., :3] = np.rint(mixed)
-        return color, depth if self._depth is not None else None
+            distance = depth * np.linalg.norm(camera.rays_C, axis=0)
+            airlight = _FULL_SCALE * illumination.exposure * haze[2:]
+            expected = hazed(expected, distance=distance, extinction=haze[0], airlight=airlight).astype(np.float32)
+        return expected, depth if self._depth is not None else None
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
         for found in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
@@ -295,17 +303,14 @@ class Camera(LeafSystem):
 
     def _take(self, context: Context, tick: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return the colour image of a tick with its noise, and the depth image."""
-        color, depth = self._see(context)
+        expected, depth = self._see(context)
         values = self._parameters(context)
         gain, noise, photon_noise, seed = values[[11, 13, 14, 17]].tolist()
         if noise or photon_noise:
-            expected = color[..., :3].astype(np.float32)
             generator = noise_generator(seed=int(seed), stream=self._stream(), tick=tick, channel=_PIXEL_CHANNEL)
             sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / _FULL_SCALE * expected)
-            counts = expected + sigma * generator.standard_normal(expected.shape, np.float32)
-            color = np.array(color)
-            color[..., :3] = np.clip(np.rint(counts), 0.0, _FULL_SCALE)
-        return color, np.zeros((0, 0), np.float32) if depth is None else depth
+            expected += sigma * generator.standard_normal(expected.shape, np.float32)
+        return _counts(expected), np.zeros((0, 0), np.float32) if depth is None else depth
 
     def _tick(self, context: Context) -> int:
         return round(context.get_time() / self._period)
@@ -368,44 +373,72 @@ def _pose_of(query: QueryObject, frame_number: int) -> RigidTransform:
     return query.GetPoseInWorld(frame)
 
 
-def _color_image(color: NDArray[np.uint8]) -> ImageRgba8U:
-    height, width = color.shape[:2]
-    image = ImageRgba8U(width, height)
-    image.mutable_data[:] = color
-    return image
+def _counts(expected: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return what opaque pixels count, (h, w, 4): saturated and rounded. The argument is used up."""
+    counts = np.full((*expected.shape[:2], 4), 255, np.uint8)
+    counts[..., :3] = np.rint(np.clip(expected, 0.0, _FULL_SCALE, out=expected), out=expected)
+    return counts
 
 
 class _RenderCamera:
     """Renders colour and depth of a scene with one camera."""
 
-    def __init__(self, view: QueryObject, info: CameraInfo, near: float, far: float, X_WC: RigidTransform) -> None:
-        self.view, self._info, self._near, self._far, self.X_WC = view, info, near, far, X_WC
+    def __init__(
+        self,
+        scene: RenderedScene,
+        view: QueryObject,
+        info: CameraInfo,
+        near: float,
+        far: float,
+        X_WC: RigidTransform,
+    ) -> None:
+        self.view, self._scene, self._info, self._near, self._far, self.X_WC = view, scene, info, near, far, X_WC
         self._world = view.inspector().world_frame_id()
 
     def _core(self, renderer: str) -> RenderCameraCore:
         return RenderCameraCore(renderer, self._info, ClippingRange(self._near, self._far), RigidTransform())
 
-    def color(self, renderer: str) -> NDArray[np.uint8]:
-        """Return the colour image, shape (h, w, 4)."""
+    def color(self, renderer: str, bracket: Sequence[float]) -> NDArray[np.float32]:
+        """Return the counts of a renderer, shape (h, w, 3); 255 if too bright for the smallest exposure.
+
+        Args:
+            renderer: `SUN` or `FILL`.
+            bracket: Increasing numbers by which the exposure is divided for what was too bright.
+        """
+        counts = self._counts(renderer).astype(np.float32)
+        for factor in bracket:
+            if counts.max() < factor / 4.0 * _FULL_SCALE:
+                break
+            darker = np.float32(factor) * self._counts(self._scene.darker(renderer, factor))
+            # Brighter by more than rounding explains: saturated, or at an edge the mean of something saturated.
+            counts = np.where(darker > counts + 0.75 * factor, darker, counts)
+        return counts
+
+    def _counts(self, renderer: str) -> NDArray[np.uint8]:
         image = self.view.RenderColorImage(ColorRenderCamera(self._core(renderer), False), self._world, self.X_WC)
-        return np.array(image.data)
+        return image.data[..., :3]
 
     def depth(self) -> NDArray[np.float32]:
         """Return the depth image, shape (h, w)."""
         camera = DepthRenderCamera(self._core(SUN), DepthRange(self._near, self._far))
         return np.array(self.view.RenderDepthImage(camera, self._world, self.X_WC).data[..., 0])
 
+    @property
+    def focal(self) -> float:
+        """Return the larger focal length, in pixels."""
+        return float(max(self._info.focal_x(), self._info.focal_y()))
+
     @cached_property
     def rays_C(self) -> NDArray[np.float64]:
-        """Return the ray of each pixel up to z_C = 1, shape (h, w, 3)."""
+        """Return the ray of each pixel up to z_C = 1, shape (3, h, w)."""
         info = self._info
         x = (np.arange(info.width()) + 0.5 - info.center_x()) / info.focal_x()
         y = (np.arange(info.height()) + 0.5 - info.center_y()) / info.focal_y()
-        return np.dstack((*np.meshgrid(x, y), np.ones((y.size, x.size))))
+        return np.stack((*np.meshgrid(x, y), np.ones((y.size, x.size))))
 
 
 def _shade(
-    color: NDArray[np.uint8],
+    color: NDArray[np.float32],
     camera: _RenderCamera,
     depth: NDArray[np.float32],
     *,
@@ -415,12 +448,12 @@ def _shade(
     """Darken the pixels of ``color`` that are in shadow, in place."""
     # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
     depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
-    # All four bytes of a pixel at once; the last is its opacity.
-    visible = color.view(np.uint32)[..., 0] & np.frombuffer(b"\xff\xff\xff\x00", np.uint32) != 0
+    visible = (color[..., 0] > 0.0) | (color[..., 1] > 0.0) | (color[..., 2] > 0.0)
     bright = np.flatnonzero(visible & np.isfinite(depth) & (depth > 0.0))
-    points_C = camera.rays_C.reshape(-1, 3)[bright] * depth.ravel()[bright, np.newaxis]
-    points_W = points_C @ camera.X_WC.rotation().matrix().T + camera.X_WC.translation()
-    share = sunlit(camera.view, renderer=FILL, points_W=points_W, direction=direction, reach=reach)
+    points_C = camera.rays_C.reshape(3, -1)[:, bright] * depth.ravel()[bright]
+    points_W = camera.X_WC.rotation().matrix() @ points_C + camera.X_WC.translation()[:, np.newaxis]
+    spacing = depth.ravel()[bright].astype(float) / camera.focal
+    share = sunlit(camera.view, renderer=FILL, points_W=points_W, spacing=spacing, direction=direction, reach=reach)
     shaded = bright[share < 1.0]
-    pixels = color.reshape(-1, 4)
-    pixels[shaded, :3] = np.rint(pixels[shaded, :3] * share[share < 1.0, np.newaxis])
+    pixels = color.reshape(-1, 3)
+    pixels[shaded] *= share[share < 1.0, np.newaxis]

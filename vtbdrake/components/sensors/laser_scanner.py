@@ -66,9 +66,10 @@ class LaserScannerConfig:
     # Number of beams, one above the other, that turn together about z_L, as those of a spinning scanner; 0 for rows and
     # columns at about equal angular distances, which are scanned row by row.
     rows: int = 0
-    # Distance below which nothing is reported, in m.
+    # Measured distance below which nothing is reported, in m.
     min_range: float = 0.2
-    # Distance at which a white, perpendicular surface is just detected in clear space, in m.
+    # Distance at which a white, perpendicular surface is just detected in clear space, in m. Above it nothing is
+    # reported.
     max_range: float = 50.0
     # Share of the light that all surfaces reflect, diffusely.
     reflectivity: float = 0.5
@@ -179,7 +180,7 @@ class LaserScanner(LeafSystem):
     beside an edge may hit either side. Ranges between the two sides (mixed pixels) do not occur.
 
     An `ErrorModel` adds noise, outliers, bias, quantization (all in m) and drop-out to the ranges, ray by ray. A range
-    that is then below min_range is not reported.
+    that is then below min_range or above max_range is not reported.
 
     The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
     ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``scan_rows``,
@@ -383,7 +384,7 @@ class LaserScanner(LeafSystem):
             ranges = np.where(power >= distances**2, distances, inf)
         kept = np.flatnonzero(ranges < inf)
         ranges = _with_errors(ranges[kept], errors, generator)
-        reported = ranges >= config.min_range
+        reported = (config.min_range <= ranges) & (ranges <= config.max_range)
         return kept[reported], ranges[reported]
 
 
