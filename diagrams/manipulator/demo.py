@@ -204,13 +204,23 @@ class Demo:
         header = ("tracking error of the tip (mm)", "sim RMS", "sim max", "machine RMS", "machine max")
         print("\n" + table(header, rows) + "\n")
         contacts = [track.contact(self.along_x, self.scenario) for track in (simulated, real)]
+        # A law without inertia leaves the arm its own: it predicts the force at rest only.
+        statics = self.along_x.inertia == 0.0
         rows = []
         for t in INSTANTS:
             (predicted, in_sim), (_, on_machine) = (contact.at(t) for contact in contacts)
-            rows.append((f"{t:.1f} s", f"{predicted:.1f}", f"{in_sim:.1f}", f"{on_machine:.1f}"))
-        apart = [f"{rms(contact.felt - contact.predicted):.1f}" for contact in contacts]
-        rows.append(("RMS from the law", "", *apart))
-        print(table(("force on the wall (N)", "law and wall", "sim", "machine"), rows) + "\n")
+            law = "(in motion)" if statics and not contacts[0].rests_at(t) else f"{predicted:.1f}"
+            rows.append((f"{t:.1f} s", law, f"{in_sim:.1f}", f"{on_machine:.1f}"))
+        apart = [contact.felt - contact.predicted for contact in contacts]
+        if statics:
+            apart = [values[contact.rests] for values, contact in zip(apart, contacts, strict=True)]
+        rows.append(
+            (f"RMS from the law{' at rest' if statics else ''}", "", *(f"{rms(values):.1f}" for values in apart))
+        )
+        print(
+            table(("force on the wall (N)", f"{'statics of ' if statics else ''}law and wall", "sim", "machine"), rows)
+        )
+        print()
 
     def _report_timing(self, loop: Runtime) -> None:
         machine = self.machine.statistics()

@@ -29,6 +29,7 @@ PROGRAM = (SWING, CIRCLE, PRESS)
 FREE = (SWING, CIRCLE)
 
 _STEP = 1e-4  # s, of the prediction's integration
+_AT_REST = 1.0  # N/s; a force that changes less is that of a rest
 
 
 def trial_scenario(law: str) -> ManipulatorScenario:
@@ -193,8 +194,20 @@ class Contact:
 
     def at(self, clock: float) -> tuple[float, float]:
         """Return the predicted and the measured force at an instant, in N."""
-        k = int(np.abs(self.clock - clock).argmin())
+        k = self._index(clock)
         return float(self.predicted[k]), float(self.felt[k])
+
+    @property
+    def rests(self) -> NDArray[np.bool_]:
+        """Return where the predicted force does not change, shape (n,)."""
+        return np.abs(np.gradient(self.predicted, self.clock)) < _AT_REST
+
+    def rests_at(self, clock: float) -> bool:
+        """Return whether the predicted force does not change at an instant."""
+        return bool(self.rests[self._index(clock)])
+
+    def _index(self, clock: float) -> int:
+        return int(np.abs(self.clock - clock).argmin())
 
 
 def rms(values: NDArray[np.float64]) -> float:

@@ -250,14 +250,16 @@ class LoopStatistics:
         return statistics
 
     def __str__(self) -> str:
-        """Return a table, in microseconds."""
-        form = "{:9}" + "{:>9}" * 7
+        """Return a table, in microseconds; behind the numbers of warnings and errors the durations where they begin."""
+        form = "{:9}" + "{:>9}" * 5 + "{:>15}" * 2
         lines = [form.format("us", "mean", "p50", "p99", "p99.9", "max", "warnings", "errors")]
         for name, histogram in self.histograms.items():
             durations = [histogram.mean, *map(histogram.percentile, (50.0, 99.0, 99.9)), histogram.largest]
             threshold = self.thresholds[name]
             cells = [f"{1e6 * seconds:.0f}" for seconds in durations]
-            lines.append(form.format(name, *cells, threshold.warnings, threshold.errors))
+            counts = ((threshold.warnings, threshold.warning), (threshold.errors, threshold.error))
+            cells += [f"{count} > {1e6 * limit:.0f}" for count, limit in counts]
+            lines.append(form.format(name, *cells))
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
         lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level}")
         if self.off_pace:

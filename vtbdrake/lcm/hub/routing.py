@@ -104,7 +104,7 @@ class ProtectedChannel:
         """Remove a client that has disconnected; return whether it was the owner."""
         if client is not self.owner:
             return False
-        _log.warning("%s: its owner %s has disconnected", self.name, client.name)
+        _log.info("%s: its owner %s has disconnected", self.name, client.name)
         self.owner = None
         return True
 
@@ -123,8 +123,10 @@ class ProtectedChannel:
 
     def _set_owner(self, client: ClientConnection, now: float) -> None:
         if client is not self.owner:
-            before = "" if self.owner is None else f", previously {self.owner.name}"
-            _log.warning("%s: its owner is %s%s", self.name, client.name, before)
+            if self.owner is None:
+                _log.info("%s: its owner is %s", self.name, client.name)
+            else:
+                _log.warning("%s: its owner is %s, previously %s", self.name, client.name, self.owner.name)
         self.owner, self._statistics.owner, self._renewed = client, client.name, now
 
     def _reject(self, client: ClientConnection, what: str) -> None:
