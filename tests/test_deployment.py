@@ -58,9 +58,23 @@ class Machine:
         self.runtime.take_over(timeout=timeout, report=self.lines.append)
 
 
-def test_default_deployment_is_enough_without_limits() -> None:
+def test_default_deployment_is_enough_without_limits_and_protocol() -> None:
     deployment = Deployment.of(ServoScenario(rate=0.0))
     assert (deployment.period, deployment.continuity, deployment.pace) == (1e-3, {}, "")
+
+
+def test_command_that_may_jump_has_to_be_declared() -> None:
+    scenario = ServoMachineScenario(rate=0.0)
+    with pytest.raises(DeploymentError, match=r"velocity may be anywhere within its limits: .* or {'velocity': None}"):
+        Deployment.of(scenario, continuity={})
+    Deployment.of(scenario, continuity={"velocity": None})
+
+
+def test_limited_command_cannot_be_declared_to_jump() -> None:
+    scenario = Given(rate=2.0)
+    scenario.given = Deployment(continuity={"velocity": None})
+    with pytest.raises(DeploymentError, match="has a limited rate or acceleration, but no measurement to start from"):
+        Deployment.of(scenario)
 
 
 def test_limited_rate_without_continuity_is_refused() -> None:

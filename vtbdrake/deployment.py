@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.switching import check_continuity
+from vtbdrake.control.switching import Continuity, checked_continuity
 from vtbdrake.lcm.protocol import Protocol, protocol_of
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.state import Snapshot
@@ -55,7 +55,9 @@ class Deployment:
         period: The period of a cycle, in seconds.
         guards: Options of `Guards`, such as ``fallback`` and ``max_missed``.
         continuity: Actuator signal -> (sensor signal, largest difference): where actuator commands start from, see
-            `Runtime`. Required for each actuator signal whose rate or acceleration is limited.
+            `Runtime`. Required for each vector actuator signal of a protocol; None lets the commands of one jump when
+            it is switched to real, where no sensor signal tells what the machine does. (A limited rate or acceleration
+            needs one.)
         blocked_by: Returns why the machine behind a bridge must not be commanded yet, or None.
         pace: The sensor signal whose messages begin the cycles. If empty, the clock does.
         patience: The number of periods without such a message after which the clock begins a cycle.
@@ -66,7 +68,7 @@ class Deployment:
     protocol: Protocol | None = None
     period: float = 1e-3
     guards: Mapping[str, Any] = field(default_factory=dict)
-    continuity: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    continuity: Continuity = field(default_factory=dict)
     blocked_by: Callable[[Bridge], str | None] = _not_blocked
     pace: str = ""
     patience: float = 3.0
@@ -96,8 +98,8 @@ class Deployment:
         """Check that the DPS with this interface can run safely.
 
         Raises:
-            ValueError: The deployment or its protocol does not fit the signals, a limited actuator signal has no
-                continuity, or a silent machine would not be noticed.
+            ValueError: The deployment or its protocol does not fit the signals, an actuator signal has no continuity,
+                or a silent machine would not be noticed.
         """
         if self.protocol is not None:
             self.protocol.check(interface)
@@ -110,12 +112,19 @@ class Deployment:
                 "no sensor signal has a max_age, so a silent machine would not be noticed: give one to the signals "
                 f"that arrive regularly ({', '.join(signal.name for signal in interface.sense)})"
             )
-        check_continuity(interface, self.continuity)
-        for name in (signal.name for signal in interface.act):
-            if guards.limiters[name].needs_start and name not in self.continuity:
+        continued = checked_continuity(interface, self.continuity, period=self.period)
+        for signal in interface.act:
+            name = signal.name
+            if guards.limiters[name].needs_start and name not in continued:
                 raise ValueError(
                     f"the actuator signal {name} has a limited rate or acceleration, but no measurement to start from: "
                     f"give continuity={{{name!r}: (sensor signal, largest difference)}}"
+                )
+            if self.protocol is not None and signal.is_vector and name not in self.continuity:
+                raise ValueError(
+                    f"the first actuator command {name} may be anywhere within its limits: give "
+                    f"continuity={{{name!r}: (sensor signal, largest difference)}} with the sensor signal that tells "
+                    f"what the machine does, or {{{name!r}: None}} if it may jump"
                 )
 
     def _guards(self, interface: Interface) -> Guards:

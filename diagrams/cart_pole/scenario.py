@@ -122,6 +122,7 @@ class CartPoleScenario(Scenario):
             ),
             period=self.period,
             guards={"fallback": {"force": Zero()}},
+            continuity={"force": None},  # Nothing measures the force, which may jump.
             pace="joint_velocity",
         )
         return deployment.in_lock_step("joint_velocity") if self.lock_step else deployment

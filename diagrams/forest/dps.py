@@ -47,6 +47,7 @@ def make_deployment(scans: LcmMap, *, period: float) -> Deployment:
         ),
         period=PERIOD,
         guards={"fallback": {"route": Hold()}},
+        continuity={"route": None},  # It is the number of the advised route.
     )
 
 

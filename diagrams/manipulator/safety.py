@@ -15,8 +15,9 @@ from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, function
 from vtbdrake_diagrams.manipulator.laws import LAWS
 
-# The switch to real is refused where the command is further than this from the measured torque (N m).
-CONTINUITY = {"joint_torque": ("joint_torque_measured", 100.0)}
+# The switch to real is refused where the command is further from the measured torque than it may change in a period:
+# 6.4 N m in the shoulder, 0.8 N m in the wrist.
+CONTINUITY = {"joint_torque": "joint_torque_measured"}
 
 POSITION, VELOCITY = "joint_position", "joint_velocity"
 

@@ -19,7 +19,7 @@ from vtbdrake.components.sensors import (
     JointTorqueSensors,
 )
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.monitoring.residuals import ResidualConfig

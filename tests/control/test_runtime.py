@@ -259,12 +259,48 @@ def test_discontinuous_command_is_refused():
     runtime.cycle()
     runtime.switch("shadow")
     runtime.run(cycles=3)
-    assert "is 0.75 away from speed; 0.3 is allowed" in refusal(runtime)
+    assert "velocity[0] is 0.75 away from speed[0]; 0.3 is allowed" in refusal(runtime)
     runtime.target.write(runtime.context, {"dps.gain": 1.0})
     runtime.run(cycles=3)
     runtime.switch("real")
     runtime.run(cycles=1)
     assert np.abs(sent(bridge)[0]).max() <= 2.0 * PERIOD * (1 + 1e-9), "it departs from what is measured"
+
+
+def test_largest_difference_may_differ_by_entry():
+    runtime, _, _ = make(continuity={"velocity": ("speed", [10.0, 0.4])})
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=3)
+    assert "velocity[1] is 0.5 away from speed[1]; 0.4 is allowed" in refusal(runtime)
+
+
+def test_largest_difference_is_what_the_rate_allows_in_a_period_by_default():
+    runtime, bridge, _ = make(rate=600.0, continuity={"velocity": "speed"})
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=3)
+    assert "velocity[0] is 0.75 away from speed[0]; 0.6 is allowed" in refusal(runtime)
+    runtime.target.write(runtime.context, {"u.target": [0.15, -0.1]})
+    runtime.run(cycles=3)
+    runtime.switch("real")
+    runtime.run(cycles=1)
+    assert sent(bridge)[0] == pytest.approx([0.5, -0.5])
+
+
+def test_default_largest_difference_needs_a_limited_rate():
+    with pytest.raises(ValueError, match="does not follow from its rate, which is not limited: give continuity="):
+        make(rate=0.0, continuity={"velocity": "speed"})
+
+
+def test_measurement_of_the_opposite_sign_is_told():
+    commanded = 5.0 * (np.array(TARGET) - [0.05, 0.0])
+    against = {"position": [0.05, 0.0], "speed": -commanded + [0.01, 0.0]}
+    runtime, _, _ = make(sensors=lambda t: against, continuity={"velocity": ("speed", 0.1)})
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=3)
+    assert "it would fit with the opposite sign: the machine may measure with another sign" in refusal(runtime)
 
 
 def test_rate_limit_without_continuity_is_refused():
@@ -343,7 +379,7 @@ def test_reset_with_discontinuous_command_is_refused():
     runtime.send_fallback("told")
     runtime.write({"u.target": [0.9, -0.1]})
     runtime.run(cycles=3)
-    with pytest.raises(SwitchRefusedError, match=r"the actuator command velocity is 4.25 away from speed; 1.2 is"):
+    with pytest.raises(SwitchRefusedError, match=r"velocity\[0\] is 4.25 away from speed\[0\]; 1.2 is"):
         runtime.reset()
     assert runtime.guards.latched
     runtime.write({"u.target": TARGET})
@@ -680,8 +716,14 @@ def test_interruption_dropped_by_pybind11_ends_the_loop(number):
         *(({"patience": patience}, f"periods, not {patience}") for patience in (0.0, -1.0, np.nan, np.inf)),
         ({"continuity": {"velocty": ("speed", 1.0)}}, "not from 'velocty' to 'speed'; there are velocity and"),
         ({"continuity": {"velocity": ("sped", 1.0)}}, "not from 'velocity' to 'sped'"),
-        ({"continuity": {"velocity": ("speed", np.nan)}}, "must not be negative, unlike nan"),
+        ({"continuity": {"velocity": ("speed", np.nan)}}, "must not be negative, a number or 2 of them, unlike nan"),
+        ({"continuity": {"velocity": ("speed", [1.0, -1.0])}}, r"must not be negative, .* unlike \[1.0, -1.0\]"),
+        ({"continuity": {"velocity": ("speed", [1.0, 1.0, 1.0])}}, "a number or 2 of them"),
         ({"continuity": {"velocity": ("speed", 1.0, 2.0)}}, r"is \(sensor signal, largest difference\)"),
+        (
+            {"continuity": {"velocty": None}},
+            r"continuity of velocty is \(sensor signal, largest difference\), not None",
+        ),
         ({"guards": Guards(ServoScenario().interface(), 1.0)}, "made for a period of 1.0 s, not for 0.001 s"),
         ({"statistics": LoopStatistics(1.0)}, "made for a period of 1.0 s, not for 0.001 s"),
         (

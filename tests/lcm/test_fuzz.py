@@ -20,8 +20,8 @@ from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_sta
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
 from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.lcm.arm_messages import iiwa_status
 from vtbdrake.lcm.bridge import ChannelReader
-from vtbdrake.lcm.drake_messages import iiwa_status
 from vtbdrake.lcm.hub import Hub
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,8 +12,8 @@ import pytest
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_image, lcmt_robot_state, lcmt_scope
 
 from tests.control.arm import ACT, SENSE, command, status
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.bridge import LcmBridge
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import LcmMap, decode, vector_map
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal
@@ -102,6 +102,37 @@ def test_fields_of_a_user_type_travel_both_ways(user_types: ModuleType) -> None:
     sent, decoded = map.decoder(of)(data)
     assert sent == pytest.approx(42e-6)
     assert {name: value.tolist() for name, value in decoded.items()} == values
+
+
+def test_signal_has_another_unit_and_sign_than_its_field(user_types: ModuleType) -> None:
+    map = vector_map("WIND", user_types.wind_t, {"level": "level", "gust": "gust"}, scale={"gust": -1e-3})
+    of = signals(level=1, gust=2)
+    data = map.encoder(of)({"level": [3.0], "gust": [0.25, -0.5]}, 42)
+    assert user_types.wind_t.decode(data).gust == (-250.0, 500.0)
+    decoded = map.decoder(of)(data)[1]
+    assert (decoded["level"].tolist(), decoded["gust"].tolist()) == ([3.0], [0.25, -0.5])
+
+
+def test_constant_is_in_every_sent_message(user_types: ModuleType) -> None:
+    map = vector_map("WIND", user_types.wind_t, {"gust": "gust"}, constants={"level": 7, "where.z": 0.5})
+    message = user_types.wind_t.decode(map.encoder(signals(gust=2))({"gust": [1.0, 2.0]}, 42))
+    assert (message.level, message.where.z, message.gust) == (7, 0.5, (1.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scale": {"gust": 0.0}}, r"scale maps signals of channel WIND \(gust\) .* not 'gust' to 0.0"),
+        ({"scale": {"gust": np.nan}}, "not 'gust' to nan"),
+        ({"scale": {"speed": 2.0}}, "not 'speed' to 2.0"),
+        ({"constants": {"level": 0.5}}, "cannot hold 0.5"),
+        ({"constants": {"gust": 0.5}}, "cannot hold 0.5"),
+        ({"constants": {"height": 0.5}}, "has no field 'height'"),
+    ],
+)
+def test_scale_and_constants_that_do_not_fit_are_refused(user_types: ModuleType, options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        vector_map("WIND", user_types.wind_t, {"gust": "gust"}, **options)
 
 
 def test_fields_beside_arrays_of_messages_travel_both_ways(user_types: ModuleType) -> None:

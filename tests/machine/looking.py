@@ -19,7 +19,8 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from vtbdrake.components.sensors.camera import Camera, connect_camera
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, image_map
+from vtbdrake.lcm.arm_messages import iiwa_command
+from vtbdrake.lcm.drake_messages import image_map
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
@@ -106,4 +107,4 @@ class LookingScenario(Scenario):
             act=[iiwa_command({"force": "joint_torque"})],
             periods={"CAMERA": CAMERA_PERIOD},
         )
-        return Deployment(protocol=protocol, period=PERIOD)
+        return Deployment(protocol=protocol, period=PERIOD, continuity={"force": None})

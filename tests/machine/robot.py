@@ -18,7 +18,7 @@ from pydrake.systems.primitives import Demultiplexer
 
 from tests.testbeds import ACROBOT
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
@@ -82,7 +82,7 @@ class RobotScenario(Scenario):
 
     def deployment(self) -> Deployment:
         protocol = Protocol(sense=[iiwa_status(SENSE)], act=[iiwa_command({"torque": "joint_torque"})])
-        return Deployment(protocol=protocol)
+        return Deployment(protocol=protocol, continuity={"torque": None})
 
 
 def torque(value: float, utime: int) -> bytes:

@@ -15,7 +15,8 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from tests.machine.robot import COMMAND, ELBOW, PERIOD, STATUS, RobotScenario, state, torque
 from tests.testbeds import AcrobotScenario
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status, scan_map
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.drake_messages import scan_map
 from vtbdrake.lcm.protocol import Protocol, ProtocolError, protocol_of
 from vtbdrake.machine import (
     PERTURBED,

@@ -144,4 +144,5 @@ class PusherScenario(Scenario):
                 commands=commands[: 1 if self.every else 2],
             ),
             guards={"max_missed": inf, "fallback": {"force": Zero()}},
+            continuity={"force": None},
         )

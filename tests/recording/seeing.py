@@ -15,7 +15,8 @@ from pydrake.systems.sensors import ImageGrey8U
 
 from tests.control.scripted import PERIOD
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, image_map
+from vtbdrake.lcm.arm_messages import iiwa_command
+from vtbdrake.lcm.drake_messages import image_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
@@ -65,7 +66,9 @@ class SeeingScenario(Scenario):
 
     def deployment(self) -> Deployment:
         act = [iiwa_command({"velocity": "joint_position"})]
-        return Deployment(protocol=Protocol(sense=[image_map("CAMERA", "image")], act=act))
+        return Deployment(
+            protocol=Protocol(sense=[image_map("CAMERA", "image")], act=act), continuity={"velocity": None}
+        )
 
     def make_dps(self) -> System:
         return Gaze()

@@ -12,6 +12,7 @@ from vtbdrake.control.fallback import FallbackController as FallbackController
 from vtbdrake.control.fallback import Hold as Hold
 from vtbdrake.control.fallback import Silence as Silence
 from vtbdrake.control.fallback import Zero as Zero
+from vtbdrake.control.fallback import gravity_compensation as gravity_compensation
 from vtbdrake.control.guards import Guards as Guards
 from vtbdrake.control.realtime import RealTime as RealTime
 from vtbdrake.control.realtime import RealTimeError as RealTimeError

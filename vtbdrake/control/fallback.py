@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.testbed import Interface, Signal
 
@@ -139,6 +139,23 @@ class Brake(Fallback):
         return -self.gain * sensed[self.velocity][self.entries]
 
 
+def gravity_compensation(plant: MultibodyPlant) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return the generalized forces that carry the weight of a plant, -tau_g(q), as a function of its positions q.
+
+    The function keeps a context of its own: one thread may call it at a time.
+
+    Args:
+        plant: The finalized plant of the arm and its tool alone, its base welded to the world.
+    """
+    context = plant.CreateDefaultContext()
+
+    def torques(q: NDArray[np.float64]) -> NDArray[np.float64]:
+        plant.SetPositions(context, q)
+        return np.asarray(-plant.CalcGravityGeneralizedForces(context))
+
+    return torques
+
+
 class CarryWeight(Fallback):
     """Carries the weight of an arm by the torques u of its actuators, with B u = -tau_g(q), so that it floats in place.
 
@@ -179,15 +196,15 @@ class CarryWeight(Fallback):
                 f"a plant with {size} positions and {plant.num_actuators()} actuators cannot be carried: it needs one "
                 "actuator per position, so weld its base and leave out what is not actuated"
             )
-        self._plant, self._context = plant, plant.CreateDefaultContext()
+        self._size, self._gravity_compensation = size, gravity_compensation(plant)
         self._to_actuators = np.linalg.inv(actuation)
 
     def check(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense if sensor.size is not None}
         found = len(range(sizes.get(self.position, 0))[self.entries])
-        if not found == self._plant.num_positions() == signal.size:
+        if not found == self._size == signal.size:
             raise ValueError(
-                f"the weight of a plant with {self._plant.num_positions()} positions is carried by as many torques and "
+                f"the weight of a plant with {self._size} positions is carried by as many torques and "
                 f"measured positions, not by the {signal.size} entries of {signal.name} with {found} entries of "
                 f"{self.position!r}"
             )
@@ -198,8 +215,7 @@ class CarryWeight(Fallback):
         last = known.get(self.position)
         if last is None or (self.position not in sensed and last.age > self.longest):
             return NO_COMMAND
-        self._plant.SetPositions(self._context, last.value[self.entries])
-        torques = -self._to_actuators @ self._plant.CalcGravityGeneralizedForces(self._context)
+        torques = self._to_actuators @ self._gravity_compensation(last.value[self.entries])
         if self.brake is not None and self.brake.velocity in sensed:
             torques += self.brake.command(last_sent, sensed, known, dt)
         return torques

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from math import floor, inf, isnan, nan
@@ -21,9 +21,10 @@ from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepping import RESET, Cycle, Stepped
 from vtbdrake.control.switching import (
+    Continuity,
     Preparation,
     SwitchRefusedError,
-    check_continuity,
+    checked_continuity,
     discontinuities,
     perform,
     prepare,
@@ -76,7 +77,9 @@ class Runtime(Stepped):
             signals' maximum ages, so that a cycle notices a silent machine. A paced loop that is delayed by more has
             missed cycles.
         continuity: Actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
-            differ by more. Commands depart from that sensor signal, also after a time in which none left.
+            differ by more, in any entry. Commands depart from that sensor signal, also after a time in which none left.
+            With the sensor signal alone, the largest difference is what the rate of the actuator signal allows in a
+            period. None, as for a signal that is left out: its commands may jump.
         blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None.
         statistics: Statistics of the loop's timing, made for the same period.
         watchers: Called with every `Cycle`. One that raises is removed, and the loop goes on.
@@ -100,7 +103,7 @@ class Runtime(Stepped):
         guards: Guards | None = None,
         pace: str | None = None,
         patience: float = 3.0,
-        continuity: Mapping[str, tuple[str, float]] | None = None,
+        continuity: Continuity | None = None,
         blocked_by: Callable[[], str | None] = lambda: None,
         statistics: LoopStatistics | None = None,
         watchers: tuple[Callable[[Cycle], None], ...] = (),
@@ -116,8 +119,7 @@ class Runtime(Stepped):
                 f"a loop paced by {pace!r} waits in real time, while a SimulatedClock stands still: "
                 'let the clock begin the cycles (Deployment(pace="") or Runtime(pace=None)), or use a WallClock'
             )
-        self.continuity = dict(continuity or {})
-        check_continuity(target.interface, self.continuity)
+        self.continuity = checked_continuity(target.interface, continuity or {}, period=period)
         super().__init__(target, bridge, period=period, context=context)
         self.clock = clock or WallClock(spin=1e-4)
         self.guards = guards or Guards(target.interface, period)

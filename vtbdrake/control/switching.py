@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.stepping import SWITCH
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from vtbdrake.control.runtime import Runtime
 
 _log = logging.getLogger(__name__)
+
+Continuity = Mapping[str, str | tuple[str, ArrayLike] | None]
+"""Actuator signal -> what its commands continue when it is switched to real; see `Runtime`."""
 
 
 class SwitchRefusedError(RuntimeError):
@@ -83,26 +87,44 @@ def prepare(
     return Preparation(senses, acts, tuple(reasons), runtime.cycles)
 
 
-def check_continuity(interface: Interface, continuity: Mapping[str, tuple[str, float]]) -> None:
-    """Check the ``continuity`` argument of `Runtime`.
+def checked_continuity(
+    interface: Interface, continuity: Continuity, *, period: float
+) -> dict[str, tuple[str, NDArray[np.float64]]]:
+    """Return the ``continuity`` argument of `Runtime` as sensor signal and largest differences, by actuator signal.
 
     Raises:
-        ValueError: An entry is no such pair, a signal does not exist, two signals have different sizes, or a largest
-            difference is negative.
+        ValueError: An entry is none of the three forms, a signal does not exist, two signals have different sizes, a
+            largest difference is negative, or there is none because the actuator signal has no limited rate.
     """
-    acted = {signal.name: signal for signal in interface.act}
-    sensed = {signal.name: signal for signal in interface.sense}
+    actuators = {signal.name: signal for signal in interface.act}
+    sensors = {signal.name: signal for signal in interface.sense}
+    checked = {}
     for name, entry in continuity.items():
-        if not isinstance(entry, tuple | list) or len(entry) != 2:
+        if name in actuators and entry is None:
+            continue
+        if not (isinstance(entry, str) or (isinstance(entry, tuple | list) and len(entry) == 2)):
             raise ValueError(f"continuity of {name} is (sensor signal, largest difference), not {entry!r}")
-        sensor, limit = entry
-        if name not in acted or sensor not in sensed or acted[name].size != sensed[sensor].size:
+        sensor, limit = (entry, None) if isinstance(entry, str) else entry
+        if name not in actuators or sensor not in sensors or actuators[name].size != sensors[sensor].size:
             raise ValueError(
                 "continuity goes from an actuator signal to a sensor signal of its size, not from "
-                f"{name!r} to {sensor!r}; there are {', '.join(acted)} and {', '.join(sensed)}"
+                f"{name!r} to {sensor!r}; there are {', '.join(actuators)} and {', '.join(sensors)}"
             )
-        if not limit >= 0.0:
-            raise ValueError(f"the largest difference of {name} from {sensor} must not be negative, unlike {limit}")
+        signal = actuators[name]
+        if limit is None:
+            if not np.isfinite(signal.rate).all():
+                raise ValueError(
+                    f"the largest difference of {name} from {sensor} does not follow from its rate, which is not "
+                    f"limited: give continuity={{{name!r}: ({sensor!r}, largest difference)}}"
+                )
+            limit = np.asarray(signal.rate) * period
+        if np.shape(limit) not in ((), (signal.size,)) or not (np.asarray(limit) >= 0.0).all():
+            raise ValueError(
+                f"the largest difference of {name} from {sensor} must not be negative, a number or {signal.size} of "
+                f"them, unlike {limit}"
+            )
+        checked[name] = (sensor, signal.vector(limit))
+    return checked
 
 
 def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
@@ -128,10 +150,23 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
             continue
         if command is None:
             continue  # A DPS that has not started has no command.
-        gap = float(np.abs(command - measured).max())
-        if not gap <= limit:
-            found.append(f"the actuator command {name} is {gap:.3g} away from {sensor}; {limit:g} is allowed")
+        gap = np.abs(command - measured)
+        if not (gap <= limit).all():
+            found.append(_discontinuity(name, sensor, command, measured, limit))
     return found
+
+
+def _discontinuity(
+    name: str, sensor: str, command: NDArray[np.float64], measured: NDArray[np.float64], limit: NDArray[np.float64]
+) -> str:
+    """Return the reason why a command does not continue a measurement, with the entry that exceeds its limit most."""
+    gap = np.abs(command - measured)
+    k = int(np.argmax(np.where(gap <= limit, -np.inf, gap - limit)))
+    entry = f"[{k}]" if len(gap) > 1 else ""
+    reason = f"the actuator command {name}{entry} is {gap[k]:.3g} away from {sensor}{entry}; {limit[k]:g} is allowed"
+    if (np.abs(command + measured) <= limit).all():
+        reason += ", and it would fit with the opposite sign: the machine may measure with another sign than it obeys"
+    return reason
 
 
 def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:

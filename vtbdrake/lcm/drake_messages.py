@@ -1,4 +1,4 @@
-"""Ready-made maps for Drake's message types: iiwa arms, camera images, point clouds and laser scans."""
+"""Ready-made maps for Drake's messages of camera images, point clouds and laser scans."""
 
 from __future__ import annotations
 
@@ -10,58 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from drake import (
-    lcmt_iiwa_command,
-    lcmt_iiwa_status,
     lcmt_image,
     lcmt_image_array,
     lcmt_point_cloud,
     lcmt_point_cloud_field,
 )
 
-from vtbdrake.lcm.maps import Decoder, Encoder, LcmMap, VectorMap, decode, vector_map
+from vtbdrake.lcm.maps import Decoder, Encoder, LcmMap, decode
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import Signal
 
 if TYPE_CHECKING:
     from pydrake.perception import PointCloud
-
-
-def iiwa_status(fields: Mapping[str, str] | Sequence[str], *, channel: str = "IIWA_STATUS") -> VectorMap:
-    """Return a map for the state of an arm that speaks the iiwa messages, as the arm sends it.
-
-    Args:
-        fields: By signal, the field of `lcmt_iiwa_status` that holds it: ``joint_position_measured``,
-            ``joint_velocity_estimated``, ``joint_position_commanded``, ``joint_position_ipo`` in rad and rad/s;
-            ``joint_torque_measured``, ``joint_torque_commanded`` (with the sign of the arm's own software, opposite to
-            Drake's) and ``joint_torque_external`` in N m. A sequence, if signals and fields have the same names.
-        channel: Name of the channel.
-
-    Raises:
-        ValueError: There is no such field.
-    """
-    return vector_map(channel, lcmt_iiwa_status, _same_names(fields))
-
-
-def iiwa_command(
-    fields: Mapping[str, str] | Sequence[str] = ("joint_position",), *, channel: str = "IIWA_COMMAND"
-) -> VectorMap:
-    """Return a map for the actuator commands to an arm that speaks the iiwa messages.
-
-    Args:
-        fields: By signal, the field of `lcmt_iiwa_command` that holds it: ``joint_position`` in rad, ``joint_torque``
-            in N m. A field without a command is empty in the message. A sequence, if signals and fields have the same
-            names.
-        channel: Name of the channel.
-
-    Raises:
-        ValueError: There is no such field.
-    """
-    return vector_map(channel, lcmt_iiwa_command, _same_names(fields))
-
-
-def _same_names(fields: Mapping[str, str] | Sequence[str]) -> Mapping[str, str]:
-    return fields if isinstance(fields, Mapping) else {name: name for name in fields}
 
 
 @cache

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from io import BytesIO
-from math import nan, prod
+from math import isfinite, nan, prod
 from typing import Any, NamedTuple
 
 from vtbdrake.lcm.messages import MalformedError, MessageDecoder, MessageEncoder
@@ -86,8 +86,8 @@ def no_time(message: Any) -> float:
 class LcmMap:
     """One channel, the type of its messages, and how they become values of signals and the reverse.
 
-    `vector_map` makes one for messages of numbers, `vtbdrake.lcm.drake_messages` some for Drake's message types. For
-    everything else, give functions from and to message objects::
+    `vector_map` makes one for messages of numbers, `vtbdrake.lcm.arm_messages` and `vtbdrake.lcm.drake_messages` some
+    for Drake's message types. For everything else, give functions from and to message objects::
 
         LcmMap(channel="GOAL", type=pose_t, signals=("goal",), decode=lambda message: {"goal": to_pose(message)})
 
@@ -220,6 +220,9 @@ class VectorMap(LcmMap):
     parts: Mapping[str, Sequence[Field]] = dataclasses.field(repr=False)
     fields: Sequence[Field] = dataclasses.field(repr=False)  # all fields of the message type
     stamp: str = ""  # path of the field with the sender's time in microseconds; empty if there is none
+    # by signal, the factor from the numbers in the message to the values; 1 for the others
+    scale: Mapping[str, float] = dataclasses.field(default_factory=dict, repr=False)
+    constants: Mapping[str, float] = dataclasses.field(default_factory=dict, repr=False)  # by path, in every message
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         self._check(signals)
@@ -243,19 +246,21 @@ class VectorMap(LcmMap):
 
         return encode
 
-    def _layout(self, names: Sequence[str]) -> tuple[bytes, Sequence[Field], dict[str, list[str]], str]:
+    def _layout(
+        self, names: Sequence[str]
+    ) -> tuple[bytes, Sequence[Field], dict[str, list[str]], str, Mapping[str, float]]:
         """Return the arguments of `MessageDecoder` and `MessageEncoder` for messages with these signals."""
         signals = {name: [field.path for field in self.parts[name]] for name in names}
-        return self.type._get_packed_fingerprint(), self.fields, signals, self.stamp
+        return self.type._get_packed_fingerprint(), self.fields, signals, self.stamp, self.scale
 
     def _example(self, sizes: Mapping[str, int]) -> bytes:
-        """Return a message with signals of these sizes, in which all numbers but the lengths of arrays are zero."""
+        """Return a message with signals of these sizes, in which all but constants and lengths of arrays is zero."""
         lengths = {self.parts[name][0].length: size for name, size in sizes.items()}
         for name in self.parts.keys() - sizes.keys():
             length = self.parts[name][0].length
             if not length or lengths.get(length):
                 raise LookupError(name)
-        return bytes(self.type._get_packed_fingerprint() + _zeros(self.fields, lengths))
+        return bytes(self.type._get_packed_fingerprint() + _zeros(self.fields, {**self.constants, **lengths}))
 
     def _check(self, signals: Sequence[Signal]) -> None:
         """Raise ValueError if a signal is abstract, or not of the size of its fields."""
@@ -279,22 +284,28 @@ class VectorMap(LcmMap):
                 )
 
 
-def _zeros(fields: Sequence[Field], lengths: Mapping[str, int]) -> bytes:
-    """Return the bytes of these fields, in which all numbers but the lengths (by path) are zero."""
+def _zeros(fields: Sequence[Field], numbers: Mapping[str, float]) -> bytes:
+    """Return the bytes of these fields, in which all numbers but these (lengths and constants, by path) are zero."""
     data = b""
     for field in fields:
-        count = prod(lengths.get(size, 0) if isinstance(size, str) else size for size in field.dimensions)
+        count = prod(int(numbers.get(size, 0)) if isinstance(size, str) else size for size in field.dimensions)
         if field.code == "{":
-            data += count * _zeros(field.members, lengths if not field.dimensions else {})
+            data += count * _zeros(field.members, numbers if not field.dimensions else {})
         elif field.code == "s":
             data += count * b"\0\0\0\1\0"
         else:
-            data += struct.pack(f">{count}{field.code}", *[lengths.get(field.path, 0)] * count)
+            data += struct.pack(f">{count}{field.code}", *[numbers.get(field.path, 0)] * count)
     return data
 
 
 def vector_map(
-    channel: str, message_type: Any, fields: Mapping[str, str | Sequence[str]], *, stamp: str = "utime"
+    channel: str,
+    message_type: Any,
+    fields: Mapping[str, str | Sequence[str]],
+    *,
+    stamp: str = "utime",
+    scale: Mapping[str, float] | None = None,
+    constants: Mapping[str, float] | None = None,
 ) -> VectorMap:
     """Return a map for messages whose signals are fields of numbers.
 
@@ -305,9 +316,14 @@ def vector_map(
             over them. Dotted names reach into messages within the message.
         stamp: Field with the sender's time in microseconds; empty if there is none: late and repeated messages then
             count as new ones.
+        scale: By signal, the factor from the numbers in the message to the values of the signal: 1e-3 for a field in
+            mm, -1 for a machine with the opposite sign. 1 for the others.
+        constants: By field, a number that it holds in every message that is sent; other fields without a signal are
+            zero.
 
     Raises:
-        ValueError: There is no such field, or it does not hold numbers.
+        ValueError: There is no such field, it does not hold numbers or cannot hold a constant, or a factor is zero or
+            not finite.
     """
     _check_type(channel, message_type)
     try:
@@ -326,9 +342,33 @@ def vector_map(
             )
     if stamp and _number_field(message_type, known, stamp).dimensions:
         raise ValueError(f"field {stamp} of {message_type.__name__} is no time; give stamp='' if there is none")
+    scale = dict(scale or {})
+    for name, factor in scale.items():
+        if name not in found or not (isfinite(factor) and factor != 0.0):
+            raise ValueError(
+                f"scale maps signals of channel {channel} ({', '.join(found)}) to finite factors other than zero, not "
+                f"{name!r} to {factor!r}"
+            )
     return VectorMap(
-        channel=channel, type=message_type, signals=tuple(found), parts=found, fields=known_fields, stamp=stamp
+        channel=channel,
+        type=message_type,
+        signals=tuple(found),
+        parts=found,
+        fields=known_fields,
+        stamp=stamp,
+        scale=scale,
+        constants=_constants(message_type, known, constants or {}),
     )
+
+
+def _constants(message_type: Any, known: Mapping[str, Field], constants: Mapping[str, float]) -> dict[str, float]:
+    numbers: dict[str, float] = {}
+    for path, number in constants.items():
+        field = _number_field(message_type, known, path)
+        if field.dimensions or (field.typename not in ("float", "double") and number != int(number)):
+            raise ValueError(f"field {path} of {message_type.__name__}, a {field.typename}, cannot hold {number!r}")
+        numbers[path] = number if field.typename in ("float", "double") else int(number)
+    return numbers
 
 
 def _number_field(message_type: Any, known: Mapping[str, Field], path: str) -> Field:

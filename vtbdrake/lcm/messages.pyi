@@ -12,7 +12,12 @@ class MalformedError(ValueError):
 
 class MessageDecoder:
     def __init__(
-        self, fingerprint: bytes, fields: Sequence[Field], signals: Mapping[str, Sequence[str]], stamp: str = ""
+        self,
+        fingerprint: bytes,
+        fields: Sequence[Field],
+        signals: Mapping[str, Sequence[str]],
+        stamp: str = "",
+        scale: Mapping[str, float] | None = None,
     ) -> None: ...
     def decode(self, data: bytes) -> tuple[float, dict[str, NDArray[np.float64]]]: ...
 
@@ -23,6 +28,7 @@ class MessageEncoder:
         fields: Sequence[Field],
         signals: Mapping[str, Sequence[str]],
         stamp: str = "",
+        scale: Mapping[str, float] | None = None,
         *,
         example: bytes,
     ) -> None: ...

@@ -60,6 +60,7 @@ cdef class MessageLayout:
         fields: the `vtbdrake.lcm.maps.Field` of every field, in the order of encoding.
         signals: the paths of the fields that make up each signal, by name.
         stamp: path of the field with the sender's time in microseconds; empty if there is none.
+        scale: by signal, the factor from the numbers in the message to its values; 1 for the others.
     """
 
     cdef bytes fingerprint
@@ -71,8 +72,9 @@ cdef class MessageLayout:
     cdef list names  # of the signals
     cdef Py_ssize_t* parts  # fields of all signals, one signal after the other
     cdef Py_ssize_t* part_ends  # by signal
+    cdef double* factors  # by signal
 
-    def __cinit__(self, bytes fingerprint not None, fields, signals, str stamp="", **_):
+    def __cinit__(self, bytes fingerprint not None, fields, signals, str stamp="", scale=None, **_):
         cdef Py_ssize_t i = 0, k = 0
         cdef list flat = []
         if len(fingerprint) != 8:
@@ -107,18 +109,21 @@ cdef class MessageLayout:
                 raise ValueError(f"{path} does not hold numbers, or is a time of several numbers")
         self.parts = <Py_ssize_t*>zeros(len(paths), sizeof(Py_ssize_t))
         self.part_ends = <Py_ssize_t*>zeros(len(signals), sizeof(Py_ssize_t))
+        self.factors = <double*>zeros(len(signals), sizeof(double))
         for i, path in enumerate(paths):
             self.parts[i] = single[path]
         k = 0
         for i, name in enumerate(signals):
             k += len(signals[name])
             self.part_ends[i] = k
+            self.factors[i] = (scale or {}).get(name, 1.0)
 
     def __dealloc__(self):
         PyMem_Free(self.fields)
         PyMem_Free(self.dimensions)
         PyMem_Free(self.parts)
         PyMem_Free(self.part_ends)
+        PyMem_Free(self.factors)
 
     cdef int locate(self, bytes data) except -1:
         """Find each field in a message. Every byte is checked to be there before it is read."""
@@ -211,7 +216,7 @@ cdef class MessageDecoder(MessageLayout):
                 field = &self.fields[self.parts[k]]
                 at = message + field.offset
                 for n in range(field.count):
-                    entry[0] = _read(at, field.code)
+                    entry[0] = _read(at, field.code) * self.factors[signal]
                     entry += 1
                     at += field.width
             values[self.names[signal]] = value
@@ -274,7 +279,7 @@ cdef class MessageEncoder(MessageLayout):
                 field = &self.fields[self.parts[k]]
                 at = message + field.offset
                 for n in range(field.count):
-                    if not _write(at, field.code, entry[0]):
+                    if not _write(at, field.code, entry[0] / self.factors[signal]):
                         raise OverflowError(f"{entry[0]} of {self.names[signal]} does not fit into its field")
                     entry += 1
                     at += field.width

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Union
 
@@ -28,6 +29,8 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.framework import System
+from pydrake.systems.lcm import ApplyLcmBusConfig
 from pydrake.systems.sensors import CameraConfig, RgbdSensor, RgbdSensorDiscrete
 from pydrake.visualization import VisualizationConfig
 
@@ -53,9 +56,10 @@ class HardwareSimScenario(Scenario):
             builder.sim_sensor("image", cameras["oracular_view"].GetOutputPort("color_image"))
             builder.sim_actuator("torque", builder.plant.get_actuation_input_port())
 
-    Some fields are read and kept, but not used: the switches and a bridge replace ``model_drivers`` and ``lcm_buses``,
-    ``build(meshcat=...)`` replaces ``visualization``, and the horizon of a rollout replaces ``simulation_duration``.
-    The world has the default values, so that ``random_seed`` is not used either.
+    Some fields are read and kept, but not used: the switches and a bridge replace ``lcm_buses`` and all
+    ``model_drivers`` but the `IiwaDriver` (see `add_drivers`), ``build(meshcat=...)`` replaces ``visualization``, and
+    the horizon of a rollout replaces ``simulation_duration``. The world has the default values, so that ``random_seed``
+    is not used either.
 
     Attributes:
         simulator_config, plant_config, scene_graph_config: As in hardware_sim; the defaults are Drake's.
@@ -84,8 +88,9 @@ class HardwareSimScenario(Scenario):
         Raises:
             ScenarioError: A directive or an initial position does not fit.
         """
-        # A plant applies zero force by itself.
-        unused = [name for name, driver in self.model_drivers.items() if type(driver).__name__ != "ZeroForceDriver"]
+        # A plant applies zero force by itself; add_drivers adds the iiwas.
+        simulated = ("ZeroForceDriver", "IiwaDriver")
+        unused = [name for name, driver in self.model_drivers.items() if type(driver).__name__ not in simulated]
         if unused:
             _log.warning(
                 "the model_drivers of %s are not simulated: connect an actuator signal to these models",
@@ -99,6 +104,45 @@ class HardwareSimScenario(Scenario):
         except RuntimeError as error:
             raise ScenarioError(f"{type(self).__name__}: the models cannot be added: {error}") from error
         return list(models)
+
+    def add_drivers(self, builder: VirtualTestbedBuilder, models: Sequence[ModelInstanceInfo]) -> dict[str, System]:
+        """Add the KUKA iiwas of ``model_drivers`` as Drake simulates them with their control cabinets.
+
+        A command port, ``position`` or ``torque``, is that of an actuator signal::
+
+            driver = self.add_drivers(builder, self.add_models(builder))["iiwa"]
+            builder.sim_actuator("joint_torque", driver.GetInputPort("torque"))
+            builder.sim_sensor("joint_position", driver.GetOutputPort("position_measured"))
+
+        The driver compensates gravity, with the hand that its ``hand_model_name`` names. Torques at its output ports
+        have the sign of the plant; maps give messages the sign of an iiwa (`vtbdrake.lcm.iiwa_status`).
+
+        Args:
+            builder: The builder to which `add_models` has added the models.
+            models: What `add_models` has returned.
+
+        Returns:
+            The systems ``sim.act.<model>``, of the class `SimIiwaDriver`, by model.
+
+        Raises:
+            ScenarioError: A driver does not fit its model.
+        """
+        drivers = {
+            name: driver
+            for name, driver in self.model_drivers.items()
+            if isinstance(driver, pydrake.manipulation.IiwaDriver)
+        }
+        diagram_builder, by_name = builder.diagram_builder, {model.model_name: model for model in models}
+        # On these buses Drake adds no systems that send or receive.
+        silent = {driver.lcm_bus: DrakeLcmParams(lcm_url="memq://null") for driver in drivers.values()}
+        buses = ApplyLcmBusConfig(silent, diagram_builder)
+        for name, driver in drivers.items():
+            try:
+                pydrake.manipulation.ApplyDriverConfig(driver, name, builder.plant, by_name, buses, diagram_builder)
+            except RuntimeError as error:
+                raise ScenarioError(f"{type(self).__name__}.model_drivers.{name} cannot be added: {error}") from error
+            diagram_builder.GetMutableSubsystemByName(name).set_name(f"sim.act.{name}")
+        return {name: diagram_builder.GetSubsystemByName(f"sim.act.{name}") for name in drivers}
 
     def add_cameras(self, builder: VirtualTestbedBuilder) -> dict[str, RgbdSensorDiscrete]:
         """Add the cameras to the models that `add_models` has added.

@@ -98,7 +98,7 @@ def test_the_motion_is_chosen_over_lcm() -> None:
 
 
 class FakeArm:
-    """An arm on the bus that does not move: it reports a torque, and keeps the torques that are commanded."""
+    """An arm on the bus that does not move: it reports a torque, as an iiwa does, and keeps the commanded torques."""
 
     def __init__(self, url: str) -> None:
         self.commanded: list[np.ndarray] = []
@@ -122,7 +122,7 @@ class FakeArm:
         status.utime, status.num_joints = time.time_ns() // 1000, 7
         for name in status.__slots__[2:]:
             setattr(status, name, [0.0] * 7)
-        status.joint_position_measured, status.joint_torque_measured = list(Arm().home), torque.tolist()
+        status.joint_position_measured, status.joint_torque_measured = list(Arm().home), (-torque).tolist()
         wrench = lcmt_force_torque()
         wrench.timestamp = status.utime
         self._lcm.publish("IIWA_STATUS", status.encode())

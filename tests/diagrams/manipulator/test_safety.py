@@ -123,7 +123,7 @@ class GuardedArm:
         interface = SCENARIO.interface()
         deployment = SCENARIO.deployment()
         self.guards = Guards(interface, T, **deployment.guards)
-        self.guards.measured_by = {name: sensor for name, (sensor, _) in deployment.continuity.items()}
+        self.guards.measured_by = {"joint_torque": "joint_torque_measured"}
         self.context = WORLD.default_context()
         self.simulator = WORLD.simulator(self.context)
         self.simulator.Initialize()

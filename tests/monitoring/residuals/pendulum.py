@@ -14,7 +14,7 @@ from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
 from tests.testbeds import PENDULUM
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.machine import Machine, MachineConfig
 from vtbdrake.state import discrete_state
@@ -79,7 +79,7 @@ class DrivenPendulum(Scenario):
             act=[iiwa_command({"torque": "joint_torque"})],
             reported={"torque": "torque_reported"},
         )
-        return Deployment(protocol=protocol)
+        return Deployment(protocol=protocol, continuity={"torque": None})
 
     def make_dps(self) -> System:
         return Rhythm(PERIOD)

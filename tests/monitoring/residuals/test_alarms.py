@@ -105,7 +105,8 @@ def test_sensor_jump_raises_its_alarm(field: str, bias: float, signal: str) -> N
 def test_wrong_reported_actuation_raises_alarm(mode: str) -> None:
     together, monitors = start(calibration=nominal())
     together.run(100)
-    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque + 0.01)
+    # In the messages of an iiwa, a commanded torque has the opposite sign.
+    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque - 0.01)
     together.run(100)
     alarm = monitors[mode].alarms[0]
     assert (alarm.signal, alarm.entry) == ("act.torque", 0)
@@ -116,7 +117,7 @@ def test_wrong_reported_actuation_raises_alarm(mode: str) -> None:
 def test_missing_nominal_bias_raises_alarm() -> None:
     biased = replace(nominal(), mean=nominal().mean | {"act.torque": [0.01]})
     together, monitors = start(calibration=biased)
-    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque + 0.01)
+    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque - 0.01)
     together.run(200)
     assert not monitors["twin"].alarms
     together.line.falsify = lambda channel, data: data
@@ -128,7 +129,7 @@ def test_alarm_ends_after_the_fault() -> None:
     together, monitors = start(calibration=nominal())
     monitor = monitors["twin"]
     together.run(100)
-    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque + 0.01)
+    together.line.falsify = telling("joint_torque_commanded", lambda torque: torque - 0.01)
     together.run(100)
     assert [alarm.signal for alarm in monitor.active()] == ["act.torque"]
     together.line.falsify = lambda channel, data: data
