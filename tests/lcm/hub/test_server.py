@@ -15,8 +15,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import lcm
 import pytest
@@ -37,12 +39,59 @@ from tests.lcm.hub.clients import (
 )
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.connections import LcmLink, TcpqConnection
-from vtbdrake.lcm.hub import Hub, HubConfig, server
+from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, clients, server
+from vtbdrake.lcm.hub.clients import SLICE
+from vtbdrake.lcm.hub.reader import TcpqReader
 from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
 pytestmark = pytest.mark.one_python
 
 DATA = bytes(MEBIBYTE)
+
+
+@pytest.mark.parametrize(
+    ("piece", "returned", "message", "turns"),
+    [
+        (100, None, record(1, b"A", bytes(237)), [[100, 100, 50]]),  # The rest of a message is read at once.
+        (100, SLICE, record(1, b"A", bytes(237)), [[SLICE], [SLICE], [SLICE]]),  # A large one is read in turns.
+        (1400, None, record(1, b"A", b"") * 130, [[1400], [290]]),  # So are many small ones.
+        (100, None, record(1, b"A", bytes(887)), [[100] * 8, [100]]),  # No more than eight reads per turn.
+    ],
+)
+def test_reading_goes_on_within_a_message_only(
+    monkeypatch: pytest.MonkeyPatch, piece: int, returned: int | None, message: bytes, turns: list[list[int]]
+) -> None:
+    reads: list[list[int]] = [[]]
+
+    class InPieces(TcpqReader):
+        def receive(self, fileno: int, size: int) -> int:
+            if not self.greeted:
+                return super().receive(fileno, len(GREETING))
+            received = super().receive(fileno, min(size, piece))
+            if received > 0:
+                received = returned or received
+                reads[-1].append(received)
+            return received
+
+    def next_turn() -> float:
+        reads.append([])
+        return time.monotonic()
+
+    monkeypatch.setattr(clients, "TcpqReader", InPieces)
+    monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=next_turn))
+    hub = HubServer(HubConfig(port=0))
+    with socket.create_connection(address(hub.url)) as client:
+        client.sendall(GREETING)
+        thread = threading.Thread(target=hub.serve_forever)
+        thread.start()
+        try:
+            assert receive(client, len(WELCOME)) == WELCOME
+            client.sendall(message)
+            wait_until(lambda: sum(map(len, reads)) == sum(map(len, turns)))
+        finally:
+            hub.stop()
+            thread.join()
+    assert [turn for turn in reads if turn] == turns
 
 
 def test_client_that_never_reads_is_disconnected(connect) -> None:
