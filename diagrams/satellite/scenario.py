@@ -204,7 +204,10 @@ class SatelliteScenario(Scenario):
             protocol=Protocol(sense=sense, act=act, commands=commands, periods=periods),
             period=PERIOD,
             guards={"fallback": {"joint_position": Hold()}},
-            continuity={"joint_position": ("joint_position", 0.05)},
+            continuity={
+                "joint_position": ("joint_position", np.repeat([0.02, 0.005], [7, 2])),
+                **({"wheel_torque": None} if self.wheels else {}),  # Nothing measures it.
+            },
         )
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:

@@ -178,3 +178,16 @@ def test_simulated_machine_sends_what_drakes_driver_sends(mode: str) -> None:
                 arm.advance(k + 1)
     assert np.abs(drakes.joint_torque_measured).max() > 30.0
     assert np.ptp(arm.positions, axis=0).max() > 0.01
+
+
+def test_small_step_of_the_position_is_a_large_one_of_the_torque() -> None:
+    machine = Machine(IiwaScenario(mode=POSITION), MachineConfig(period=STEP, brake="idle"))
+    torques = []
+    for k in range(40):
+        command = lcmt_iiwa_command()
+        command.utime, command.num_joints = k + 1, JOINTS
+        command.joint_position = (HOME + (0.001 if k >= 20 else 0.0)).tolist()
+        machine.receive("IIWA_COMMAND", command.encode())
+        machine.advance()
+        torques.append(machine.read("sim.act.iiwa.torque_measured"))
+    assert np.abs(np.diff(torques, axis=0)).max() == pytest.approx(91.4, abs=0.5)

@@ -5,9 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from pydrake.manipulation import IiwaDriver
+from pydrake.multibody.parsing import LoadModelDirectivesFromString
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
+from tests.lcm.iiwa import HOME, POSITION, TORQUE, IiwaScenario
+from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.testbed import HardwareSimScenario, Interface, ScenarioError, Signal, VirtualTestbedBuilder, load_scenario
 
 # With all that the scenarios of Drake's examples/hardware_sim have, on models that come with Drake.
@@ -136,3 +140,50 @@ def test_the_scenario_survives_pickle_and_file(tmp_path):
 def test_what_does_not_fit_is_named(tmp_path, old, new, message):
     with pytest.raises(ScenarioError, match=message):
         load(tmp_path, DEMO.replace(old, new)).build()
+
+
+ELBOW = "sim.sys.iiwa.iiwa_joint_4.position"
+
+
+@pytest.mark.parametrize("mode", [TORQUE, POSITION])
+def test_rollout_with_drakes_driver_of_an_iiwa_is_the_future(mode):
+    scenario = IiwaScenario(mode=mode)
+    testbed = scenario.build()
+    simulator = testbed.simulator()
+    context = simulator.get_mutable_context()
+    testbed.write(context, {"u.target": HOME + 0.1})
+    simulator.AdvanceTo(0.2)
+    task = RolloutTask(scenario, 0.2, record=[ELBOW], sample_period=0.05, start=testbed.fork(simulator))
+    forecast = RolloutRunner(task).run({}).record[ELBOW]
+    future = [testbed.read(context, ELBOW)]
+    for instant in task.instants(0.2, testbed.event_timings())[1:]:
+        simulator.AdvanceTo(instant)
+        future.append(testbed.read(context, ELBOW))
+    np.testing.assert_array_equal(forecast, future)
+    assert np.ptp(forecast) > 0.01
+
+
+def test_two_iiwas_have_a_driver_each(caplog):
+    scenario = IiwaScenario()
+    other = scenario.directives[0].add_model
+    scenario.directives += LoadModelDirectivesFromString(f"""
+directives:
+- add_model: {{ name: left, file: "{other.file}" }}
+- add_weld: {{ parent: world, child: "left::iiwa_link_0", X_PC: {{ translation: [0, 1, 0] }} }}
+""").directives
+    scenario.model_drivers["left"] = IiwaDriver(control_mode=POSITION)
+    builder = VirtualTestbedBuilder(scenario.interface())
+    drivers = scenario.add_drivers(builder, scenario.add_models(builder))
+    assert {name: driver.get_name() for name, driver in drivers.items()} == {
+        "iiwa": "sim.act.iiwa",
+        "left": "sim.act.left",
+    }
+    assert drivers["iiwa"].HasInputPort("torque") and drivers["left"].HasInputPort("position")
+    assert "not simulated" not in caplog.text
+
+
+def test_driver_of_an_iiwa_that_does_not_fit_is_named():
+    scenario = IiwaScenario()
+    scenario.model_drivers["iiwa"] = IiwaDriver(hand_model_name="gripper")
+    with pytest.raises(ScenarioError, match="model_drivers.iiwa cannot be added: .*gripper"):
+        scenario.build()
