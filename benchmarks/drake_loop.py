@@ -13,7 +13,7 @@ from pydrake.manipulation import IiwaCommandSender, IiwaControlMode, IiwaStatusR
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
-from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.primitives import ConstantVectorSource, Gain
 
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.manipulator.arm import JOINTS
@@ -71,10 +71,12 @@ class DrakeLoop:
         vector = builder.AddSystem(_Wrench())
         builder.Connect(wrench.get_output_port(), vector.get_input_port())
         motion = builder.AddSystem(ConstantVectorSource([float(HOME)]))
+        torque = builder.AddSystem(Gain(-1.0, JOINTS))  # An iiwa sends its measured torques with the opposite sign.
+        builder.Connect(arm.GetOutputPort("torque_measured"), torque.get_input_port())
         for port, signal in (
             (arm.GetOutputPort("position_measured"), "joint_position"),
             (arm.GetOutputPort("velocity_estimated"), "joint_velocity"),
-            (arm.GetOutputPort("torque_measured"), "joint_torque_measured"),
+            (torque.get_output_port(), "joint_torque_measured"),
             (vector.get_output_port(), "wrench"),
             (motion.get_output_port(), "motion"),
         ):

@@ -129,8 +129,8 @@ class ManipulatorScenario(Scenario):
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the arm: it answers each state at once; after a fault, the arm floats in place.
 
-        The arm speaks the messages of an iiwa, with their signs, but without gravity compensation of its own: its command
-        is the whole torque. It publishes the wrench at its flange; ARM_MOTION chooses the motion.
+        The arm speaks the messages of an iiwa, with their signs, but does not compensate gravity: its command is the
+        whole torque. It publishes the wrench at its flange; ARM_MOTION chooses the motion.
         """
         status = {
             "joint_position": "joint_position_measured",

@@ -27,6 +27,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import discrete_state
+from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import HardwareSimScenario, Interface, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.005
@@ -82,13 +83,13 @@ class Impedance(LeafSystem):
     The reference r moves to the target at `SPEED`; ``joint_torque`` is K (r - q) - D v, ``joint_position_command`` r.
     """
 
+    __slots__ = NO_DICT
+
     def __init__(self, interface: Interface) -> None:
         super().__init__()
         (command,) = interface.act
-        self._inputs = {
-            signal.name: self.DeclareVectorInputPort(signal.name, JOINTS)
-            for signal in (*interface.sense, *interface.commands)
-        }
+        for signal in (*interface.sense, *interface.commands):
+            self.DeclareVectorInputPort(signal.name, JOINTS)
         reference, torque = self.DeclareDiscreteState(HOME), self.DeclareDiscreteState(JOINTS)
         self.DeclareStateOutputPort(command.name, torque if command.name == "joint_torque" else reference)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
@@ -98,7 +99,9 @@ class Impedance(LeafSystem):
         )
 
     def _update(self, context: Context, discrete: Any) -> None:
-        q, v, target = (self._inputs[name].Eval(context) for name in ("joint_position", "joint_velocity", "target"))
+        q, v, target = (
+            self.GetInputPort(name).Eval(context) for name in ("joint_position", "joint_velocity", "target")
+        )
         before = context.get_discrete_state(0).value()
         reference = before + np.clip(target - before, -SPEED * PERIOD, SPEED * PERIOD)
         discrete.set_value(0, reference)

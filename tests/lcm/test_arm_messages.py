@@ -16,10 +16,12 @@ from pydrake.manipulation import (
     PandaControlMode,
     SchunkWsgCommandReceiver,
 )
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, System
 from pydrake.systems.lcm import LcmSubscriberSystem
 
+from vtbdrake.control.fallback import gravity_compensation
 from vtbdrake.lcm.arm_messages import (
     iiwa_command,
     iiwa_status,
@@ -167,6 +169,12 @@ def test_gripper_commands_are_read_by_drake(force: float | None) -> None:
     assert read == [[0.05], [40.0]]
 
 
+def _empty() -> MultibodyPlant:
+    plant = MultibodyPlant(0.0)
+    plant.Finalize()
+    return plant
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -181,6 +189,19 @@ def test_gripper_commands_are_read_by_drake(force: float | None) -> None:
                 iiwa_status({}, on_top={"added": "joint_torque_measured"}, gravity=weight), {"added": np.zeros(7)}
             ),
             "measured positions: let a signal hold them",
+        ),
+        (
+            lambda: decode(
+                iiwa_status({}, on_top={"added": "joint_torque_measured"}, gravity=lambda q: np.append(q, 0.0)), b""
+            ),
+            r"has the shape \(8,\), not \(7,\)",
+        ),
+        (
+            lambda: decode(
+                iiwa_status({}, on_top={"added": "joint_torque_measured"}, gravity=gravity_compensation(_empty())),
+                b"",
+            ),
+            "cannot take 7 positions",
         ),
         (lambda: wsg_command(), "with one largest force"),
         (lambda: wsg_command(["force"], force=1.0), "with one largest force"),

@@ -65,7 +65,7 @@ def iiwa_status(
         on_top: By signal, the field of the measured or the commanded torque, of which the signal is the part on top of
             the gravity compensation: what the torque commands of `iiwa_command` add, and what they have to continue.
         gravity: The gravity compensation of the arm with its tool; `vtbdrake.control.gravity_compensation` makes it
-            from a plant. Required for ``on_top``.
+            from a plant with the arm's joints alone. Required for ``on_top``.
         channel: Name of the channel.
 
     Raises:
@@ -255,11 +255,17 @@ class OnTopOfGravityMap(LcmMap):
         return encode_on_top
 
     def _sizes(self, signals: Sequence[Signal]) -> tuple[int, list[Signal]]:
-        """Return the number of joints, and the signals of ``whole``."""
+        """Return the number of joints, and the signals of ``whole``; raise ValueError if the gravity does not fit."""
         known = {signal.name: signal for signal in signals}
         (size, *others) = {known[name].size for name in self.on_top}
         if others or size is None:
             raise ValueError(f"signals {', '.join(self.on_top)} on channel {self.channel} are vectors of one size")
+        try:
+            shape = np.shape(self.gravity(np.zeros(size)))
+        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            raise ValueError(f"the gravity of channel {self.channel} cannot take {size} positions: {error}") from error
+        if shape != (size,):
+            raise ValueError(f"the gravity of channel {self.channel} has the shape {shape}, not ({size},)")
         return size, [known.get(name) or Signal(name, size=size) for name in self.whole.signals]
 
 
