@@ -186,7 +186,7 @@ def test_trees_in_a_square_lattice_are_not_sure():
 
 
 @pytest.mark.parametrize(
-    ("seed", "missing"), [(2, None), (43, "count"), (93, "likelihood"), (44, "margin"), (53, "fit")]
+    ("seed", "missing"), [(86, None), (43, "count"), (2, "likelihood"), (666, "margin"), (183, "fit")]
 )
 def test_each_condition_of_the_test_of_uniqueness_counts(seed, missing):
     """Random cases: in the first one all conditions hold, in each of the others all but one."""
@@ -199,10 +199,11 @@ def test_each_condition_of_the_test_of_uniqueness_counts(seed, missing):
     mapped = landmarks(places + of_map * rng.normal(size=places.shape), deviation=of_map)
     fix = ConstellationMap(mapped).locate(local)
     variance = of_map**2 + of_local**2 + 0.02**2
-    poses = np.prod(np.ptp(mapped.positions, axis=0)) / (2.0 * pi * variance) * 2.0 * pi * 10.0 / np.sqrt(variance)
+    # The map is smaller than a hectare, but asks for the evidence of one.
+    poses = 1e4 / (2.0 * pi * variance) * 2.0 * pi * 10.0 / np.sqrt(variance)
     holds = {
         "count": len(local) >= 16,
-        "likelihood": fix.log_likelihood > np.log(poses) + np.log(200.0),
+        "likelihood": fix.log_likelihood > np.log(poses) + np.log(1e6),
         "margin": fix.margin >= max(5.0, 0.5 * fix.log_likelihood),
         "fit": fix.fit >= 0.6,
     }

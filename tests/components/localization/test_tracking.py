@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -166,6 +167,53 @@ def test_an_uncertain_position_loses_the_track():
         # Along the way, its deviation is 0.03 m times the root of the metres.
         after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), duration=0.0)
         assert tracker.is_lost(after) == is_lost
+
+
+@pytest.mark.parametrize("errors", [ACCURATE, REMOTE, POOR])
+def test_right_maps_seem_no_more_distorted_than_by_chance(errors):
+    """At most chi-square distributed with 6 degrees of freedom; less, as what is not known yet is not corrected."""
+    found = np.array([tracked(drive(seed, errors), correlation=errors.correlation)[1][-1] for seed in range(8)])
+    distortions = np.array([state.distortion for state in found])
+    assert 0.0 < distortions.mean() < 6.0 + 3.0 * np.sqrt(12.0 / 8.0)
+    assert distortions.max() < chi2.ppf(0.999, 6)
+
+
+def distorted(landmarks, displacement):
+    """Return the map with displacements by a function of the positions (n, 2)."""
+    places = landmarks.positions
+    return replace(landmarks, positions=places + displacement(places - places.mean(axis=0)))
+
+
+DISTORTIONS = {
+    "shear": lambda p: 0.01 * p[:, ::-1],
+    "scale": lambda p: 0.01 * p,
+    "stretch": lambda p: p * [0.015, 0.0],
+}
+
+
+@pytest.mark.parametrize("kind", DISTORTIONS)
+def test_distorted_maps_make_the_pose_doubtful(kind):
+    one = drive(3, ACCURATE, reach=18.0)
+    tracker, states = tracked(replace(one, map=distorted(one.map, DISTORTIONS[kind])))
+    right, rights = tracked(one)
+    assert tracker.is_doubtful(states[-1]) and states[-1].failures == 0
+    assert not any(right.is_doubtful(state) for state in rights)
+    # Before there is doubt, the covariance grows.
+    larger = [np.trace(tracker.pose_covariance(s)) / np.trace(s.pose_covariance) for s in states]
+    ratios = [max(1.0, state.distortion / chi2.ppf(0.95, 6)) for state in states]
+    np.testing.assert_allclose(larger, ratios)
+    assert max(ratios) > 1.5
+
+
+def test_a_displaced_or_turned_map_is_not_distorted():
+    one = drive(3, ACCURATE, reach=18.0)
+    middle = one.map.positions.mean(axis=0)
+    for X in ([3.0, -2.0, 0.0], [0.0, 0.0, 0.5]):
+        around = np.array([*middle, 0.0])
+        X_WV = compose(compose(around, X), inverse(around))
+        moved = replace(one, map=one.map.seen_from(X_WV), poses=np.array([compose(X_WV, pose) for pose in one.poses]))
+        (_, states), (_, same) = tracked(moved), tracked(one)
+        assert states[-1].distortion == pytest.approx(same[-1].distortion, rel=1e-3)
 
 
 def test_fusing_the_map_in_each_scan_is_inconsistent():

@@ -77,6 +77,18 @@ def test_a_doubtful_pose_is_back_with_the_next_good_scan():
     assert nees(answers[22].pose, answers[22].covariance, one.poses[22]) < 25.0
 
 
+def test_a_pose_on_a_sheared_map_becomes_doubtful():
+    """A shear of 1 % displaces what is seen by two deviations of the map at most, but by metres along 200 m."""
+    one = drive(3, ACCURATE, reach=18.0)
+    places = one.map.positions
+    sheared = replace(one.map, positions=places + 0.01 * (places - places.mean(axis=0))[:, ::-1])
+    right, _ = run(unit_for(one.map), one.scans, one.reckoned)
+    wrong, state = run(unit_for(sheared), one.scans, one.reckoned)
+    assert DOUBTFUL not in [answer.status for answer in right]
+    assert wrong[-1].status == DOUBTFUL and not state.track.failures
+    assert np.isnan(wrong[-1].pose).all() and np.isinf(wrong[-1].covariance[0, 0])
+
+
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_unit_never_tracks_on_the_map_of_another_place(errors):
     for seed in range(2):

@@ -18,8 +18,10 @@ is the inverse of the observed information: matches that are in doubt count less
 difference between the local position of a landmark and that on the map:
 
 * There are at least `fewest` local landmarks.
-* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 200. The first logarithm is that of the number of distinguishable poses on a
-  map of area A; the factor of 200 is a margin.
+* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 10⁶. The first logarithm is that of the number of distinguishable poses on a
+  map of area A, at least 1 ha: a small map asks for no less. At a place that the map does not show, an attempt exceeds
+  the bound with a probability of at most 10⁻⁶ if the trees stand at random, because the expectation of exp Λ is then 1
+  for each pose; real stands are not quite random.
 * Every other pose has at most Λ - 5 and at most Λ / 2. Poses are different if they have less than half of their matches
   in common. (In the rows of a plantation many poses nearly match; the best of them may lead by more than 5 by chance.)
 * Λ is at least 0.6 of its expectation for the right pose with these landmarks.
@@ -71,7 +73,10 @@ _NEIGHBOURS = 3
 # The number of samples from which the likelihood of a right pose is computed.
 _SAMPLES = 300
 
-_FACTOR, _LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 200.0, 5.0, 0.5, 0.6
+# The test of uniqueness, see the module. The factor is the number of attempts off the map, among random trees, of which
+# one may be sure; a carrier tries every 2 m. A smaller map than the least area, in m², asks for as much evidence.
+_FACTOR, _LEAST_AREA = 1e6, 1e4
+_LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 5.0, 0.5, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +225,7 @@ class ConstellationMap:
             return self._unknown()
         p_HoCo_H = local.positions.mean(axis=0)
         here = self._seen(local, local.positions - p_HoCo_H)
-        # The part of the map's variance that displaces landmarks relative to each other: the variance about the mean.
-        relative = self._variance * (1.0 - float(np.mean(_correlation(here.places, self.correlation))))
+        relative = self._relative(here.places)
         variance = relative + float(np.mean(here.variances)) + _FLOOR**2
         judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
         found = sorted((one for one in judged if one is not None), key=lambda one: -one.log_likelihood)
@@ -231,10 +235,9 @@ class ConstellationMap:
         others = [one.log_likelihood for one in found[1:] if _is_other(one.pairs, best.pairs)]
         margin = best.log_likelihood - max([0.0, *others])
         fit = best.log_likelihood / max(1.0, self._expected(here, relative / max(self._variance, 1e-12)))
-        poses = self._area / (2.0 * pi * variance) * 2.0 * pi * 10.0 / variance**0.5
         is_sure = (
             len(local) >= self.fewest
-            and best.log_likelihood > log(max(poses, 1.0)) + log(_FACTOR)
+            and best.log_likelihood > self._required(variance)
             and margin >= max(_LEAST_MARGIN, (1.0 - _LARGEST_SHARE) * best.log_likelihood)
             and fit >= _LEAST_FIT
         )
@@ -243,6 +246,23 @@ class ConstellationMap:
         carried = np.array([[1.0, 0.0, -p_CoHo_M[1]], [0.0, 1.0, p_CoHo_M[0]], [0.0, 0.0, 1.0]])
         covariance = carried @ best.covariance @ carried.T
         return Fix(pose, covariance, is_sure, best.log_likelihood, margin, fit, best.pairs)
+
+    def required(self, local: Landmarks) -> float:
+        """Return the log-likelihood ratio Λ that a sure pose needs at least with these landmarks."""
+        own = 0.5 * float(np.mean(np.trace(local.covariances, axis1=1, axis2=2)))
+        return self._required(self._relative(local.positions - local.positions.mean(axis=0)) + own + _FLOOR**2)
+
+    def _required(self, variance: float) -> float:
+        """Return the least Λ of a sure pose, if local and mapped positions differ by a variance in m² per axis."""
+        poses = max(self._area, _LEAST_AREA) / (2.0 * pi * variance) * 2.0 * pi * 10.0 / variance**0.5
+        return log(max(poses, 1.0)) + log(_FACTOR)
+
+    def _relative(self, places: Array) -> float:
+        """Return the part of the map's variance that displaces landmarks relative to each other, in m².
+
+        It is the variance about their mean.
+        """
+        return self._variance * (1.0 - float(np.mean(_correlation(places, self.correlation))))
 
     def _unknown(self) -> Fix:
         """Return the result of a failed search: the carrier may be anywhere on the map."""

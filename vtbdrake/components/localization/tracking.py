@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve, solve_triangular
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
@@ -84,6 +84,9 @@ _JUDGED_FROM = 6
 # With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
 _LARGEST_TURN = 0.2
 
+# Degrees of freedom of the distortions: displacement, rotation, scale and shear, which are affine.
+_DISTORTIONS = 6
+
 # The share of first matches that are assumed to be by chance although the pose is right.
 _CHANCE = 0.2
 
@@ -99,6 +102,7 @@ class TrackState:
         is_recent: Whether each of them was seen in the last scan that was fused, shape (n,).
         evidence: Cumulative log-likelihood ratio of first matches, see `Tracker`.
         failures: The number of scans in succession that failed, see `Tracker`.
+        distortion: The test statistic of a distorted map after the last scan that was fused, see `Tracker`.
     """
 
     mean: Array
@@ -107,6 +111,7 @@ class TrackState:
     is_recent: NDArray[np.bool_]
     evidence: float = 0.0
     failures: int = 0
+    distortion: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("mean", "covariance", "indices", "is_recent"):
@@ -204,6 +209,14 @@ class Tracker:
     log-likelihood ratio of right matches is summed up to at most ``credit``; below 0, the track is lost (the cumulative
     sum of Page, Biometrika 41, 1954).
 
+    Doubt: a map that is bent, sheared or scaled fits everywhere nearly, and leads astray all the same. It shows in the
+    corrections c of the landmarks in the state, their estimates less their positions on the map: on a right map they
+    have the covariance K (less what is not known yet), on a distorted one they change with the position. With the
+    functions B = [1, x, y], the statistic T = Σ |(Bᵀ K⁻¹ B)^(-1/2) Bᵀ K⁻¹ c|² over both axes is at most chi-square
+    distributed with 6 degrees of freedom on a right map. Beyond ``distortion_gate``, the pose is doubtful. Between its
+    95 % quantile and that, the covariance of the pose is multiplied by the ratio of T to the quantile (the ratio of
+    Birge, Physical Review 40, 1932).
+
     Landmarks that were marginalized enter anew if the carrier comes back, and their map error is then used twice:
     ``horizon`` and ``most`` must be so large that the state holds the landmarks of a whole closed route. Landmarks of
     which the map is less certain than ``largest_deviation`` are not used.
@@ -231,6 +244,7 @@ class Tracker:
         credit: The upper limit of the evidence.
         first_credit: The evidence at the start; it is less than ``credit``, so that a wrong start ends sooner.
         largest_deviation: The largest standard deviation of the position in m, per axis, with which a track goes on.
+        distortion_gate: The share of right maps that are not doubtful in one test of the distortion.
 
     Raises:
         ValueError: The map is empty, or a setting is outside of its range.
@@ -256,6 +270,7 @@ class Tracker:
     credit: float = 12.0
     first_credit: float = 6.0
     largest_deviation: float = 2.0
+    distortion_gate: float = 0.99999
     _usable: Indices = field(init=False, repr=False)
     _tree: cKDTree = field(init=False, repr=False)
     _variances: Array = field(init=False, repr=False)
@@ -282,6 +297,7 @@ class Tracker:
             "credit": (self.credit > 0.0, "positive"),
             "first_credit": (self.first_credit > 0.0, "positive"),
             "largest_deviation": (self.largest_deviation > 0.0, "in m, positive"),
+            "distortion_gate": (0.0 < self.distortion_gate < 1.0, "a share between 0 and 1"),
         }
         check_settings("Tracker", self, checks)
         variances = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1]
@@ -380,6 +396,15 @@ class Tracker:
         is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
         return state.failures >= self.patience or state.evidence < 0.0 or is_vague
 
+    def is_doubtful(self, state: TrackState) -> bool:
+        """Return whether the last scan failed or the map seems distorted, so that the pose must not be used now."""
+        return state.failures > 0 or state.distortion > chi_square_quantile(self.distortion_gate, _DISTORTIONS)
+
+    def pose_covariance(self, state: TrackState) -> Array:
+        """Return the covariance of X_WH, (3, 3), larger than the filter's if the map seems distorted, see `Tracker`."""
+        ratio = state.distortion / chi_square_quantile(0.95, _DISTORTIONS)
+        return state.pose_covariance * max(1.0, ratio)
+
     # -- the state
 
     def _at(self, X_WH: Array, covariance: Array) -> TrackState:
@@ -421,14 +446,18 @@ class Tracker:
     def _covariance(self, indices: Indices) -> Array:
         """Return K of the map's errors, shape (m, m) in m^2."""
         places = self.landmarks.positions[indices]
-        variances = np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2) / 2.0
-        deviations = np.sqrt(np.maximum(variances, 1e-6))
+        deviations = np.sqrt(np.maximum(self._map_variances(indices), 1e-6))
         squares = ((places[:, None] - places[None]) ** 2).sum(axis=2)
         K: Array = (
             self.correlated_share * np.exp(-0.5 * squares / self.correlation**2) * np.outer(deviations, deviations)
         )
         K[np.diag_indices_from(K)] = deviations**2
         return K
+
+    def _map_variances(self, indices: Indices) -> Array:
+        """Return the mean variances per axis of landmarks on the map, (m,) in m^2."""
+        variances: Array = np.trace(self.landmarks.covariances[indices], axis1=1, axis2=2) / 2.0
+        return variances
 
     def _fused(self, state: TrackState, landmarks: Landmarks, pairs: Indices) -> tuple[TrackState, Matches]:
         """Return the state after the fusion of matched detections, of landmarks in the state."""
@@ -454,7 +483,25 @@ class Tracker:
         distance = np.hypot(*(mean[_FIXED:].reshape(-1, 2) - mean[:2]).T)
         far = distance > self.horizon
         far[np.argsort(distance)[self.most :]] = True
-        return _without(fused, far), Matches(pairs, float(parts.sum()), is_fused=True)
+        near = _without(fused, far)
+        return replace(near, distortion=self._distortion(near)), Matches(pairs, float(parts.sum()), is_fused=True)
+
+    def _distortion(self, state: TrackState) -> float:
+        """Return the statistic T of a distorted map, see `Tracker`."""
+        places = self.landmarks.positions[state.indices]
+        corrections = state.mean[_FIXED:].reshape(-1, 2) - places
+        around = places - places.mean(axis=0)
+        B = np.column_stack([np.ones(len(places)), around / max(1.0, float(np.abs(around).max()))])
+        if self.correlation == 0.0:
+            deviations = np.sqrt(np.maximum(self._map_variances(state.indices), 1e-6))[:, None]
+            B, corrections = B / deviations, corrections / deviations
+        else:
+            root = np.linalg.cholesky(self._covariance(state.indices))
+            B, corrections = (solve_triangular(root, one, lower=True) for one in (B, corrections))
+        Q, R = np.linalg.qr(B)
+        # Landmarks on one line, or fewer than three, show fewer distortions.
+        is_shown = np.abs(np.diagonal(R)) > 1e-6 * np.abs(R).max()
+        return float(((Q.T @ corrections)[is_shown] ** 2).sum())
 
     def _noise(self, landmarks: Landmarks) -> Array:
         return landmarks.covariances + self.least_deviation**2 * np.eye(2)

@@ -172,8 +172,8 @@ class LocalizationUnit:
             predicted = self.tracker.predict(state.track, motion, C, duration=duration)
             track, matches = self.tracker.update(predicted, landmarks)
             if not self.tracker.is_lost(track):
-                answer = _answer(track, matches, len(landmarks), pose, time)
-                if track.failures:
+                answer = self._answer(track, matches, len(landmarks), pose, time)
+                if self.tracker.is_doubtful(track):
                     answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
                 return answer, replace(state, answer=answer, track=track)
             lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
@@ -197,17 +197,17 @@ class LocalizationUnit:
             return none, state
         seen = gathered if self.begins_with_submap else landmarks
         track, matches = self.tracker.start(fix.pose, fix.covariance, seen)
-        if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track):
+        if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
-        answer = _answer(track, matches, len(landmarks), X_OH, time)
+        answer = self._answer(track, matches, len(landmarks), X_OH, time)
         return answer, UnitState(answer, track, Submap.empty(X_OH), ignored=state.ignored, losses=state.losses)
 
-
-def _answer(track: TrackState, matches: Matches, detected: int, X_OH: Array, time: float) -> Localization:
-    matched = len(matches.pairs) if matches.is_fused else 0
-    return Localization(
-        time, X_OH, track.pose, track.pose_covariance, TRACKING, detected, matched, matches.nis, track.range_bias
-    )
+    def _answer(self, track: TrackState, matches: Matches, detected: int, X_OH: Array, time: float) -> Localization:
+        covariance = self.tracker.pose_covariance(track)
+        matched = len(matches.pairs) if matches.is_fused else 0
+        return Localization(
+            time, X_OH, track.pose, covariance, TRACKING, detected, matched, matches.nis, track.range_bias
+        )
 
 
 _PARTS = {
