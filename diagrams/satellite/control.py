@@ -1,4 +1,4 @@
-"""Resolved-rate control of the gripper along the moving target."""
+"""Control of the gripper along the moving target, and of the base's attitude by wheels."""
 
 from __future__ import annotations
 
@@ -12,14 +12,27 @@ from vtbdrake.components.perception.estimate import cross_matrix, rotation_vecto
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
+from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
+from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
-from vtbdrake_diagrams.satellite.supervisor import ABORT, GUIDANCE, HOLD, RETREAT, Guidance
+from vtbdrake_diagrams.satellite.supervisor import ABORT, GUIDANCE, HOLD, RETREAT, Guidance, stopping_speed
 
 Array = NDArray[np.float64]
 
 # Share of their opening from which on the fingers release the bar.
 _OPEN = 0.9
+
+LARGEST_REACTION = 2.5
+"""The largest torque of the arm on the base with wheels, in N m.
+
+They give a fifth of it. With less the base turns less, and the capture takes longer."""
+ACCELERATION = 0.1
+"""The acceleration of the gripper that goes with it, in m/s^2: the arm has about 20 N m s at 1 m/s."""
+UNLIMITED = 1e6
+"""What stands for no limit of both, since parameters are finite."""
+# The share of the largest reaction by which a change of the rates may always add to it, so that the arm can stop.
+_LEAST = 0.1
 
 
 class ArmController(LeafSystem):
@@ -34,16 +47,22 @@ class ArmController(LeafSystem):
         - joint_position
         output_ports:
         - joint_position
+        - reaction
 
     While the supervisor lets it follow, the gripper is to be at D, at ``distance`` before the fixture H along its z
     axis (turned by pi about it if ``flip``). With the errors e of position and orientation in B,
 
-        V_BG = V_BD + [K_R e_R; K_p e_p],   |K_R e_R| <= turn_rate,   |K_p e_p| <= speed,
+        V_BG = V_BD + [K_R e_R; s(e_p)],   |K_R e_R| <= turn_rate,   |s(e_p)| <= speed,
         qdot = J+ V_BG + (1 - J+ J) k (rest - q),   J+ = J' (J J' + damping^2)^-1,
 
-    where V_BD is the velocity of D against the base, in which the base's own motion is subtracted already. All rates
-    are scaled down together if one exceeds ``joint_rate``. The output integrates qdot, and stays within ``lead`` of the
-    measured positions.
+    where V_BD is the velocity of D against the base, in which the base's own motion is subtracted already, and s is
+    K_p e_p near D and farther away the speed of `stopping_speed`. All rates are scaled down together if one exceeds
+    ``joint_rate``. The output integrates qdot, and stays within ``lead`` of the measured positions.
+
+    With ``wheels`` the arm moves less abruptly. Its motion has the angular momentum h_B, see `reaction` in
+    ``kinematics.py``, from the mode retreat on with the target. The rates go as far towards what they should be as
+    h_B then changes by ``largest_reaction`` (N m) at most. The output ``reaction`` is dh_B/dt (N m), the torque that
+    keeps the base's attitude; 0 without wheels.
 
     Otherwise the rates decay (time constant ``brake_time``). After an abort, when the fingers are open, the gripper
     backs off along its z axis for ``back_off`` seconds, and the arm returns to where it was stowed. The fingers follow
@@ -52,9 +71,9 @@ class ArmController(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float) -> None:
+    def __init__(self, *, period: float, wheels: bool = False) -> None:
         super().__init__()
-        self._period = period
+        self._period, self._wheels = period, wheels
         servicer = Servicer()
         self._rates = joint_rates()
         self._lower, self._upper = servicer.lower + 0.02, servicer.upper - 0.02
@@ -66,12 +85,17 @@ class ArmController(LeafSystem):
         self.DeclareStateOutputPort("joint_position", command)
         # The rates of the arm's joints, for how long an abort has lasted, and the positions measured last.
         memory = self.DeclareDiscreteState(np.concatenate((np.zeros(ARM_JOINTS + 1), servicer.home)))
-        self._command, self._memory = int(command), int(memory)
+        # The momentum of the arm's motion, and whether the target is part of it.
+        momentum, torque = self.DeclareDiscreteState(4), self.DeclareDiscreteState(3)
+        self.DeclareStateOutputPort("reaction", torque)
+        self._command, self._memory, self._momentum, self._reaction = map(int, (command, memory, momentum, torque))
         declared = {
             "position_gain": (1.0, "1/s"),
             "orientation_gain": (1.0, "1/s"),
             "speed": (0.12, "m/s"),
             "turn_rate": (0.25, "rad/s"),
+            "acceleration": (ACCELERATION if wheels else UNLIMITED, "m/s^2"),
+            "largest_reaction": (LARGEST_REACTION if wheels else UNLIMITED, "N m"),
             "joint_rate": (0.4, "rad/s"),
             "posture_gain": (0.3, "1/s"),
             "damping": (0.05, "1"),
@@ -89,6 +113,9 @@ class ArmController(LeafSystem):
             discrete_state(
                 "measured_position", self._memory, start=ARM_JOINTS + 1, shape=(len(JOINT_NAMES),), unit="rad, m"
             ),
+            discrete_state("momentum", self._momentum, shape=(3,), unit="N m s"),
+            discrete_state("holding", self._momentum, start=3, bounds=(0.0, 1.0)),
+            discrete_state("reaction", self._reaction, shape=(3,), unit="N m"),
             *(
                 parameter(name, 0, start=k, unit=unit, bounds=(0.0, inf))
                 for k, (name, (_, unit)) in enumerate(declared.items())
@@ -98,12 +125,12 @@ class ArmController(LeafSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T = self._period
-        p = context.get_numeric_parameter(0).value()
-        k_p, k_R, speed, turn, limit, posture, damping, lead, brake, finger_rate, back_off, back_speed = p.tolist()
+        p = context.get_numeric_parameter(0).value().tolist()
+        k_p, k_R, speed, turn, push, torque, limit, posture, damping, lead, brake, finger_rate, back_off, back_speed = p
         guidance = Guidance.of(self._guidance.Eval(context))
         relative, measured = Relative.of(self._relative.Eval(context)), self._joints.Eval(context)
         command, memory = context.get_discrete_state(self._command).value(), context.get_discrete_state(1).value()
-        q, rates, aborted = measured[:ARM_JOINTS], memory[:ARM_JOINTS], memory[ARM_JOINTS]
+        q, before, aborted = measured[:ARM_JOINTS], memory[:ARM_JOINTS], memory[ARM_JOINTS]
         mode = guidance.mode
         if mode == ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
             aborted += T
@@ -113,13 +140,19 @@ class ArmController(LeafSystem):
             else:
                 rates = np.clip(self._stowed - command[:ARM_JOINTS], -0.5 * limit, 0.5 * limit)
         elif guidance.follows:
-            twist = self._twist(relative, guidance, k_p, k_R, speed, turn)
+            twist = self._twist(relative, guidance, k_p, k_R, speed, turn, push)
             rates = self._rates.value((q, twist, [posture, damping])).copy()
         elif mode in (RETREAT, HOLD, ABORT):
-            rates = rates * np.exp(-T / max(brake, T))
+            rates = before * np.exp(-T / max(brake, T))
         else:
             rates = np.zeros(ARM_JOINTS)
         rates *= min(1.0, limit / max(float(np.abs(rates).max()), 1e-9))
+        if self._wheels:
+            momentum = context.get_discrete_state(self._momentum).value()
+            holding = mode in (RETREAT, HOLD)
+            rates, momentum, reaction = self._gentle(q, before, rates, momentum, most=T * torque, holding=holding)
+            state.set_value(self._momentum, momentum)
+            state.set_value(self._reaction, reaction)
         following = np.clip(command[:ARM_JOINTS] + T * rates, q - lead, q + lead)
         following = np.clip(following, self._lower, self._upper)
         fingers = command[ARM_JOINTS:]
@@ -127,8 +160,33 @@ class ArmController(LeafSystem):
         state.set_value(self._command, np.concatenate((following, fingers)))
         state.set_value(self._memory, np.concatenate((rates, (aborted,), measured)))
 
+    def _gentle(
+        self, q: Array, before: Array, rates: Array, momentum: Array, *, most: float, holding: bool
+    ) -> tuple[Array, Array, Array]:
+        """Return the rates on the way from ``before`` to ``rates`` whose momentum changes slowly, that and its rate.
+
+        Args:
+            q: The positions of the joints.
+            before: Their rates one period ago.
+            rates: The rates that they should have.
+            momentum: h_B one period ago, and whether the target was part of it.
+            most: The largest change of h_B, in N m s.
+            holding: Whether the target is part of it.
+        """
+        kernel = arm_reaction(holding=holding)
+        unchanged = kernel.value((q, before))[:3].copy()
+        change = kernel.value((q, rates))[:3] - unchanged
+        # When the target is gripped, its momentum comes at once.
+        had = momentum[:3] if holding == (momentum[3] > 0.5) else unchanged
+        room = np.maximum(most - np.sign(change) * (unchanged - had), _LEAST * most)
+        share = min(1.0, float((room / np.maximum(np.abs(change), 1e-12)).min()))
+        has = unchanged + share * change
+        return before + share * (rates - before), np.append(has, float(holding)), (has - had) / self._period
+
     @staticmethod
-    def _twist(relative: Relative, guidance: Guidance, k_p: float, k_R: float, speed: float, turn: float) -> Array:
+    def _twist(
+        relative: Relative, guidance: Guidance, k_p: float, k_R: float, speed: float, turn: float, push: float
+    ) -> Array:
         """Return V_BG as it should be, [angular; linear] in B."""
         axis = relative.R_BH[:, 2]
         offset = -guidance.distance * axis
@@ -136,9 +194,67 @@ class ArmController(LeafSystem):
         e_p = relative.p_BH + offset - relative.p_BG
         e_R = rotation_vector(R_BD @ relative.R_BG.T)
         v_BD = relative.v_BH + cross_matrix(relative.w_BH) @ offset - guidance.rate * axis
-        return np.concatenate((relative.w_BH + _limited(k_R * e_R, turn), v_BD + _limited(k_p * e_p, speed)))
+        distance = float(np.linalg.norm(e_p))
+        v = min(speed, stopping_speed(distance, gain=k_p, acceleration=push)) * e_p / max(distance, 1e-9)
+        return np.concatenate((relative.w_BH + _limited(k_R * e_R, turn), v_BD + v))
 
 
 def _limited(vector: Array, length: float) -> Array:
     norm = float(np.linalg.norm(vector))
     return vector if norm <= length else vector * (length / norm)
+
+
+class AttitudeController(LeafSystem):
+    r"""Holds the base's attitude by reaction wheels, against the motion of the arm.
+
+    .. pydrake_system::
+
+        name: AttitudeController
+        input_ports:
+        - base
+        - joint_position
+        - reaction
+        - guidance
+        output_ports:
+        - wheel_torque
+
+    ``base`` is that of a `BaseEstimator`, ``reaction`` that of the `ArmController`. ``wheel_torque``, on the base about
+    its axes (N m), is
+
+        tau = dh_B/dt - J_B 2 b (w + u(theta)),   |u(theta)| = `stopping_speed` of |theta|,
+
+    with theta the rotation vector since the start, in B, u along it, the ``bandwidth`` b (gain b / 2, so that small
+    turns are critically damped), and the inertia J_B of base and arm; from the mode retreat on, with the target. The
+    deceleration on the way back is half of what the wheels can do, so that they do not saturate before the end.
+    """
+
+    __slots__ = NO_DICT
+
+    def __init__(self, *, period: float) -> None:
+        super().__init__()
+        self._torque = Servicer().wheel_torque
+        self._base = self.DeclareVectorInputPort("base", BASE)
+        self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
+        self._reaction = self.DeclareVectorInputPort("reaction", 3)
+        self._guidance = self.DeclareVectorInputPort("guidance", GUIDANCE)
+        torque = self.DeclareDiscreteState(3)
+        self.DeclareStateOutputPort("wheel_torque", torque)
+        self.DeclareNumericParameter(BasicVector([0.5]))
+        self.variables = (
+            discrete_state("wheel_torque", int(torque), shape=(3,), unit="N m"),
+            parameter("bandwidth", 0, unit="rad/s", bounds=(0.0, inf)),
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        (bandwidth,) = context.get_numeric_parameter(0).value().tolist()
+        base, q = self._base.Eval(context), self._joints.Eval(context)[:ARM_JOINTS]
+        holding = Guidance.of(self._guidance.Eval(context)).mode in (RETREAT, HOLD)
+        J = arm_reaction(holding=holding).value((q, np.zeros(ARM_JOINTS)))[3:].reshape(3, 3)
+        # The rotation vector of a small turn, whichever the sign of the quaternion; the same in B and in I. And
+        # R_IB' w_IB: for the rate, too, the base's turn is small.
+        theta, w = 2.0 * np.copysign(1.0, base[1]) * base[2:5], base[8:11]
+        angle = float(np.linalg.norm(theta))
+        brakes = 0.5 * self._torque / float(J.diagonal().max())
+        back = stopping_speed(angle, gain=0.5 * bandwidth, acceleration=brakes) * theta / max(angle, 1e-9)
+        state.set_value(0, self._reaction.Eval(context) - J @ (2.0 * bandwidth * (w + back)))

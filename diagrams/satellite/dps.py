@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RotationMatrix
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import (
     ConstantValueSource,
     Saturation,
@@ -18,11 +17,9 @@ from pydrake.systems.primitives import (
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.tracking import TargetTracker
 from vtbdrake.components.sensors.calibration import make_calibration
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.control import ArmController
-from vtbdrake_diagrams.satellite.estimation import BASE, BaseEstimator
+from vtbdrake_diagrams.satellite.control import ACCELERATION, UNLIMITED, ArmController, AttitudeController
+from vtbdrake_diagrams.satellite.estimation import BaseEstimator
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_marker_part, add_scan_part
 from vtbdrake_diagrams.satellite.pose_sensor import PoseReader
 from vtbdrake_diagrams.satellite.relative_motion import RelativeMotion
@@ -147,8 +144,10 @@ def _make_impl(*, period: float, wheels: bool) -> Diagram:
     """Return the supervisor and the controllers that it leads."""
     builder = DiagramBuilder()
     relative = builder.AddNamedSystem("relative", RelativeMotion(period=period))
-    supervisor = builder.AddNamedSystem("supervisor", Supervisor(period=period))
-    controller = builder.AddNamedSystem("controller", ArmController(period=period))
+    supervisor = builder.AddNamedSystem(
+        "supervisor", Supervisor(period=period, acceleration=ACCELERATION if wheels else UNLIMITED)
+    )
+    controller = builder.AddNamedSystem("controller", ArmController(period=period, wheels=wheels))
     for port in ("base", "target", "status"):
         builder.ExportInput(relative.GetInputPort(port), port)
     builder.ExportInput(supervisor.GetInputPort("capture"), "capture")
@@ -160,10 +159,13 @@ def _make_impl(*, period: float, wheels: bool) -> Diagram:
         else:
             builder.ExportInput(port, "joints")
     builder.Connect(supervisor.get_output_port(), controller.GetInputPort("guidance"))
-    builder.ExportOutput(controller.get_output_port(), "joint_position")
+    builder.ExportOutput(controller.GetOutputPort("joint_position"), "joint_position")
     if wheels:
         attitude = builder.AddNamedSystem("attitude", AttitudeController(period=period))
-        builder.ConnectInput("base", attitude.get_input_port())
+        builder.ConnectInput("base", attitude.GetInputPort("base"))
+        builder.ConnectInput("joints", attitude.GetInputPort("joint_position"))
+        for port, source in (("reaction", controller), ("guidance", supervisor)):
+            builder.Connect(source.GetOutputPort(port), attitude.GetInputPort(port))
         builder.ExportOutput(attitude.get_output_port(), "wheel_torque")
     return builder.Build()
 
@@ -181,43 +183,3 @@ def _make_act(*, wheels: bool) -> Diagram:
         builder.ExportInput(limited.get_input_port(), name)
         builder.ExportOutput(limited.get_output_port(), name)
     return builder.Build()
-
-
-class AttitudeController(LeafSystem):
-    """Holds the base's attitude by reaction wheels.
-
-    .. pydrake_system::
-
-        name: AttitudeController
-        input_ports:
-        - base
-        output_ports:
-        - wheel_torque
-
-    ``base`` is that of a `BaseEstimator`. ``wheel_torque``, on the base about its axes (N m), is
-    -stiffness theta - damping w, with theta the rotation vector since the start, in B.
-    """
-
-    __slots__ = NO_DICT
-
-    def __init__(self, *, period: float) -> None:
-        super().__init__()
-        self._base = self.DeclareVectorInputPort("base", BASE)
-        torque = self.DeclareDiscreteState(3)
-        self.DeclareStateOutputPort("wheel_torque", torque)
-        self.DeclareNumericParameter(BasicVector([20.0, 80.0]))
-        self.variables = (
-            discrete_state("wheel_torque", int(torque), shape=(3,), unit="N m"),
-            parameter("stiffness", 0, unit="N m/rad", bounds=(0.0, inf)),
-            parameter("damping", 0, start=1, unit="N m s/rad", bounds=(0.0, inf)),
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        stiffness, damping = context.get_numeric_parameter(0).value().tolist()
-        base = self._base.Eval(context)
-        w, x = base[1], base[2:5]
-        # The rotation vector of a small turn, whichever the sign of the quaternion; the same in B and in I.
-        theta = 2.0 * np.copysign(1.0, w) * x
-        # R_IB' w_IB: for the damping, too, the base's turn is small.
-        state.set_value(0, -stiffness * theta - damping * base[8:11])

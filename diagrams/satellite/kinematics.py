@@ -1,4 +1,4 @@
-"""The arm's kinematics in its controller: the pose of the gripper, and the joint rates for a velocity of it."""
+"""The arm in the servicer's controllers: its kinematics, and how its motion turns the base."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint
 
 from vtbdrake.components.casadi_system.kernel import Kernel
-from vtbdrake.components.compiled_plant import FrameMotion, PlantDynamics
+from vtbdrake.components.compiled_plant import FrameMotion, MomentumModel, PlantDynamics
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, LINK_NAMES, Servicer
+from vtbdrake_diagrams.satellite.plant import add_servicer, add_target
 
 REST = (0.0, 0.9, 0.0, 1.8, 0.0, 0.9, 0.0)
 """The arm's posture in the middle of its workspace (rad): the free motion of its elbow is drawn there."""
@@ -31,6 +32,28 @@ def joint_rates() -> Kernel:
     drawn = gains[0] * (casadi.DM(REST) - q)
     solved = casadi.solve(J @ J.T + gains[1] ** 2 * casadi.SX.eye(6), V - J @ drawn)
     return Kernel("joint_rates", [q, V, gains], casadi.densify(drawn + J.T @ solved), compile=False)
+
+
+@lru_cache
+def reaction(*, holding: bool) -> Kernel:
+    """Return [h_B (3,); J_B (9,)], by which the arm's motion turns the base, as a kernel of (q, qdot), (7,) each.
+
+    They are those of `MomentumModel.reaction`. The wheels are at rest, and open fingers count as closed ones.
+
+    Args:
+        holding: Whether the gripper holds the target, with G and H in one place.
+    """
+    plant = MultibodyPlant(0.0)
+    instance = add_servicer(plant, wheels=True, servos=False)
+    if holding:
+        add_target(plant)
+        plant.WeldFrames(plant.GetFrameByName("gripper"), plant.GetFrameByName("grapple"))
+    plant.Finalize()
+    joints = [plant.GetJointByName(name, instance) for name in ARM_JOINT_NAMES]
+    model = MomentumModel(plant, plant.CreateDefaultContext(), joints=joints)
+    q, rates = casadi.SX.sym("q", ARM_JOINTS), casadi.SX.sym("rates", ARM_JOINTS)
+    h, J = model.reaction(q, rates)
+    return Kernel("reaction", [q, rates], casadi.densify(casadi.vertcat(h, J.reshape((9, 1)))), compile=False)
 
 
 def _arm() -> MultibodyPlant:

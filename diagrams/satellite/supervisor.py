@@ -58,6 +58,8 @@ REASONS = (
 GO, STAY, STOP = 1.0, 0.0, -1.0
 """Values of the command ``capture``: go ahead, wait, abort."""
 
+# Time constant of the low-pass filter of the arm's positions, in s.
+_SMOOTHING = 0.5
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 GUIDANCE = 6
@@ -95,6 +97,20 @@ class Guidance:
         return Guidance(mode, follows > 0.5, distance, rate, opening, flip > 0.5)
 
 
+def stopping_speed(distance: float, *, gain: float, acceleration: float) -> float:
+    r"""Return the speed at a distance from the goal from which the brakes still stop there.
+
+    It is gain d up to d = a / gain^2, and beyond that sqrt(2 a (d - a / (2 gain^2))): a constant deceleration a.
+
+    Args:
+        distance: The distance d, not negative.
+        gain: The rate at which the distance shrinks near the goal, in 1/s.
+        acceleration: The deceleration a.
+    """
+    knee = acceleration / max(gain**2, 1e-12)
+    return gain * distance if distance <= knee else float(np.sqrt(2.0 * acceleration * (distance - 0.5 * knee)))
+
+
 @dataclass
 class _Step:
     """A step holds what an update changes: mode, guidance, how long the gripper is steady (s), and attempts."""
@@ -122,7 +138,8 @@ class Supervisor(LeafSystem):
         output_ports:
         - guidance
 
-    ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` is that of `RelativeMotion`.
+    ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` is that of `RelativeMotion`. ``acceleration``
+    limits how fast ``closing_speed`` is reached and left.
 
     ========= ============================================ =====================================================
     mode      what happens                                 ends when
@@ -131,15 +148,16 @@ class Supervisor(LeafSystem):
     approach  to ``standoff`` before the fixture           there, within the tolerances: track
     track     in along its axis, at ``closing_speed``      at the fixture, within ``grip_tolerance``: grip
     grip      the fingers close                            they hold the bar: retreat; they miss it: approach
-    retreat   the arm brakes the relative motion           it has stopped: hold
+    retreat   the arm brakes the relative motion           all joints are slower than ``still_rate``: hold
     hold      nothing moves
     abort     fingers open, the arm backs off
     ========= ============================================ =====================================================
 
     Approach, track and grip are aborted on command, when there has been no estimate for ``lost_after``, when the
     fixture leaves the reach, when it moves against the base faster than ``largest_speed``, and after ``time_limit``;
-    retreat and hold on command, and when the bar slips out. While the newest estimate is older than ``hold_after``,
-    all holds.
+    retreat and hold on command, and when the bar slips out. Whether the joints rest is measured by their encoders, for
+    ``still_time``: while the fingers hold the bar, nothing else moves. While the newest estimate is older than
+    ``hold_after``, all holds.
 
     The open fingers' lips leave 25 mm of room on each side of the bar. The grip tolerance takes half of it; the other
     half is for what the target does while the fingers close.
@@ -149,7 +167,7 @@ class Supervisor(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, *, period: float) -> None:
+    def __init__(self, *, period: float, acceleration: float) -> None:
         super().__init__()
         self._period = period
         servicer, target = Servicer(), Target()
@@ -165,10 +183,13 @@ class Supervisor(LeafSystem):
         self.DeclareStateOutputPort("guidance", guidance)
         # reason, time in the mode, time since the start of the capture, steady for, attempts, fingers' last positions
         memory = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, self._opening, self._opening]))
-        self._state, self._memory = int(guidance), int(memory)
+        # The arm's positions through a low-pass filter, which are behind by the arm's rates times _SMOOTHING.
+        smooth = self.DeclareDiscreteState(ARM_JOINTS)
+        self._state, self._memory, self._smooth = int(guidance), int(memory), int(smooth)
         declared = {
             "standoff": (0.25, "m"),
             "closing_speed": (0.06, "m/s"),
+            "acceleration": (acceleration, "m/s^2"),
             "position_tolerance": (0.03, "m"),
             "orientation_tolerance": (0.12, "rad"),
             "grip_tolerance": (0.012, "m"),
@@ -180,7 +201,8 @@ class Supervisor(LeafSystem):
             "largest_speed": (0.15, "m/s"),
             "time_limit": (60.0, "s"),
             "attempts": (3.0, "1"),
-            "retreat_time": (6.0, "s"),
+            "still_rate": (2e-3, "rad/s"),
+            "still_time": (1.0, "s"),
         }
         self.DeclareNumericParameter(BasicVector([value for value, _ in declared.values()]))
         self._names = tuple(declared)
@@ -195,6 +217,7 @@ class Supervisor(LeafSystem):
             discrete_state("time_in_mode", self._memory, start=1, unit="s"),
             discrete_state("capture_time", self._memory, start=2, unit="s"),
             discrete_state("steady_for", self._memory, start=3, unit="s"),
+            discrete_state("smooth_position", self._smooth, shape=(ARM_JOINTS,), unit="rad"),
             discrete_state("attempts_made", self._memory, start=4),
             discrete_state("last_fingers", self._memory, start=5, shape=(2,), unit="m"),
             *(
@@ -207,11 +230,13 @@ class Supervisor(LeafSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T = self._period
         p = dict(zip(self._names, context.get_numeric_parameter(0).value().tolist(), strict=True))
-        mode, _, distance, _, opening, flip = context.get_discrete_state(self._state).value().tolist()
+        mode, _, distance, rate, opening, flip = context.get_discrete_state(self._state).value().tolist()
         memory = context.get_discrete_state(self._memory).value()
         reason, in_mode, since, steady, attempts = memory[:5].tolist()
         relative = Relative.of(self._relative.Eval(context))
-        fingers = self._joints.Eval(context)[ARM_JOINTS:]
+        arm, fingers = np.split(self._joints.Eval(context), [ARM_JOINTS])
+        behind = arm - context.get_discrete_state(self._smooth).value()
+        rests = float(np.abs(behind).max()) < p["still_rate"] * _SMOOTHING
         go = float(self._capture.Eval(context)[0])
         still = bool((np.abs(fingers - memory[5:]) < 5e-4 * T / 0.02).all())
         holds = 0.6 * self._bar < float(fingers.sum()) < 1.4 * self._bar
@@ -227,10 +252,10 @@ class Supervisor(LeafSystem):
                 step.mode, step.reason, step.distance = APPROACH, _FIX, p["standoff"]
                 step.flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
         elif mode in (APPROACH, TRACK) and fresh:
-            self._steer(step, relative, p)
+            self._steer(step, relative, rate, p)
         elif mode == GRIP:
             self._grip(step, still, holds, in_mode, p)
-        elif mode == RETREAT and in_mode > p["retreat_time"]:
+        elif mode == RETREAT and holds and self._lasts(step, rests) > p["still_time"]:
             step.mode, step.reason = HOLD, _STOPPED
         elif mode in (RETREAT, HOLD) and not holds and still:
             step.mode, step.reason = ABORT, SLIPPED
@@ -242,29 +267,36 @@ class Supervisor(LeafSystem):
         guidance = [step.mode, follows, step.distance, step.rate, step.opening, step.flip]
         state.set_value(self._state, np.array(guidance))
         state.set_value(self._memory, np.array([step.reason, in_mode, since, step.steady, step.attempts, *fingers]))
+        state.set_value(self._smooth, arm - behind * np.exp(-T / _SMOOTHING))
 
-    def _steer(self, step: _Step, relative: Relative, p: dict[str, float]) -> None:
-        """Approach the fixture, or go in along its axis."""
+    def _lasts(self, step: _Step, true: bool) -> float:
+        """Return for how long something has been true, in s."""
+        step.steady = step.steady + self._period if true else 0.0
+        return step.steady
+
+    def _steer(self, step: _Step, relative: Relative, rate: float, p: dict[str, float]) -> None:
+        """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
         T = self._period
         error, angle = self._errors(relative, step.distance, step.flip)
         close = error < p["position_tolerance"] and angle < p["orientation_tolerance"]
-        step.steady = step.steady + T if close else 0.0
+        lasts = self._lasts(step, close)
         if step.mode == APPROACH:
-            if step.steady > 0.5:
+            if lasts > 0.5:
                 step.mode, step.reason = TRACK, _BEFORE
         elif step.distance > 0.0:
-            step.rate = -min(p["closing_speed"], step.distance / T) if close else 0.0
+            push = p["acceleration"]
+            goal = min(p["closing_speed"], stopping_speed(step.distance, gain=1.0 / T, acceleration=push))
+            step.rate = -min(goal, push * T - rate) if close else 0.0
             step.distance += step.rate * T
         else:
-            step.steady = step.steady if error < p["grip_tolerance"] else 0.0
+            step.steady = lasts if error < p["grip_tolerance"] else 0.0
             if step.steady > p["grip_time"]:
                 step.mode, step.reason = GRIP, _AT_BAR
 
     def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: dict[str, float]) -> None:
         """Close the fingers; ``still`` tells whether they rest, ``holds`` whether the bar is between them."""
         step.opening = 0.0
-        step.steady = step.steady + self._period if still else 0.0
-        if step.steady <= 0.3 or in_mode <= 0.5:
+        if self._lasts(step, still) <= 0.3 or in_mode <= 0.5:
             return
         if holds:
             step.mode, step.reason = RETREAT, _HELD

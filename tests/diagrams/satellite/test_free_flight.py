@@ -56,7 +56,7 @@ def test_capture_conserves_momentum_and_wheels_hold_the_attitude() -> None:
         simulator.AdvanceTo(0.05)
         own = testbed.plant.GetMyContextFromRoot(context)
         before = momentum(testbed.plant, own)
-        simulator.AdvanceTo(13.0)
+        simulator.AdvanceTo(14.0)
         assert testbed.read(context, "dps.impl.supervisor.mode") == RETREAT  # With contact.
         # At a step of 10 ms the plant is accurate to the first order.
         for part in (slice(0, 3), slice(3, 6)):

@@ -33,7 +33,7 @@ class Bench:
 
     def __init__(self, mode: float) -> None:
         builder = DiagramBuilder()
-        self.system = builder.AddNamedSystem("supervisor", Supervisor(period=T))
+        self.system = builder.AddNamedSystem("supervisor", Supervisor(period=T, acceleration=10.0))
         diagram = builder.Build()
         self.simulator = Simulator(diagram)
         self.root = self.simulator.get_mutable_context()
@@ -52,10 +52,10 @@ class Bench:
         relative = [age, valid, *R_BH, *p, 0.0, 0.0, 0.0, speed, 0.0, 0.0, *R_BH, *p]
         self.system.GetInputPort("relative").FixValue(self.context, relative)
 
-    def close(self, gap: float) -> None:
-        """Let the fingers stand so far apart."""
+    def close(self, gap: float, *, turn: float = 0.0) -> None:
+        """Let the fingers stand so far apart, and the first joint at an angle."""
         joints = np.zeros(len(JOINT_NAMES))
-        joints[-2:] = gap / 2.0
+        joints[0], joints[-2:] = turn, gap / 2.0
         self.system.GetInputPort("joint_position").FixValue(self.context, joints)
 
     def set(self, name: str, value: float) -> None:
@@ -75,6 +75,17 @@ def test_held_bar_leads_to_hold() -> None:
     bench.close(0.95 * BAR)
     assert bench.run(1.0) == RETREAT
     assert bench.run(7.0) == HOLD
+
+
+@pytest.mark.parametrize(("rate", "expected"), [(4e-3, RETREAT), (1e-3, HOLD)])
+def test_retreat_lasts_until_the_joints_rest(rate: float, expected: float) -> None:
+    bench = Bench(RETREAT)
+    for k in range(500):
+        bench.close(0.95 * BAR, turn=rate * k * T)
+        bench.run(T)
+    assert bench.get("mode") == expected
+    bench.run(3.0)
+    assert bench.get("mode") == HOLD
 
 
 def test_missed_bar_is_tried_again_and_then_aborted() -> None:

@@ -106,6 +106,23 @@ class MomentumModel(PlantDynamics):
         momentum = self._momentum(at, still, self._velocities(qdot))
         return self._free(at, momentum)
 
+    def reaction(self, q: Expression, qdot: Expression) -> tuple[Expression, Expression]:
+        """Return what turns the base, and what resists: (h_B, J_B), about the centre of mass of all, in the axes of B.
+
+        h_B, shape (3, 1) in N m s, is the angular momentum of the joints' motion while the base keeps its attitude;
+        J_B, shape (3, 3) in kg m^2, is the inertia with the joints locked. So the base turns by -J_B^-1 h_B if nothing
+        else has momentum, and a torque of dh_B/dt on the base keeps its attitude.
+
+        Args:
+            q: Positions of the joints, shape (m, 1).
+            qdot: Their rates, shape (m, 1).
+        """
+        at = self._positions(q)
+        momentum = self._momentum(at, casadi.SX(self.nv, 1), self._velocities(qdot))
+        M = self._locked(at)
+        lever = M[:3, 3:] / M[5, 5]  # [p_BoBcm]x
+        return momentum[:3] - lever @ momentum[3:], M[:3, :3] - lever @ M[3:, :3]
+
     def torque(self, q: Expression, qdot: Expression, qddot: Expression) -> Expression:
         """Return the torques of the drives that move the joints so, shape (m, 1), in N m (or N).
 
@@ -182,12 +199,16 @@ class MomentumModel(PlantDynamics):
 
     def _free(self, q: Expression, momentum: Expression) -> Expression:
         """Return -M_bb^-1 times a momentum (or its change), shape (6, 1)."""
+        root = casadi.chol(self._locked(q))
+        return -casadi.solve(root, casadi.solve(root.T, momentum))
+
+    def _locked(self, q: Expression) -> Expression:
+        """Return M_bb, the inertia of all about Bo with the joints locked, shape (6, 6), angular before linear."""
         moves = self._moves(q, casadi.SX(self.nv, 1))
         inertias = [link.inertia for link in self._links]
         for k in range(len(self._links) - 1, 0, -1):
             inertias[self._links[k].parent] += moves[k].inertia_to_parent(inertias[k])
-        root = casadi.chol(casadi.densify(inertias[0]))
-        return -casadi.solve(root, casadi.solve(root.T, momentum))
+        return casadi.densify(inertias[0])
 
 
 @dataclass(frozen=True)
