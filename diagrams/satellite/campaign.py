@@ -1,8 +1,8 @@
 """A campaign of captures from random starts: how often they succeed, and why they fail.
 
-``python -m vtbdrake_diagrams.satellite.campaign [--captures N] [--perception P] [--workers W] [--seed S]`` simulates
-captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with camera and
-scanner in the loop, and prints one row per capture.
+``python -m vtbdrake_diagrams.satellite.campaign [--captures N] [--perception P] [--wheels] [--workers W] [--seed S]``
+simulates captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with
+camera and scanner in the loop, and prints one row per capture.
 
 The criteria of success, fixed before any result was seen:
 
@@ -180,10 +180,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--captures", type=int, default=40)
     parser.add_argument("--perception", default="camera+scanner")
+    parser.add_argument("--wheels", action="store_true", help="hold the base's attitude by wheels")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1000)
     chosen = parser.parse_args()
-    scenario = SatelliteScenario(perception=chosen.perception)
+    scenario = SatelliteScenario(perception=chosen.perception, wheels=chosen.wheels)
     found: dict[int, Capture] = {}
     with ProcessExecutor(chosen.workers) as executor:
         for index, capture in captures(scenario, executor, count=chosen.captures, seed=chosen.seed):
