@@ -4,11 +4,13 @@ import functools
 import importlib
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
 
 from tests.optimization.studies import DAMPING, THETA, pendulum_problem
 from tests.testbeds import PendulumScenario
@@ -123,22 +125,22 @@ def law_problem(folder, *, gain="1.0", more=""):
     return pendulum_problem(scenario=importlib.import_module("law_of_a_test").LawScenario())
 
 
-@pytest.mark.parametrize("change", [{"gain": "2.25"}, {"more": "  # changed"}])
+@pytest.mark.parametrize("change", [{"gain": "2.25"}, {"more": " or None"}])
 def test_a_changed_dps_is_told_and_noted_where_it_is_allowed(tmp_path, monkeypatch, change):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    path = tmp_path / "a.db"
+    path, told = tmp_path / "a.db", "has other code, or uses other values"
     with law_problem(tmp_path).study(path, solver="sobol") as study:
         study.run(rollouts=4, executor="serial", progress=False)
-    law_problem(tmp_path).study(path).close()
+    law_problem(tmp_path, more="  # a comment").study(path).close()
     changed = law_problem(tmp_path, **change)
-    with pytest.raises(StudyError, match="law_of_a_test:LawScenario, a part of the testbed, has other code.*=True"):
+    with pytest.raises(StudyError, match=f"law_of_a_test:LawScenario, a part of the testbed, {told}.*=True"):
         changed.study(path)
     with changed.study(path, allow_changed_code=True) as study:
         study.run(rollouts=6, executor="serial", progress=False)
         assert len(study) == len(study.trials) == 6
         (noted,) = study.record["changes"]
-        assert noted["what"] == ["law_of_a_test:LawScenario, a part of the testbed, has other code"]
+        assert noted["what"] == [f"law_of_a_test:LawScenario, a part of the testbed, {told}"]
         assert "the code changed on " in study.summary()
     changed.study(path).close()
     with pytest.raises(StudyError, match="of another problem"):
@@ -168,6 +170,75 @@ def test_a_function_that_a_system_holds_is_code_of_the_testbed(one, other):
     held = [one]
     assert any("test_identity:Law" in name for name in code(one))
     assert code(one) == code(away_from(0.3)) != code(other)
+
+
+class Steady(Risk):
+    def __init__(self, weights):
+        self.weights = weights
+
+    def __call__(self, h):
+        return float(h @ self.weights)
+
+
+def test_what_a_risk_holds_is_code(tmp_path):
+    pendulum_problem(risk=Steady([1.0])).study(tmp_path / "a.db").close()
+    pendulum_problem(risk=Steady([1.0])).study(tmp_path / "a.db").close()
+    with pytest.raises(StudyError, match="test_identity:Steady, a part of the testbed, has other code"):
+        pendulum_problem(risk=Steady([2.0])).study(tmp_path / "a.db")
+
+
+def test_a_file_that_the_scenario_reads_is_part_of_s0(tmp_path):
+    class ReadingScenario(PendulumScenario):
+        def add_world(self, builder):
+            super().add_world(builder)
+            offset = float((tmp_path / "offset").read_text())
+            builder.add("env", "offset", ConstantVectorSource([offset]))
+
+    def study():
+        return pendulum_problem(scenario=ReadingScenario()).study(tmp_path / "a.db")
+
+    (tmp_path / "offset").write_text("0.3")
+    study().close()
+    (tmp_path / "offset").write_text("0.30000000000000004")  # The last digit differs between processors.
+    study().close()
+    (tmp_path / "offset").write_text("0.4")
+    with pytest.raises(StudyError, match="the scenario builds another s0, perhaps from a changed file"):
+        study()
+
+
+def test_another_python_cannot_compare_the_code(tmp_path, monkeypatch):
+    path = tmp_path / "a.db"
+    pendulum_problem().study(path).close()
+    monkeypatch.setattr(sys, "version_info", (3, 99))
+    with pytest.raises(StudyError, match=r"Python 3\.\d+, whose code cannot be compared with that of 3\.99.*=True"):
+        pendulum_problem().study(path)
+    pendulum_problem().study(path, allow_changed_code=True).close()
+    pendulum_problem().study(path).close()
+
+
+def test_what_cannot_be_read_is_said(tmp_path, caplog):
+    lock = threading.Lock()
+
+    def locked(theta):
+        with lock:
+            return abs(theta)
+
+    with quality(locked).study(tmp_path / "a.db") as study:
+        told = "changes would go unnoticed inside objects that cannot be read: _thread.lock (in the function locked)"
+        assert told in caplog.text
+        assert told in study.summary()
+
+
+def test_edited_values_of_a_function_are_told(tmp_path):
+    wanted = {"angles": [0.3]}
+
+    def nearest(theta):
+        return min(abs(theta - angle) for angle in wanted["angles"])
+
+    quality(nearest).study(tmp_path / "a.db").close()
+    wanted["angles"].append(0.5)
+    with pytest.raises(StudyError, match="the function nearest has other code, or uses other values"):
+        quality(nearest).study(tmp_path / "a.db")
 
 
 def test_another_process_knows_the_same_functions():

@@ -473,9 +473,12 @@ class Problem:
                 time for as many workers, and racing goes in rounds of as many rollouts. The points depend on it, never
                 on the number of workers. By default the solver chooses its batches, which suits about eight cores (see
                 docs/studies.md), or as in the file.
-            allow_changed_code: Whether to go on although the functions of the problem, or the Python code of its
-                testbed, have changed. The file records the changes (`Study.record`, ``changes``). Its rollouts stay,
-                but those in which a quality function failed run again.
+            allow_changed_code: Whether to go on although the functions of the problem, the Python code of its testbed,
+                the values that they use, or the defaults of its s0 have changed; or the version of Python, with which
+                no code can be compared. The file records the changes (`Study.record`, ``changes``). Its rollouts stay,
+                but those in which a quality function failed run again. What a function looks up by a computed name
+                (``getattr``, ``eval``), a file that it reads, and global state of installed packages are not seen;
+                objects that cannot be read are named in a warning, and in `Study.summary`.
 
         Raises:
             StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed,

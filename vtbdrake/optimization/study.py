@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
 
     from vtbdrake.optimization.problem import Problem
+
+_log = logging.getLogger(__name__)
 
 # A function that is called with a study and each of its new trials.
 Callback = Callable[["Study", Trial], Any]
@@ -118,6 +121,8 @@ class Study:
                         f"{path} was begun with {key} {study._meta.get(key)!r}, not {meta[key]!r}: leave {key} out to "
                         "resume it, or give another file"
                     )
+            if blind := _unreadable(meta["problem"]):
+                _log.warning("%s", blind)
             if code:
                 study._file.change_code(meta["problem"], code, versions=meta["versions"], revision=meta["revision"])
                 study._meta = study._file.meta
@@ -437,6 +442,8 @@ class Study:
         ]
         for change in self._meta.get("changes", []):
             lines.append(f"the code changed on {change['at'][:10]}: {'; '.join(change['what'])}")
+        if blind := _unreadable(self._meta["problem"]):
+            lines.append(blind)
         if self.message:
             lines.append(f"ended: {self.message}")
         lines.append(self._result())
@@ -544,6 +551,12 @@ class Study:
         points = points_from_optuna(self, storage, name=name)
         self._file.give(points)
         return len(points)
+
+
+def _unreadable(problem: Mapping[str, Any]) -> str:
+    """Return which changes of a problem's code would go unnoticed; empty if none would."""
+    parts = [f"{', '.join(types)} (in {name})" for name, types in problem.get("unreadable", {}).items()]
+    return f"changes would go unnoticed inside objects that cannot be read: {'; '.join(parts)}" if parts else ""
 
 
 def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
