@@ -2,7 +2,7 @@
 
 import json
 
-from vtbdrake.error_text import error_text
+from vtbdrake.error_text import error_text, safe_text
 
 
 def parse(text: str) -> None:
@@ -25,3 +25,14 @@ def test_error_that_was_not_raised_has_no_line() -> None:
 def test_text_is_one_line_and_never_empty() -> None:
     assert error_text(ValueError("a\n  b")) == "ValueError: a b"
     assert error_text(SystemExit()) == "SystemExit: SystemExit"
+
+
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
+def test_text_can_always_be_stored() -> None:
+    assert error_text(MuteError()) == "MuteError: <MuteError, whose text raises RuntimeError>"
+    assert safe_text("half a pair: \ud800") == "half a pair: \\ud800"
+    assert safe_text("Zo\xeb \U0001f916") == "Zo\xeb \U0001f916"

@@ -12,7 +12,7 @@ from scipy.stats import beta
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Parameter, Problem, Sweep
 from vtbdrake.optimization.boundary import Chance, Refinement, find_boundary, repeat_around
-from vtbdrake.rollout import Constraint, Quality, RolloutResult
+from vtbdrake.rollout import Constraint, Quality, QualityError, RolloutResult
 
 THETA = "sim.sys.Pendulum.theta.position"
 OMEGA = "sim.sys.Pendulum.theta.velocity"
@@ -345,3 +345,28 @@ def test_rollouts_that_the_testbed_ended_are_told():
     boundary = replace(sweep, rollouts=rollouts).boundary()
     assert (boundary.lower, boundary.ended_at) == (5.0, (5.0,))
     assert "ended early by the testbed at 5 kg" in str(boundary)
+
+
+@pytest.mark.parametrize("of_constraint", [False, True])
+def test_a_value_at_which_f_fails_is_unsafe(of_constraint):
+    def fails_above_two(theta, omega):
+        return np.nan if omega > 2.05 else abs(theta)
+
+    failing = [fails_above_two, [THETA, OMEGA]]
+    problem = Problem(
+        scenario=PendulumScenario(),
+        parameters=[Parameter(OMEGA, 0.0, 4.0)],
+        quality=Quality(abs, THETA) if of_constraint else Quality(*failing),
+        constraints=[Constraint(*failing, at_most=100.0)] if of_constraint else [],
+        threshold=3.0,
+        horizon=0.1,
+        sample_period=0.1,
+    )
+    boundary = problem.boundary(resolution=0.25, coarse=1.0, executor="serial", progress=False)
+    assert (boundary.lower, boundary.upper) == (2.0, 2.25)
+    assert min(boundary.failed_at) > 2.24  # with jitter
+    role = "constraint" if of_constraint else "quality"
+    assert boundary.failure.startswith(f"QualityError: the {role} function fails_above_two at t = 0 s")
+    assert f"values with failed rollouts: QualityError: the {role} function" in str(boundary)
+    with pytest.raises(QualityError, match=f"the {role} function"):
+        problem.boundary(resolution=0.25, coarse=1.0, executor="serial", progress=False, on_error="raise")

@@ -265,3 +265,48 @@ def test_problem_sweep_boundary_and_rollout_show_themselves():
     for shown in (sweep, boundary, rollout):
         assert shown._repr_html_().count('<img src="data:image/png;base64,') == 1
         assert len(repr(shown)) < 300
+
+
+GAIN, ELBOW = "dps.gain", "sim.sys.Acrobot.elbow.velocity"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "condition", "told"),
+    [
+        (
+            [f"{GAIN}[0]"],
+            {GAIN: [1.0, 0.0, 0.0, 0.0]},
+            rf"{GAIN}\[0\] is a parameter, so that no condition can set {GAIN}",
+        ),
+        ([f"{GAIN}[0]"], {f"{GAIN}[0]": 1.0}, rf"{GAIN}\[0\] is a parameter, so that no condition can set {GAIN}\[0\]"),
+        ([f"{GAIN}[1]"], {GAIN: [0.0] * 4, f"{GAIN}[0]": 1.0}, rf"{GAIN}\[1\] is a parameter"),
+        (
+            [ELBOW],
+            {GAIN: [0.0] * 4, f"{GAIN}[0]": 1.0},
+            "one is an entry of",
+        ),
+        ([f"{GAIN}[00]"], {}, r"there is no variable 'dps\.gain\[00\]'"),
+        ([ELBOW], {f"{GAIN}[00]": 1.0}, r"there is no variable 'dps\.gain\[00\]'"),
+        ([f"{GAIN}[٠]"], {}, "there is no variable"),
+    ],
+)
+def test_an_entry_and_its_array_are_not_set_twice(parameters, condition, told):
+    with pytest.raises(ValueError, match=told):
+        vtb.Problem(
+            scenario=AcrobotScenario(),
+            parameters=[vtb.Parameter(address, -1.0, 1.0) for address in parameters],
+            quality=vtb.Quality(abs, ELBOW),
+            horizon=1.0,
+            conditions=[condition],
+        )
+
+
+def test_entries_of_one_array_are_varied_beside_conditions_on_others():
+    problem = vtb.Problem(
+        scenario=AcrobotScenario(),
+        parameters=[vtb.Parameter(f"{GAIN}[0]", -1.0, 1.0)],
+        quality=vtb.Quality(lambda gain: abs(gain[0]) + 10.0 * abs(gain[1]), GAIN),
+        horizon=0.1,
+        conditions=[{f"{GAIN}[1]": 0.5}],
+    )
+    assert problem.rollout([0.25]).value == 5.25

@@ -621,6 +621,41 @@ def test_a_raising_quality_fails_its_rollout_until_repaired(tmp_path, caplog, ex
         assert {row: study.rollouts[row] for row in kept} == kept and study.best.value == 2.0
 
 
+class MuteError(Exception):
+    def __str__(self):
+        raise RuntimeError("no text")
+
+
+def _mute(theta):
+    raise MuteError
+
+
+def _half_a_pair(theta):
+    raise ValueError("\ud800")
+
+
+@pytest.mark.parametrize("executor", ["serial", "processes"])
+@pytest.mark.parametrize(("f", "text"), [(_mute, "whose text raises RuntimeError"), (_half_a_pair, "\\ud800")])
+def test_messages_that_are_no_text_are_kept_and_do_not_end_a_study(tmp_path, executor, f, text):
+    path = tmp_path / "a.db"
+    with pendulum_problem(quality=Quality(f, THETA, reading="end")).study(path, solver="sobol") as study:
+        study.run(rollouts=4, executor=executor, progress=False)
+        assert "4 rollouts failed" in study.summary()
+    with Study.open(path) as study:
+        assert len(study) == 4 and all(text in outcome.message for outcome in study.rollouts.values())
+        with pytest.raises(ValueError, match="an attribute has a name"):
+            study.set_attribute("\ud800", 1)
+
+
+def test_all_failed_rollouts_are_counted_although_their_messages_differ():
+    def f(theta):
+        return 1.0 / 0.0
+
+    with pendulum_problem(quality=Quality(f, THETA, reading="end")).study(solver="sobol") as study:
+        study.run(rollouts=16, executor="serial", progress=False)
+        assert "; 16 rollouts failed, the first: QualityError: the quality function f at t = " in study.summary()
+
+
 def test_what_becomes_of_errors_is_one_of_two(tmp_path):
     with pytest.raises(ValueError, match="on_error is 'record' or 'raise', not 'ignore'"):
         pendulum_problem().study().run(rollouts=1, on_error="ignore")

@@ -8,7 +8,7 @@ import pytest
 import vtbdrake as vtb
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Quantile, Risk, Sweep
-from vtbdrake.rollout import Executor, SerialExecutor
+from vtbdrake.rollout import Executor, QualityError, SerialExecutor
 
 THETA = "sim.sys.Pendulum.theta.position"
 OMEGA = "sim.sys.Pendulum.theta.velocity"
@@ -212,3 +212,37 @@ def test_a_grid_is_spaced_as_its_parameter_says():
     assert points == [0.0, 2.0, 3.0, 5.0]
     with pytest.raises(ValueError, match="does not have 7 different whole numbers in equal steps"):
         whole.sweep(7, executor="serial", progress=False)
+
+
+def _raises_above_two(theta, omega):
+    if omega > 2.0:
+        raise ValueError("too fast")
+    return abs(theta)
+
+
+def _nan_above_two(theta, omega):
+    return np.nan if omega > 2.0 else abs(theta)
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
+@pytest.mark.parametrize("f", [_raises_above_two, _nan_above_two])
+def test_points_at_which_f_fails_are_failed_rollouts(executor, f, caplog):
+    problem = _problem(quality=vtb.Quality(f, [THETA, OMEGA]), threshold=3.0, horizon=0.2)
+    sweep = problem.sweep(values=[0.5, 1.0, 3.0, 4.0], executor=executor, progress=False)
+    assert sweep.complete
+    assert sweep.failed.tolist() == sweep.unsafe.tolist() == [False, False, True, True]
+    assert np.isfinite(sweep.h).tolist() == [True, True, False, False]
+    assert sweep.rollouts[2].message.startswith(f"QualityError: the quality function {f.__name__} at t = 0 s")
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].endswith(
+        "The rollout counts as failed, and so do others of this kind; on_error='raise' ends the run"
+    )
+    assert str(sweep.boundary()).startswith(f"{OMEGA}: safe up to 1 rad/s, not at 3 rad/s")
+
+
+def test_f_that_fails_can_end_a_sweep():
+    problem = _problem(quality=vtb.Quality(_nan_above_two, [THETA, OMEGA]), horizon=0.2)
+    with pytest.raises(QualityError, match="_nan_above_two"):
+        problem.sweep(values=[0.5, 3.0], executor="serial", progress=False, on_error="raise")
+    with pytest.raises(ValueError, match="on_error is 'record' or 'raise', not 'ignore'"):
+        problem.sweep(values=[0.5, 3.0], on_error="ignore")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import exp, inf, isinf, log
 from typing import TYPE_CHECKING
@@ -14,8 +14,8 @@ from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.optimization.sweep import Sweep, borrowed, make_sweep, numeric, roll_out
-from vtbdrake.rollout import Executor, RolloutResult
-from vtbdrake.rollout.task import TERMINATED
+from vtbdrake.rollout import Executor, RolloutResult, RolloutTask
+from vtbdrake.rollout.task import TERMINATED, catches
 from vtbdrake.state.variables import with_unit
 
 if TYPE_CHECKING:
@@ -83,7 +83,9 @@ class Boundary:
     # values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was safe up to
     # there
     ended_at: tuple[float, ...] = ()
-    failed_at: tuple[float, ...] = ()  # values at which a simulation failed
+    failed_at: tuple[
+        float, ...
+    ] = ()  # values at which a simulation, or the function of a quality or constraint, failed
     failure: str = ""  # the reason of the first failure
     sweep: Sweep | None = field(default=None, compare=False)  # the rollouts without jitter
     repeated: Sweep | None = field(default=None, compare=False)  # the rollouts with jitter; None if there are none
@@ -128,7 +130,7 @@ class Boundary:
         again = [v for v in self.safe_beyond if v > self.upper]
         beyond = f"; not monotonic: safe again at {self._listed(again)}" if again else ""
         ended = f"; ended early by the testbed at {self._listed(self.ended_at)}" if self.ended_at else ""
-        failed = f" ({len(self.failed_at)} values with failed simulations: {self.failure})" if self.failed_at else ""
+        failed = f" ({len(self.failed_at)} values with failed rollouts: {self.failure})" if self.failed_at else ""
         interval = self.interval_text(self.lower, self.upper)
         return f"{self.address}: {interval}{self._undecided()}{missed}{beyond}{ended}{failed}"
 
@@ -352,12 +354,14 @@ def search_boundary(
     jitter: float,
     executor: str | Executor,
     workers: int | None,
+    on_error: str,
     progress: bool,
 ) -> Boundary:
     """Search the boundary of a problem; see `Problem.boundary`."""
     if len(problem.parameters) != 1:
         raise ValueError(f"a boundary is that of one parameter, but the problem has {len(problem.parameters)}")
     (parameter,) = numeric(problem)
+    task = replace(problem.task, catch=catches(on_error))
     reason = why_never_unsafe(
         finite_threshold=problem.task.threshold is not None,
         minimize=[quality.minimize for quality in problem.objectives],
@@ -369,7 +373,7 @@ def search_boundary(
     repeats, jitter = _checked_jitter(parameter, repeats, jitter)
     first = len(refinement.start()) * len(problem.conditions)
     with borrowed(problem, executor, rollouts=first, workers=workers) as chosen:
-        search = _Search(problem, refinement, chosen, progress=progress)
+        search = _Search(problem, task, refinement, chosen, progress=progress)
         outcomes = find_boundary(refinement, len(problem.conditions), search.examine)
         if repeats:
             unsafe = [index for found in outcomes for index, bad in found.items() if bad]
@@ -392,8 +396,11 @@ def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) ->
 class _Search:
     """The rollouts of a search for a boundary: one at each value, and repeats with jitter close to the boundary."""
 
-    def __init__(self, problem: Problem, refinement: Refinement, executor: Executor, *, progress: bool) -> None:
+    def __init__(
+        self, problem: Problem, task: RolloutTask, refinement: Refinement, executor: Executor, *, progress: bool
+    ) -> None:
         self._problem = problem
+        self._task = task
         self._refinement = refinement
         self._executor = executor
         self._progress = progress
@@ -439,8 +446,7 @@ class _Search:
 
     def _roll(self, keys: Sequence[RolloutKey], results: list[tuple[RolloutKey, RolloutResult]]) -> np.ndarray:
         """Run rollouts and keep their results; return whether each was unsafe."""
-        task = self._problem.task
-        found = roll_out(self._problem, self._executor, task, keys, name="boundary", progress=self._progress)
+        found = roll_out(self._problem, self._executor, self._task, keys, name="boundary", progress=self._progress)
         finished = [result for result in found if result is not None]
         if len(finished) < len(found):
             raise KeyboardInterrupt

@@ -30,7 +30,9 @@ from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
 from vtbdrake.rollout.recorded_motion import MotionPlayer
 from vtbdrake.rollout.runner import Testbeds, split
+from vtbdrake.rollout.task import catches
 from vtbdrake.state import Snapshot
+from vtbdrake.state.variables import overlap
 from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -222,9 +224,10 @@ class Problem:
             self._scenario(condition)
             for address, value in split(condition)[1].items():
                 variables[address].check(value)
-            both = [address for address in condition if address in addresses]
-            if both:
-                raise ValueError(f"{both[0]} is a parameter, so that no condition can set it")
+            if both := overlap(addresses, condition):
+                raise ValueError(f"{both[0]} is a parameter, so that no condition can set {both[1]}")
+            if both := overlap(condition, condition):
+                raise ValueError(f"a condition sets {both[0]} and {both[1]}, of which one is an entry of the other")
         for measure in (*self.objectives, *self.constraints):
             for address in measure.of:
                 self.testbed.reader(address)
@@ -362,6 +365,7 @@ class Problem:
         workers: int | None = None,
         record: Sequence[str] = (),
         run_on: bool = False,
+        on_error: str = "record",
         progress: bool = True,
     ) -> Sweep:
         """Run a rollout at every point, under every condition. Ctrl-C keeps the finished rollouts.
@@ -374,11 +378,13 @@ class Problem:
             workers: The number of threads or processes; by default the number of cores.
             record: Addresses and ports to record at the sample times.
             run_on: Whether to simulate to t_m although the threshold was exceeded; then all of G1 is known.
+            on_error: What happens if a quality or constraint function raises, is negative or NaN. ``record``: the
+                rollout counts as failed, with the message, and the first is logged; ``raise``: the sweep ends.
             progress: Whether to show a progress bar.
 
         Raises:
             ValueError: A point lies outside the range of a parameter, or the executor is unknown.
-            QualityError: f raises, is negative or NaN.
+            QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``.
         """
         if (points is None) == (values is None):
             raise ValueError("a sweep takes either the number of points of a grid, or values")
@@ -390,7 +396,7 @@ class Problem:
             table = as_points(parameters, values)
         checked = [self.point(point.tolist()) for point in table]
         keys = [(point, condition) for point in checked for condition in range(len(self.conditions))]
-        task = replace(self.task, record=record, run_on=run_on)
+        task = replace(self.task, record=record, run_on=run_on, catch=catches(on_error))
         with borrowed(self, executor, rollouts=len(keys), workers=workers) as chosen:
             return make_sweep(self, keys, roll_out(self, chosen, task, keys, name="sweep", progress=progress))
 
@@ -403,6 +409,7 @@ class Problem:
         jitter: float = 1e-6,
         executor: str | Executor = "auto",
         workers: int | None = None,
+        on_error: str = "record",
         progress: bool = True,
     ) -> Boundary:
         """Search the largest value of the parameter below which every rollout examined is safe.
@@ -427,9 +434,13 @@ class Problem:
                 scale).
             executor: See `sweep`.
             workers: See `sweep`.
+            on_error: What happens if a quality or constraint function raises, is negative or NaN. ``record``: the
+                rollout counts as failed, which is unsafe, and the first of a round is logged; ``raise``: the search
+                ends.
             progress: Whether to show a progress bar.
 
         Raises:
+            QualityError: f raises, is negative or NaN, and ``on_error`` is ``raise``.
             ValueError: There is not exactly one parameter, neither a threshold nor a constraint, a threshold of a cost
                 (which is a goal, not a danger), or the steps do not fit the range.
             KeyboardInterrupt: The search was interrupted.
@@ -442,6 +453,7 @@ class Problem:
             jitter=jitter,
             executor=executor,
             workers=workers,
+            on_error=on_error,
             progress=progress,
         )
 

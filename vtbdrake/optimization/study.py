@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.error_text import safe_text
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
 from vtbdrake.optimization.parameter import Dimension, checked_point
@@ -20,6 +21,7 @@ from vtbdrake.optimization.solvers import Solver, make_solver
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
+from vtbdrake.rollout.task import catches
 
 if TYPE_CHECKING:
     import optuna
@@ -204,8 +206,7 @@ class Study:
                 f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
             )
         check_budget(problem, rollouts=rollouts, seconds=seconds, target=target)
-        if on_error not in ("record", "raise"):
-            raise ValueError(f"on_error is 'record' or 'raise', not {on_error!r}")
+        catch = catches(on_error)
         for callback in callbacks:
             if not callable(callback):
                 raise ValueError(f"a callback is a function of a study and a trial, not {callback!r}")
@@ -231,7 +232,7 @@ class Study:
                     solver,
                     chosen,
                     racing=racing,
-                    catch=on_error == "record",
+                    catch=catch,
                     progress=progress,
                     after_batch=after_batch,
                 )
@@ -299,7 +300,7 @@ class Study:
         Raises:
             ValueError: The value cannot be stored, or the point is invalid.
         """
-        if not isinstance(key, str) or not key:
+        if not isinstance(key, str) or not key or key != safe_text(key):
             raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
         (kept,) = plain({key: value}, "attributes").values()
         self._file.set_attribute(None if point is None else checked_point(self.parameters, point), key, kept)
@@ -399,8 +400,12 @@ class Study:
         return tuple(t for t, own in zip(found, signed, strict=True) if not any(_dominates(o, own) for o in signed))
 
     def _failures(self) -> str:
-        messages = Counter(o.message for o in self.rollouts.values() if o.end == "failed")
-        return "".join(f"; {count} rollouts failed: {message}" for message, count in messages.most_common(1))
+        messages = [outcome.message for outcome in self.rollouts.values() if outcome.failed]
+        if not messages:
+            return ""
+        count = "1 rollout" if len(messages) == 1 else f"{len(messages)} rollouts"
+        first = "" if len(set(messages)) == 1 else ", the first"
+        return f"; {count} failed{first}: {messages[0]}"
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Return columns by name, one entry per trial.

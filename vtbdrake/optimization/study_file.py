@@ -19,9 +19,10 @@ from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
+from vtbdrake.error_text import safe_text
 from vtbdrake.optimization.solvers.solver import Point, PointValues
 from vtbdrake.rollout import RolloutResult
-from vtbdrake.rollout.task import QUALITY_FAILED
+from vtbdrake.rollout.task import FAILED, QUALITY_FAILED
 
 VERSION = 2
 _APPLICATION = 0x56544253  # "VTBS"
@@ -65,10 +66,16 @@ class Outcome:
     message: str
     wall_time: float
 
+    @property
+    def failed(self) -> bool:
+        """Return whether the rollout failed."""
+        return self.end == FAILED
+
     @classmethod
     def of(cls, result: RolloutResult) -> Outcome:
         """Return the part of a result that is stored: everything but its trajectories."""
-        return cls(**{field.name: getattr(result, field.name) for field in fields(cls)})
+        values = {field.name: getattr(result, field.name) for field in fields(cls)}
+        return cls(**{**values, "message": safe_text(result.message)})
 
 
 @dataclass(frozen=True)

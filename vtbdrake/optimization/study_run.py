@@ -17,7 +17,7 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyFile, Trial
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.executor import watched
-from vtbdrake.rollout.task import QUALITY_FAILED
+from vtbdrake.rollout.task import quality_warning
 from vtbdrake.testbed.interrupt import Interruptible
 
 _log = logging.getLogger(__name__)
@@ -234,13 +234,10 @@ class StudyRun:
             raise _RunEnd(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
 
     def _warn(self, outcome: Outcome) -> None:
-        """Log once in a run that the quality function fails: it may be wrong, and the run useless."""
-        if outcome.message.startswith(QUALITY_FAILED) and not self._warned:
+        """Log once in a run that the quality function fails."""
+        if not self._warned and (warning := quality_warning(outcome.message)):
             self._warned = True
-            _log.warning(
-                "%s. The rollout counts as failed, and so do others of this kind; on_error='raise' ends the run",
-                outcome.message.removeprefix(QUALITY_FAILED),
-            )
+            _log.warning("%s", warning)
 
     def _log_progress(self) -> None:
         of = "" if self._limit == inf else f" of {self._limit:g}"

@@ -102,12 +102,12 @@ class Sweep:
 
     @property
     def unsafe(self) -> np.ndarray:
-        """Return whether the threshold was exceeded, a constraint violated, or the simulation failed, shape (n,)."""
+        """Return whether the threshold was exceeded, a constraint violated, or the rollout failed, shape (n,)."""
         return self.exceeded | self.violated | self.failed
 
     @property
     def failed(self) -> np.ndarray:
-        """Return whether the simulation failed, shape (n,)."""
+        """Return whether the simulation, or the function of a quality or constraint, failed, shape (n,)."""
         return np.array([rollout.failed for rollout in self.rollouts], dtype=bool)
 
     @property

@@ -22,7 +22,7 @@ from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
 from vtbdrake.rollout.start import Start, Starts, start_of_each
-from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.task import RolloutResult, RolloutTask, quality_warning
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -228,18 +228,23 @@ def run_rollouts(
 ) -> list[RolloutResult | None]:
     """Run the rollouts with a progress bar; return one result per point, in the order of ``points``.
 
-    Ctrl-C ends the running rollouts and starts no more; a point without a result has None.
+    Ctrl-C ends the running rollouts and starts no more; a point without a result has None. The first failure of f that
+    the task catches is logged.
 
     Raises:
-        QualityError: f raises, is negative or NaN.
+        QualityError: f raises, is negative or NaN, and the task does not catch that.
     """
     results: list[RolloutResult | None] = [None] * len(points)
+    warned = False
     with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and watched())) as bar:
         rollouts = executor.run(task, points)
         try:
             with Interruptible() as interruptible:
                 for index, result in rollouts:
                     results[index] = result
+                    if not warned and (warning := quality_warning(result.message)):
+                        warned = True
+                        _log.warning("%s", warning)
                     bar.update()
                     interruptible.check()
         except KeyboardInterrupt:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from math import inf, isnan, nan
 
 from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.error_text import safe_text
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 
 # How a rollout ends: it cannot win any more; its quality has not improved for too long.
@@ -158,7 +159,7 @@ class Prospect:
         try:
             bound = float(self._pruning.bound(left, *values))
         except (Exception, SystemExit) as error:
-            raise QualityError(f"the bound of a pruning raises {type(error).__name__}: {error}") from error
+            raise QualityError(f"the bound of a pruning raises {type(error).__name__}: {safe_text(error)}") from error
         if isnan(bound):
             raise QualityError(f"the bound of a pruning is NaN with {left:g} s left, for {values}")
         return bound

@@ -6,11 +6,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite, isnan
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from vtbdrake.argument_checks import as_addresses, as_flag, as_number
+from vtbdrake.error_text import safe_text
 
 # (times, samples, True if larger samples are better) -> (time, number)
 Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[float, float]]
@@ -49,7 +50,7 @@ def check_reading(reading: str) -> str:
 
 
 class QualityError(ValueError):
-    """A quality function raises, or returns a value that is not a quality."""
+    """The function of a quality or constraint raises, or returns a value that is none."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,6 +69,9 @@ class Measure:
     f: Callable[..., float]
     of: Sequence[str]
     reading: str = field(default="best", kw_only=True)
+
+    # A word for the function in messages.
+    role: ClassVar[str] = "measure"
 
     def __post_init__(self) -> None:
         if not callable(self.f):
@@ -105,7 +109,7 @@ class Measure:
         try:
             sample = float(self.f(*values))
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            raise QualityError(f"{self._at(values, time)} raises {type(error).__name__}: {error}") from error
+            raise QualityError(f"{self._at(values, time)} raises {type(error).__name__}: {safe_text(error)}") from error
         self._check(sample, lambda: self._at(values, time))
         return sample
 
@@ -114,8 +118,8 @@ class Measure:
             raise QualityError(f"{where()} is {sample}, but it must be finite")
 
     def _at(self, values: Sequence[Any], time: float) -> str:
-        arguments = ", ".join(f"{address} = {value}" for address, value in zip(self.of, values, strict=True))
-        return f"the quality function {self.name} at t = {time:g} s, {arguments},"
+        arguments = ", ".join(f"{address} = {safe_text(value)}" for address, value in zip(self.of, values, strict=True))
+        return f"the {self.role} function {self.name} at t = {time:g} s, {arguments},"
 
     @abstractmethod
     def read(self, times: np.ndarray, samples: np.ndarray) -> float:
@@ -132,6 +136,8 @@ class Quality(Measure):
         minimize: Whether f is a cost.
         upper: An upper bound of f, if one is known; racing needs it to drop a candidate that can no longer win.
     """
+
+    role: ClassVar[str] = "quality"
 
     minimize: bool = field(default=False, kw_only=True)
     upper: float = field(default=inf, kw_only=True)
@@ -179,6 +185,8 @@ class Constraint(Measure):
         at_most, at_least: The limits, in the unit of f; one of them or both.
         reading: See `Measure`; ``worst``: the condition holds at every sample time, ``best``: at one at least.
     """
+
+    role: ClassVar[str] = "constraint"
 
     reading: str = field(default="worst", kw_only=True)
     at_most: float = field(default=inf, kw_only=True)

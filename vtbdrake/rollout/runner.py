@@ -445,7 +445,7 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
         # f may accept NaN (nothing was detected). If it does not, NaN is a failure of the simulation.
         if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
             raise
-        raise SimulationError(f"a quality variable is not finite: {error}") from error
+        raise SimulationError(f"a variable of a {measure.role} is not finite: {error}") from error
 
 
 def _t_star(f: Quality, times: np.ndarray, samples: np.ndarray, threshold: float | None) -> tuple[float, float]:
@@ -576,8 +576,7 @@ class Runners:
             raise
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             chosen = ", ".join(f"{FIELD}{name} = {value!r}" for name, value in fields.items())
-            text = " ".join(str(error).split())
-            raise BuildError(f"no testbed can be built with {chosen}: {type(error).__name__}: {text}") from error
+            raise BuildError(f"no testbed can be built with {chosen}: {error_text(error)}") from error
         return RolloutRunner(changed, testbed)
 
     def run(

@@ -24,8 +24,27 @@ THRESHOLD = "threshold"
 HORIZON = "horizon"
 TERMINATED = "terminated"
 FAILED = "failed"
-# Begin of the message of a rollout whose quality function failed.
+# Begin of the message of a rollout in which the function of a quality or constraint failed.
 QUALITY_FAILED = "QualityError: "
+
+
+def catches(on_error: str) -> bool:
+    """Return whether an error of f fails only its rollout, see `RolloutTask.catch`.
+
+    Raises:
+        ValueError: ``on_error`` is neither ``record`` nor ``raise``.
+    """
+    if on_error not in ("record", "raise"):
+        raise ValueError(f"on_error is 'record' or 'raise', not {on_error!r}")
+    return on_error == "record"
+
+
+def quality_warning(message: str) -> str:
+    """Return what to log of a rollout's message if f failed, which may be wrong and the run useless; else nothing."""
+    if not message.startswith(QUALITY_FAILED):
+        return ""
+    text = message.removeprefix(QUALITY_FAILED)
+    return f"{text}. The rollout counts as failed, and so do others of this kind; on_error='raise' ends the run"
 
 
 @dataclass(frozen=True, repr=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -132,7 +133,7 @@ class AddressError(KeyError, ValueError):
 
 
 # One entry of an array, in C order: ``address[3]``.
-_ENTRY = re.compile(r"(.+)\[(\d+)\]")
+_ENTRY = re.compile(r"(.+)\[(0|[1-9][0-9]*)\]")
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:
@@ -278,6 +279,15 @@ def check_address(address: object) -> None:
     """
     if not isinstance(address, str):
         raise AddressError(f"an address is a text, such as 'plant.box.mass', not {address!r}")
+
+
+def overlap(addresses: Iterable[str], others: Iterable[str]) -> tuple[str, str] | None:
+    """Return the first address of each that are an array and an entry of it, or equal; None if there are none.
+
+    If the addresses and the others are the same object, an address is not compared with itself.
+    """
+    pairs = itertools.combinations(addresses, 2) if addresses is others else itertools.product(addresses, others)
+    return next(((a, b) for a, b in pairs if a == b or a.startswith(f"{b}[") or b.startswith(f"{a}[")), None)
 
 
 def _entry(variable: Variable, index: int) -> Variable:
