@@ -278,7 +278,7 @@ GAIN, ELBOW = "dps.gain", "sim.sys.Acrobot.elbow.velocity"
             {GAIN: [1.0, 0.0, 0.0, 0.0]},
             rf"{GAIN}\[0\] is a parameter, so that no condition can set {GAIN}",
         ),
-        ([f"{GAIN}[0]"], {f"{GAIN}[0]": 1.0}, rf"{GAIN}\[0\] is a parameter, so that no condition can set {GAIN}\[0\]"),
+        ([f"{GAIN}[0]"], {f"{GAIN}[0]": 1.0}, rf"{GAIN}\[0\] is a parameter, so that no condition can set it"),
         ([f"{GAIN}[1]"], {GAIN: [0.0] * 4, f"{GAIN}[0]": 1.0}, rf"{GAIN}\[1\] is a parameter"),
         (
             [ELBOW],

@@ -1,7 +1,9 @@
 """The file of a study when it cannot be used: what is said, and that nothing is lost."""
 
 import json
+import os
 import random
+import shutil
 import sqlite3
 import zlib
 
@@ -123,3 +125,72 @@ def test_a_damaged_file_is_refused_or_says_what_it_said(tmp_path, whole_study, k
             refused += 1
         assert path.read_bytes() == changed, "it is left as it is"
     assert refused > 20
+
+
+@pytest.fixture(scope="module", params=["new log", "log used again"])
+def killed_study(request, tmp_path_factory):
+    """A study as a killed process leaves it: its last rollouts are in the log."""
+    path, left = (tmp_path_factory.mktemp(name) / "a.db" for name in ("running", "killed"))
+    with pendulum_problem().study(path, solver="sobol") as study:
+        if request.param == "log used again":
+            study.add(*([angle, 0.0] for angle in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)))
+            study._file._db.execute("PRAGMA wal_checkpoint(RESTART)")
+        for number in range(12):
+            study.set_attribute(f"note {number}", number)
+        for end in ("", "-wal"):
+            shutil.copy(f"{path}{end}", f"{left}{end}")
+    return left
+
+
+def test_a_damaged_log_is_told_and_left_as_it_is(tmp_path, killed_study):
+    def attributes():
+        with Study.open(path) as study:
+            return study.attributes
+
+    path, log = tmp_path / "a.db", tmp_path / "a.db-wal"
+    db, content = killed_study.read_bytes(), killed_study.with_name("a.db-wal").read_bytes()
+    path.write_bytes(db)
+    log.write_bytes(content)
+    before = attributes()
+    assert before == {f"note {number}": number for number in range(12)}
+    chance, refused = random.Random(1), 0
+    for _ in range(150):
+        changed, at = bytearray(content), chance.randrange(len(content))
+        changed[at] ^= 1 << chance.randrange(8)
+        path.write_bytes(db)
+        log.write_bytes(changed)
+        try:
+            assert attributes() == before
+        except StudyError as error:
+            refused += 1
+            assert "a.db-wal is damaged after" in str(error)
+            assert path.read_bytes() == db and log.read_bytes() == changed
+            # What the message offers: without the rest of the log, it is the study of an earlier time.
+            cut = int(str(error).partition("truncate -s ")[2].split()[0])
+            os.truncate(log, cut)
+            assert attributes().items() <= before.items()
+    assert refused > 50
+
+
+def test_a_log_that_ends_within_a_write_is_no_damage(tmp_path, killed_study):
+    path, log = tmp_path / "a.db", tmp_path / "a.db-wal"
+    content = killed_study.with_name("a.db-wal").read_bytes()
+    for length in random.Random(2).sample(range(len(content)), 20):
+        shutil.copy(killed_study, path)
+        log.write_bytes(content[:length])
+        with Study.open(path) as study:
+            assert study.attributes.items() <= {f"note {number}": number for number in range(12)}.items()
+
+
+def test_the_log_of_a_long_run_stays_short_and_is_empty_after_it(tmp_path):
+    path = tmp_path / "a.db"
+    longest = 0
+
+    def look(study, trial):
+        nonlocal longest
+        longest = max(longest, path.with_name("a.db-wal").stat().st_size)
+
+    with pendulum_problem().study(path, solver="random") as study:
+        study.run(rollouts=300, executor="serial", progress=False, callbacks=[look])
+        assert path.with_name("a.db-wal").stat().st_size == 0
+    assert 0 < longest < 300 * 4096

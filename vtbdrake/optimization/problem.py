@@ -225,7 +225,8 @@ class Problem:
             for address, value in split(condition)[1].items():
                 variables[address].check(value)
             if both := overlap(addresses, condition):
-                raise ValueError(f"{both[0]} is a parameter, so that no condition can set {both[1]}")
+                part = "it" if both[0] == both[1] else both[1]
+                raise ValueError(f"{both[0]} is a parameter, so that no condition can set {part}")
             if both := overlap(condition, condition):
                 raise ValueError(f"a condition sets {both[0]} and {both[1]}, of which one is an entry of the other")
         for measure in (*self.objectives, *self.constraints):

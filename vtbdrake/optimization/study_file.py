@@ -21,6 +21,7 @@ from typing import Any
 
 from vtbdrake.error_text import safe_text
 from vtbdrake.optimization.solvers.solver import Point, PointValues
+from vtbdrake.optimization.write_ahead_log import lost_writes
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.task import FAILED, QUALITY_FAILED
 
@@ -44,6 +45,8 @@ _TABLES = {
     "attributes": "point TEXT, key TEXT, value TEXT",
 }
 _KEYS = {"rollouts": "point, condition", "trials": "batch, position", "attributes": "point, key"}
+# The pages of the write-ahead log before they are written to the file, where every row is checked.
+_LOG_PAGES = 200
 _ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units"}
 
 # (point, number of the condition)
@@ -130,6 +133,8 @@ class StudyFile:
                 raise StudyError(f"there is no study file {self.path}")
             if not self.path.parent.is_dir():
                 raise StudyError(f"{self.path} lies in a folder that does not exist")
+        if self.path is not None:
+            _refuse_lost_writes(self.path)
         with _explained(self.path):
             # Commits are explicit; the lock of this object keeps threads apart.
             self._db = sqlite3.connect(
@@ -142,6 +147,7 @@ class StudyFile:
                     self._refuse_damage()
                 # A killed process loses nothing that was committed; a power failure may lose the last rollouts.
                 self._db.execute("PRAGMA synchronous = NORMAL")
+                self._db.execute(f"PRAGMA wal_autocheckpoint = {_LOG_PAGES}")
                 if meta is not None and self._is_empty():
                     self._create(meta)
             self._addresses = [parameter["address"] for parameter in self.meta["problem"]["parameters"]]
@@ -191,6 +197,12 @@ class StudyFile:
             self._set(meta)
             self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {VERSION}")
+        self._empty_log()
+
+    def _empty_log(self) -> None:
+        """Write the log into the file; nothing happens while another process uses the log."""
+        with self._lock, _explained(self.path):
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -255,6 +267,7 @@ class StudyFile:
             finally:
                 with self._transaction():
                     self._insert("sessions", [(*begun, _now(), "; ".join(reason), *about)], instead="REPLACE")
+                self._empty_log()
 
     # -- contents
 
@@ -551,6 +564,37 @@ def _claim(path: Path | None) -> Iterator[None]:
     finally:
         lock.unlink(missing_ok=True)
         os.close(handle)
+
+
+def _is_claimed(path: Path) -> bool:
+    """Return whether a process runs the study."""
+    try:
+        with open(path.with_name(path.name + "-lock")) as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def _refuse_lost_writes(path: Path) -> None:
+    """Refuse a file in whose write-ahead log damage would hide the last writes.
+
+    Raises:
+        StudyError: There is such damage.
+    """
+    if _is_claimed(path):  # It is being written.
+        return
+    with _explained(path):
+        lost = lost_writes(path)
+    if lost is not None:
+        log = f"{path}-wal"
+        raise StudyError(
+            f"the write-ahead log {log} is damaged after {lost.readable} bytes, which hides {lost.frames} pages that "
+            f"were written later; it was left unchanged: restore both files from a copy, or cut the log (truncate "
+            f"-s {lost.readable} {log}) to go on without these writes: their rollouts run again"
+        )
 
 
 def _damaged(path: Path | None, reason: object) -> StudyError:
