@@ -12,7 +12,9 @@ from vtbdrake.optimization import Choice as Choice
 from vtbdrake.optimization import CVaR as CVaR
 from vtbdrake.optimization import Parameter as Parameter
 from vtbdrake.optimization import Problem as Problem
+from vtbdrake.optimization import Quantile as Quantile
 from vtbdrake.optimization import Study as Study
+from vtbdrake.reasoning.belief import Belief as Belief
 from vtbdrake.reasoning.budget import Budget as Budget
 from vtbdrake.reasoning.onboard import OnboardReasoner as OnboardReasoner
 from vtbdrake.reasoning.reasoner import Reasoner as Reasoner

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.optimization import Choice, Parameter
+from vtbdrake.optimization.parameter import point_text
 
 pytestmark = pytest.mark.one_python
 
@@ -64,3 +65,18 @@ def test_a_logarithmic_range_has_its_geometric_mean_in_the_middle():
 def test_what_is_no_value_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "text"),
+    [
+        (Parameter("kp", 0.0, 400.0), 400.0, "kp = 400 N (the upper end of its range)"),
+        (Parameter("kp", 0.0, 400.0), 399.99999, "kp = 400 N (the upper end of its range)"),
+        (Parameter("kp", 1e-3, 1e3, log=True), 1e-3, "kp = 0.001 N (the lower end of its range)"),
+        (Parameter("kp", 0.0, 400.0), 39.99999999999123, "kp = 40 N"),
+        (Parameter("kp", 0, 3, integer=True), 3, "kp = 3 N (the upper end of its range)"),
+        (Choice("kp", ["low", "high"]), "high", "kp = 'high'"),
+    ],
+)
+def test_a_value_at_an_end_of_its_range_is_pointed_out(parameter, value, text):
+    assert point_text([parameter], [value], ["N"]) == text

@@ -1,6 +1,7 @@
 """Decisions whose answers are known; budgets, candidates, methods, executors; what is refused."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
 from tests.reasoning.scenarios import HANG, KILL, FencedMassScenario, MassScenario, SwingUpScenario
+from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Choice, Parameter
-from vtbdrake.reasoning import Belief, Budget, Reasoner, ReasonerError
-from vtbdrake.rollout import Constraint, ProcessExecutor, Pruning, Quality, SerialExecutor, ThreadExecutor
+from vtbdrake.reasoning import Belief, BeliefError, Budget, Reasoner, ReasonerError
+from vtbdrake.rollout import Constraint, ProcessExecutor, Pruning, Quality, SerialExecutor, Start, ThreadExecutor
 from vtbdrake.testbed import DpsAlone
 
 SWITCH = Parameter("u.switch", 0.0, 3.0)
@@ -666,6 +668,18 @@ def test_a_plan_that_cannot_be_decided_is_refused(mass):
         decide(make(), mass, plan={"u.switch": 9.0})
     with pytest.raises(ValueError, match="wrong about u.other"):
         decide(make(), mass, plan={"u.switch": 1.0, "u.other": 1.0})
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads"])
+def test_a_start_of_another_testbed_is_a_belief_error(mass, executor):
+    other = PendulumScenario().build()
+    start = Start.of(mass, mass.default_context())
+    with make(executor=executor) as reasoner:
+        with pytest.raises(BeliefError, match=r"no rollout can begin from Start.*of another testbed"):
+            reasoner.decide(Start.of(other, other.default_context()))
+        with pytest.raises(BeliefError, match=r"no rollout can begin from Start.*u\.other"):
+            reasoner.decide(replace(start, values={**start.values, "u.other": 1.0}))
+        assert reasoner.decide(start)
 
 
 def test_a_second_decision_at_the_same_time_is_refused(mass):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from functools import cache
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -134,3 +135,24 @@ def test_bad_trajectories_are_refused(changes: dict[str, Any], message: str) -> 
 def test_bad_knots_are_refused(knots: np.ndarray) -> None:
     with pytest.raises(ValueError, match="u.plan"):
         trajectory("cubic").limited(knots)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("duration", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("order", ["linear", "cubic", "bspline"])
+def test_limits_are_kept_at_any_scale_of_values_and_time(order: str, duration: float, scale: float) -> None:
+    rng = np.random.default_rng(5)
+    for share in (1e-4, 1e-2, 1.0):
+        rate = share * scale / duration
+        acceleration = inf if order == "linear" else 10.0 * rate / duration
+        plan = Trajectory(
+            "u.plan", 8, duration, order, lower=-scale, upper=2.0 * scale, rate=rate, acceleration=acceleration
+        )
+        for start in (None, 2.0 * scale, 0.3 * scale):
+            knots = plan.limited(rng.uniform(-3.0 * scale, 3.0 * scale, 8), start=start)
+            assert plan.excess(knots) == {}
+            times = np.linspace(0.0, duration, 400)
+            for derivative, limit in enumerate((2.0 * scale, rate, acceleration)):
+                assert np.abs(plan.values(knots, times, derivative)).max() <= limit * (1.0 + 1e-9)
+            # They use what is allowed.
+            assert np.abs(plan.values(knots, times, 1)).max() > 0.3 * rate or share == 1.0

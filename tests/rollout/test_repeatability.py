@@ -8,6 +8,7 @@ import pytest
 
 import vtbdrake as vtb
 from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
+from vtbdrake.rollout.repeatability import Check
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
@@ -140,3 +141,11 @@ def test_a_failing_simulation_is_compared_too():
     assert found.ok
     assert f"the rollout fails after {found.seconds:g} s: {found.failure}" in str(found)
     assert "RuntimeError: " in found.failure
+
+
+def test_a_notebook_shows_the_sentences():
+    check = Check(("x < y & z",), 0.1, "it fell")
+    assert check._repr_html_() == (
+        "<div>x &lt; y &amp; z</div><div>no more was compared, as the rollout fails after 0.1 s: it fell</div>"
+    )
+    assert repr(Check((), 0.1)).startswith("Check(nothing found: rollouts repeat over 0.1 s")

@@ -9,8 +9,9 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from tests.optimization.studies import THETA, pendulum_problem
 from vtbdrake.optimization import Parameter, Sweep
-from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout import Quality, RolloutResult
 from vtbdrake.rollout.quality import best_sample
 from vtbdrake.visualization import plot_quality, plot_sweep
 
@@ -215,3 +216,65 @@ def test_notebook_shows_the_figure_once() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["[]", "b'PNG'"]
+
+
+def of_cost(cost: np.ndarray, threshold: float = np.inf, **parameters: float) -> RolloutResult:
+    """A rollout as a runner returns it of a cost: the trajectory is 1 / (1 + cost)."""
+    below = np.flatnonzero(cost < (threshold if np.isfinite(threshold) else -1.0))
+    best = below[0] if below.size else int(np.argmin(cost))
+    return RolloutResult(
+        parameters=parameters,
+        end="horizon",
+        times=TIMES,
+        quality=1.0 / (1.0 + cost),
+        t_star=TIMES[best],
+        h=1.0 / (1.0 + cost[best]),
+        value=cost[best],
+        threshold=1.0 / (1.0 + threshold) if np.isfinite(threshold) else np.inf,
+        exceedances=TIMES[below[:1]],
+    )
+
+
+COSTS = [40.0 - 10.0 * TIMES, 30.0 + 5.0 * TIMES]
+
+
+def test_a_cost_is_drawn_as_a_cost_with_its_unit() -> None:
+    def effort(x: float) -> float:
+        return x
+
+    axes = plot_quality(
+        [of_cost(COSTS[0], 25.0, mass=1.0)], quality=Quality(effort, "x", minimize=True, unit="J")
+    ).axes[0]
+    (line,) = marked(axes, "trajectory")
+    np.testing.assert_allclose(line.get_ydata(), COSTS[0], rtol=1e-12)
+    np.testing.assert_allclose(xy(marked(axes, "t_star")), [[1.6, 24.0]])
+    assert [line.get_ydata()[0] for line in marked(axes, "threshold")] == pytest.approx([25.0])
+    assert axes.get_ylabel() == "effort: cost c(s⁰, t) [J]"
+    assert "c_m = 25" in [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_a_sweep_of_a_cost_is_drawn_as_costs() -> None:
+    one = replace(sweep([0, 20], [of_cost(cost) for cost in COSTS]), minimize=(True,))
+    left, right = plot_sweep(one).axes[:2]
+    (line,) = marked(left, "h")
+    np.testing.assert_allclose(line.get_ydata(), [20.0, 30.0])
+    assert left.get_ylabel() == "cost c(s⁰, t*)"
+    for line, cost in zip(marked(right, "trajectory"), COSTS, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), cost, rtol=1e-12)
+
+
+def test_the_worst_cost_of_several_conditions_is_the_largest() -> None:
+    rollouts = [of_cost(cost) for cost in [*COSTS, COSTS[0], COSTS[0]]]
+    grid = sweep([[0, 0], [1, 0]], rollouts, conditions=({}, {}), parameters=(MASS, FRICTION), units=("kg", ""))
+    axes = plot_sweep(replace(grid, minimize=(True,))).axes[0]
+    (points,) = [artist for artist in axes.collections if artist.get_gid() == "h"]
+    np.testing.assert_allclose(points.get_array(), [30.0, 20.0])
+
+
+def test_a_rollout_of_a_cost_shows_the_cost_in_a_notebook() -> None:
+    problem = pendulum_problem()
+    shown = problem.rollout([0.5, 0.0])
+    (line,) = marked(shown.plot().axes[0], "trajectory")
+    theta = problem.rollout([0.5, 0.0], record=[THETA]).record[THETA]
+    np.testing.assert_allclose(line.get_ydata(), np.abs(theta - 0.3), rtol=1e-9)
+    assert shown.plot().axes[0].get_ylabel() == "gap: cost c(s⁰, t)"

@@ -34,7 +34,7 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.output import number, table, write_csv
 from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
 from vtbdrake.optimization.boundary import why_no_boundary
-from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.parameter import Dimension, point_text
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.executor import NAMES
@@ -288,7 +288,7 @@ def _conclusion(sweep: Sweep) -> str:
         point, h = sweep.best()
     except ValueError as error:
         raise FailedError(one_line(error)) from error
-    at = ", ".join(f"{address} = {number(value)}" for address, value in point.items())
+    at = point_text(sweep.parameters, list(point.values()), sweep.units)
     lines.append(f"best: h = {number(h)} at {at}")
     if not why_no_boundary(sweep):
         lines.append(f"boundary: {sweep.boundary()}")
@@ -306,7 +306,7 @@ def _report(found: Boundary, sweep: Sweep) -> str:
         lines.append(f"  {with_unit(number(chance.value), found.unit)}: {chance}{which}")
     if found.failed_at:
         values = ", ".join(map(number, found.failed_at))
-        lines.append(f"counted as unsafe: the simulation failed at {with_unit(values, found.unit)}")
+        lines.append(f"counted as unsafe: a rollout failed at {with_unit(values, found.unit)}")
     rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]
     seconds = sum(rollout.wall_time for rollout in rollouts)
     return "\n".join([*lines, f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation"])

@@ -223,6 +223,23 @@ class Choice(_Addressed):
 
 Dimension = Parameter | Choice
 
+# A value is at an end of its range if it is closer than this part of the range.
+_AT_END = 1e-6
+
+
+def point_text(parameters: Sequence[Dimension], point: Sequence[Any], units: Sequence[str]) -> str:
+    """Return the values of a point with six digits and units; a value at an end of its range is pointed out."""
+    texts = []
+    for parameter, value, unit in zip(parameters, point, units, strict=True):
+        if isinstance(parameter, Choice):
+            texts.append(f"{parameter.address} = {value!r}")
+            continue
+        near = _AT_END * (parameter.upper - parameter.lower)
+        end = "lower" if value - parameter.lower <= near else "upper" if parameter.upper - value <= near else ""
+        told = f" (the {end} end of its range)" if end else ""
+        texts.append(f"{parameter.address} = {with_unit(f'{value:.6g}', unit)}{told}")
+    return ", ".join(texts)
+
 
 def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[str, Any]) -> tuple[Any, ...]:
     """Check a point s^0, given as values in the order of the parameters or by address, and return its values.

@@ -94,10 +94,10 @@ class ProblemRollout(RolloutResult):
         return show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
 
     def plot(self) -> Figure:
-        """Plot the quality trajectory with t* marked (Figure 5)."""
+        """Plot the quality trajectory with t* marked (Figure 5); of a cost, the cost itself."""
         from vtbdrake.visualization import plot_quality
 
-        return plot_quality([self])
+        return plot_quality([self], quality=self.problem.objectives[0])
 
 
 class Problem:

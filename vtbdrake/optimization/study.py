@@ -16,7 +16,7 @@ from vtbdrake.argument_checks import as_whole
 from vtbdrake.error_text import safe_text
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
-from vtbdrake.optimization.parameter import Dimension, checked_point
+from vtbdrake.optimization.parameter import Dimension, checked_point, point_text
 from vtbdrake.optimization.solvers import Solver, make_solver
 from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial
 from vtbdrake.optimization.study_run import StudyRun, check_budget
@@ -479,8 +479,7 @@ class Study:
             best = self.best
         except ValueError as error:
             return f"best: {error}"
-        at = ", ".join(f"{address} = {value!r}" for address, value in best.parameters.items())
-        return f"best: {self.names[0]} = {best.value:g} at {at}"
+        return f"best: {self.names[0]} = {best.value:g} at {point_text(self.parameters, best.point, self.units)}"
 
     # -- pictures and exports
 

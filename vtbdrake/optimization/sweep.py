@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import all_of, as_whole, check_plain
 from vtbdrake.lazy import extra_module
-from vtbdrake.optimization.parameter import Parameter
+from vtbdrake.optimization.parameter import Parameter, point_text
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
 from vtbdrake.optimization.study_file import RolloutKey
@@ -68,7 +68,7 @@ class Sweep:
 
         try:
             point, h = self.best()
-            best = f"{h:g} at {', '.join(f'{address} = {value:g}' for address, value in point.items())}"
+            best = f"{h:g} at {point_text(self.parameters, list(point.values()), self.units)}"
         except ValueError as error:
             best = str(error)
         rows: dict[str, object] = {p.address: p.range_text for p in self.parameters}

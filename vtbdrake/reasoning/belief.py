@@ -261,7 +261,8 @@ class Starter:
         if not self._targets:
             raise BeliefError(
                 f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
-                "declare them with VirtualTestbedBuilder.believe, or take Belief.perfect"
+                "declare them with VirtualTestbedBuilder.believe, or begin in the true world of a simulated testbed, "
+                "Belief.perfect(testbed, context)"
             )
         self._check_dps(dps)
         for name in self._sensors:

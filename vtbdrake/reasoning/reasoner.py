@@ -20,13 +20,13 @@ from vtbdrake.optimization.problem import Motion, Problem, recording_motion
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.reasoning.belief import Belief, Starter, Uncertainty
+from vtbdrake.reasoning.belief import Belief, BeliefError, Starter, Uncertainty
 from vtbdrake.reasoning.budget import Budget, check_budget
 from vtbdrake.reasoning.decision import Decision
 from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
-from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, make_executor
+from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.testbed import Scenario
@@ -249,14 +249,17 @@ class Reasoner:
                 if context is None:
                     raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")
                 believer, now = Belief.of(believer, context), max(now, context.get_time())
-            starts = self._starts(believer, now)
-            held = self._plan_in_use(starts[0])
-            given = None if plan is None else self.space.point(plan, starts[0].time)
             try:
-                decision = DecisionRun(self, budget, starts, held, given, begin).decision()
-            except BaseException:
-                self._warm = False  # Workers that are interrupted are ended, and others take their place.
-                raise
+                starts = self._starts(believer, now)
+                held = self._plan_in_use(starts[0])
+                given = None if plan is None else self.space.point(plan, starts[0].time)
+                try:
+                    decision = DecisionRun(self, budget, starts, held, given, begin).decision()
+                except BaseException:
+                    self._warm = False  # Workers that are interrupted are ended, and others take their place.
+                    raise
+            except StartError as error:
+                raise BeliefError(f"no rollout can begin from {believer!r}: {error}") from error
             doubts = self._unbelieved.warnings(believer) if isinstance(believer, Belief) else ()
             if doubts and not self._has_warned:
                 _log.warning("the decision at t = %g s: %s", decision.time, doubts[0])

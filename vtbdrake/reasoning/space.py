@@ -80,6 +80,8 @@ class DecisionSpace:
             value = plan[element.address]
             if isinstance(element, Trajectory):
                 begin, *knots = element.check(value)
+                for parameter, knot in zip(element.parameters, knots, strict=True):
+                    parameter.check(knot)
                 point += element.shifted(knots, time - begin).tolist()
             else:
                 point.append(element.check(value))

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 # Rows that are this small beside the largest one are rounding errors of zero.
 _NEGLIGIBLE = 1e-12
-# Relative: limits that are exceeded by less count as kept, and those of rates are reached up to this.
+# Relative: limits that are exceeded by less count as kept, and the projection aims below those of rates by this.
 _ROUNDING, _ACCURACY = 1e-9, 1e-5
 _LIMITS = ("lower", "upper", "rate", "acceleration")
 
@@ -207,8 +207,22 @@ class Trajectory:
         if not (self.spline.stays_within_knots and self._has_only_range):
             exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
             for j in np.flatnonzero(exceeded).tolist():
-                w[:, j] = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+                kept = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+                w[:, j] = self._slowed(kept, j)
         return w.reshape(np.shape(knots))
+
+    def _slowed(self, w: Array, j: int) -> Array:
+        """Return the knots of entry ``j``, drawn together towards the first one until the limits of rates are kept.
+
+        The accuracy of the projection is relative to the largest number in it, which may be a range far above what a
+        small rate allows.
+        """
+        factor = 1.0
+        for derivative, limit in enumerate(self._limits[2:, j], 1):
+            if limit < inf:
+                largest = np.abs(self.spline.extremes(w[:, None], derivative)).max()
+                factor = min(factor, limit / largest) if largest > limit else factor
+        return w if factor == 1.0 else w[0] + factor * (w - w[0])
 
     def _projected(self, w: Array, j: int, *, fixed: int) -> Array:
         """Return the knots of entry ``j`` nearest to ``w`` that keep its limits; the first ``fixed`` ones are kept."""

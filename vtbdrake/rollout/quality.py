@@ -64,11 +64,13 @@ class Measure:
         reading: How the samples become one number: ``best``, ``worst`` (over time), ``end``, or ``integral`` (over
             time, by the trapezoidal rule). All readings use the samples up to the end of the rollout: at t_m, or
             earlier if a threshold is exceeded or a system of the testbed terminates the simulation.
+        unit: The unit of f, for plots.
     """
 
     f: Callable[..., float]
     of: Sequence[str]
     reading: str = field(default="best", kw_only=True)
+    unit: str = field(default="", kw_only=True)
 
     # A word for the function in messages.
     role: ClassVar[str] = "measure"

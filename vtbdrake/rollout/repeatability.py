@@ -6,6 +6,7 @@ import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from html import escape
 from itertools import zip_longest
 from typing import Any
 
@@ -29,7 +30,7 @@ _BUDGET = 0.1
 Sample = Mapping[str, tuple[Any, ...]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Check:
     """The findings of `check_rollouts`.
 
@@ -47,6 +48,13 @@ class Check:
     def ok(self) -> bool:
         """Return whether nothing was found."""
         return not self.findings
+
+    def __repr__(self) -> str:
+        return f"Check({self})"
+
+    def _repr_html_(self) -> str:
+        """Show the findings in a notebook, one per line."""
+        return "".join(f"<div>{escape(line)}</div>" for line in str(self).split("\n"))
 
     def __str__(self) -> str:
         lines = list(self.findings)

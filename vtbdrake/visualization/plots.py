@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType
 
 from vtbdrake.optimization.boundary import why_no_boundary
-from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout import Quality, RolloutResult
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Boundary, Sweep
@@ -64,6 +65,42 @@ def finish(axes: Axes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
+
+@dataclass(frozen=True)
+class _Words:
+    """How a quality, or a cost, is called in a plot."""
+
+    symbol: str  # of the trajectory
+    noun: str
+    limit: str  # of the threshold
+    beyond: str  # how a sample in G1 compares with the threshold
+    passed: str  # what happened to the threshold there
+    name: str = ""  # of the function
+    unit: str = ""
+
+    @classmethod
+    def of(cls, *, minimize: bool, name: str = "", unit: str = "") -> _Words:
+        """Return the words for a quality, or for a cost if ``minimize``."""
+        return replace(_COST if minimize else _QUALITY, name="" if name == "f" else name, unit=unit)
+
+    @property
+    def title(self) -> str:
+        return f"{self.noun.capitalize()} trajectories"
+
+    @property
+    def trajectory(self) -> str:
+        """Return the label of the axis of a trajectory."""
+        name = f"{self.name}: " if self.name else ""
+        return label(f"{name}{self.noun} {self.symbol}(s⁰, t)", self.unit)
+
+    @property
+    def result(self) -> str:
+        """Return the label of the axis of h, or of the cost at t*."""
+        return "cost c(s⁰, t*)" if self.symbol == "c" else "h(s⁰) = f'(s⁰, t*)"
+
+
+_QUALITY = _Words("f'", "quality", "f_m", ">", "exceeded")
+_COST = _Words("c", "cost", "c_m", "<", "reached")
 
 MARKERS = "osD^vP*X<>hp"
 STYLES: tuple[tuple[float, Sequence[float]], ...] = (
@@ -114,6 +151,7 @@ def draw_bars(
     *,
     colors: Sequence[ColorType],
     styles: Sequence[int],
+    words: _Words,
 ) -> None:
     """Draw two-valued trajectories as bars at ``heights``: thin at the lower value of f', thick at the upper one.
 
@@ -134,12 +172,12 @@ def draw_bars(
             axes.plot(times[-1], height, "x", color=FAILED, ms=6, mew=2, gid="failed", clip_on=False)
         elif rollout.h > lower:
             draw_t_star(axes, rollout.t_star, height, color=color, style=style)
-    handles = [_key(f"f' = {lower:g}", color="0.4", lw=1)]
+    handles = [_key(f"{words.symbol} = {lower:g}", color="0.4", lw=1)]
     if upper > lower:
-        handles.append(_key(f"f' = {upper:g}", color="0.4", lw=4))
-    handles += keys(failed=any(rollout.failed for rollout in rollouts))
+        handles.append(_key(f"{words.symbol} = {upper:g}", color="0.4", lw=4))
+    handles += keys(words, failed=any(rollout.failed for rollout in rollouts))
     axes.legend(handles=handles, fontsize="small", loc="best")
-    axes.set(xlabel="time t [s]", title="Quality trajectories f'(s⁰, t) of two values")
+    axes.set(xlabel="time t [s]", title=f"{words.title} {words.symbol}(s⁰, t) of two values")
 
 
 def draw_threshold(axes: Axes, threshold: float) -> None:
@@ -148,15 +186,15 @@ def draw_threshold(axes: Axes, threshold: float) -> None:
         axes.axhline(threshold, color=THRESHOLD, lw=1, ls=(0, (4, 2)), gid="threshold", zorder=1)
 
 
-def keys(*, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
+def keys(words: _Words, *, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
     """Return the legend entries that all rollouts share."""
     found = [_key("t*", marker="o", color="white", mec="black", ls="")]
     if exceedances:
-        found.append(_key("G₁: f' > f_m", color="0.6", lw=6, alpha=0.5))
+        found.append(_key(f"G₁: {words.symbol} {words.beyond} {words.limit}", color="0.6", lw=6, alpha=0.5))
     if np.isfinite(threshold):
-        found.append(_key(f"f_m = {threshold:g}", color=THRESHOLD, lw=1, ls=(0, (4, 2))))
+        found.append(_key(f"{words.limit} = {threshold:g}", color=THRESHOLD, lw=1, ls=(0, (4, 2))))
     if failed:
-        found.append(_key("simulation failed", marker="x", color=FAILED, ls="", mew=2))
+        found.append(_key("rollout failed", marker="x", color=FAILED, ls="", mew=2))
     return found
 
 
@@ -190,21 +228,23 @@ _THRESHOLD = "#f4a582"
 
 
 def worst(sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct points, shape (n, p), and the worst h over their conditions, shape (n,).
+    """Return the distinct points, shape (n, p), and the worst h (or cost) over their conditions, shape (n,).
 
-    h is NaN where a condition is missing or its simulation failed.
+    It is NaN where a condition is missing or its rollout failed.
     """
     points, where = np.unique(sweep.points, axis=0, return_inverse=True)
     where = where.reshape(-1)
-    h = np.full(len(points), np.inf)
+    cost = sweep.minimize[0]
+    h = np.full(len(points), -np.inf if cost else np.inf)
     # Unlike fmin, minimum keeps a NaN.
-    np.minimum.at(h, where, sweep.h)
+    (np.maximum if cost else np.minimum).at(h, where, sweep.h)
     h[np.bincount(where, minlength=len(points)) < len(sweep.conditions)] = np.nan
     return points, h
 
 
 def draw_landscape(axes: Axes, sweep: Sweep) -> None:
     """Draw h as an image on a full grid, else as coloured points, with contour lines, failures and the best point."""
+    words = _Words.of(minimize=sweep.minimize[0])
     points, h = worst(sweep)
     x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
     known = np.isfinite(h)
@@ -216,18 +256,19 @@ def draw_landscape(axes: Axes, sweep: Sweep) -> None:
         drawn: ScalarMappable = draw_mesh(axes, x, y, image, log=log, lines=min(x.size, y.size) > 2)
         if known.any() and np.nanmin(h) < threshold < np.nanmax(h):
             axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
-            axes.plot([], [], color=_THRESHOLD, lw=2, label=f"f_m = {threshold:g}")
+            axes.plot([], [], color=_THRESHOLD, lw=2, label=f"{words.limit} = {threshold:g}")
     else:
         x_known, y_known = points[known].T
         drawn = axes.scatter(x_known, y_known, c=h[known], cmap="viridis", s=60, gid="h")
     if not known.all():
         axes.plot(*points[~known].T, "x", color=FAILED, mew=2, label="failed or not finished", gid="failed")
-    _draw_best(axes, sweep)
+    _draw_best(axes, sweep, words)
     first, second = (label(p.address, unit) for p, unit in zip(sweep.parameters, sweep.units, strict=True))
     axes.set(xlabel=first, ylabel=second)
     several = len(sweep.conditions) > 1
-    axes.set_title(f"h(s⁰), the worst of {len(sweep.conditions)} conditions" if several else "h(s⁰)")
-    axes.figure.colorbar(drawn, ax=axes, label="h(s⁰) = f'(s⁰, t*)", pad=0.02)
+    text = words.result.partition(" = ")[0]
+    axes.set_title(f"{text}, the worst of {len(sweep.conditions)} conditions" if several else text)
+    axes.figure.colorbar(drawn, ax=axes, label=words.result, pad=0.02)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, frameon=False)
 
@@ -276,13 +317,13 @@ def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: 
     axes.plot(x, y, "*", color="#d6604d", ms=size, mec="white", clip_on=False, zorder=4, label=text, gid="best")
 
 
-def _draw_best(axes: Axes, sweep: Sweep) -> None:
+def _draw_best(axes: Axes, sweep: Sweep, words: _Words) -> None:
     several = len(sweep.minimize) > 1
     if several or sweep.risk is None or not any(evaluation.feasible for evaluation in sweep.evaluations):
         return
     point, best = sweep.best()
     text = ", ".join(f"{value:.4g}" for value in point.values())
-    mark_best(axes, *point.values(), text=f"s⁰* = [{text}], h = {best:.4g}")
+    mark_best(axes, *point.values(), text=f"s⁰* = [{text}], {'c' if words.symbol == 'c' else 'h'} = {best:.4g}")
 
 
 _BOUNDARY = "#f4a582"
@@ -314,14 +355,16 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
         )
     if not len(sweep):
         raise ValueError("the sweep has no finished rollouts, so that there is nothing to draw")
+    if boundary is None and not why_no_boundary(sweep):
+        boundary = sweep.boundary()
+    if sweep.minimize[0]:
+        sweep = replace(sweep, rollouts=tuple(in_user_terms(rollout) for rollout in sweep.rollouts))
     if len(sweep.parameters) == 2:
         figure = Picture(7.2, 5.4)
         draw_landscape(figure.add_subplot(), sweep)
         return figure
     figure = Picture(12.0, 4.6)
     left, right = figure.subplots(1, 2)
-    if boundary is None and not why_no_boundary(sweep):
-        boundary = sweep.boundary()
     _draw_h(left, sweep, boundary)
     if is_two_valued(sweep.rollouts):
         _draw_bars(right, sweep)
@@ -330,31 +373,45 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
     return figure
 
 
-def plot_quality(rollouts: Sequence[RolloutResult]) -> Figure:
+def in_user_terms(rollout: RolloutResult) -> RolloutResult:
+    """Return a rollout of a cost whose trajectory, value and threshold are the cost instead of 1 / (1 + cost)."""
+    threshold = 1.0 / rollout.threshold - 1.0 if np.isfinite(rollout.threshold) else rollout.threshold
+    return replace(rollout, quality=1.0 / rollout.quality - 1.0, h=rollout.value, threshold=threshold)
+
+
+def plot_quality(rollouts: Sequence[RolloutResult], *, quality: Quality | None = None) -> Figure:
     """Plot the quality trajectories f'(t) of some rollouts, with f_m, the samples in G1 and t* (Figure 5).
 
+    Args:
+        rollouts: Rollouts of one problem.
+        quality: The quality of the rollouts, for its name and unit; if it is a cost, the cost is drawn.
+
     Raises:
-        ValueError: There is none, or one has no quality.
+        ValueError: There is no rollout, or one has no quality.
     """
     if not rollouts or any(rollout.quality.size == 0 for rollout in rollouts):
         raise ValueError("a quality trajectory is that of a rollout with a quality and at least one sample")
+    words = _QUALITY
+    if quality is not None:
+        words = _Words.of(minimize=quality.minimize, name=quality.name, unit=quality.unit)
+        rollouts = [in_user_terms(rollout) for rollout in rollouts] if quality.minimize else rollouts
     figure = Picture(7.6, 4.4)
     axes = figure.add_subplot()
     names = [describe(rollout.parameters) for rollout in rollouts]
     colors = [_CONDITIONS(i) if len(rollouts) <= 10 else _VALUES(i / len(rollouts)) for i in range(len(rollouts))]
     if is_two_valued(rollouts):
         rows = np.arange(len(rollouts), dtype=float)
-        draw_bars(axes, rollouts, rows, colors=colors, styles=[0] * len(rollouts))
+        draw_bars(axes, rollouts, rows, colors=colors, styles=[0] * len(rollouts), words=words)
         axes.set_yticks(rows, names)
         figure.set_figheight(max(3.0, 1.5 + 0.25 * len(rollouts)))
         finish(axes)
     else:
-        _draw_qualities(axes, rollouts, colors, names)
+        _draw_qualities(axes, rollouts, colors, names, words)
     return figure
 
 
 def _draw_qualities(
-    axes: Axes, rollouts: Sequence[RolloutResult], colors: Sequence[ColorType], names: Sequence[str]
+    axes: Axes, rollouts: Sequence[RolloutResult], colors: Sequence[ColorType], names: Sequence[str], words: _Words
 ) -> None:
     few = len(rollouts) <= 10
     for number, (rollout, color) in enumerate(zip(rollouts, colors, strict=True)):
@@ -368,11 +425,12 @@ def _draw_qualities(
     draw_threshold(axes, threshold)
     handles = [line for line in axes.get_lines() if line.get_gid() == "trajectory"] if few else []
     handles += keys(
+        words,
         threshold=threshold,
         exceedances=any(rollout.exceedances.size for rollout in rollouts),
         failed=any(rollout.failed for rollout in rollouts),
     )
-    axes.set(xlabel="time t [s]", ylabel="quality f'(s⁰, t)", title="Quality trajectories")
+    axes.set(xlabel="time t [s]", ylabel=words.trajectory, title=words.title)
     finish(axes)
     axes.legend(
         handles=handles, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False
@@ -380,13 +438,14 @@ def _draw_qualities(
 
 
 def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
+    words = _Words.of(minimize=sweep.minimize[0])
     values, h = sweep.points[:, 0], sweep.h
     many = len(sweep.conditions) > 1
     for number, condition in enumerate(sweep.conditions):
         mine = sweep.condition == number
         color = _CONDITIONS(number % 10) if many else _SINGLE
         marker = MARKERS[number % len(MARKERS)]
-        name = describe(condition) if many else "h(s⁰)"
+        name = describe(condition) if many else words.result.partition(" = ")[0]
         order = np.argsort(values[mine], kind="stable")
         (line,) = axes.plot(values[mine][order], h[mine][order], color=color, marker=marker, ms=5, label=name, gid="h")
         # Between 0 and 1 of a quality that takes no other value there is nothing to be drawn.
@@ -400,19 +459,21 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
     draw_threshold(axes, threshold)
     handles = list(axes.get_legend_handles_labels()[0])
     if sweep.exceeded.any():
-        handles += axes.plot([], [], "o", color="0.3", mfc="white", label="f_m exceeded")
+        handles += axes.plot([], [], "o", color="0.3", mfc="white", label=f"{words.limit} {words.passed}")
     if (sweep.violated & ~sweep.exceeded).any():
         handles += axes.plot([], [], "o", color="0.6", mfc="white", label="a constraint violated")
     if sweep.failed.any():
         failed = values[sweep.failed]
         place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "gid": "failed"}
         bottom = np.full(failed.size, 0.03)
-        handles += axes.plot(failed, bottom, "x", color=FAILED, mew=2, label="simulation failed", **place)
-    handles += [key for key in keys(threshold=threshold) if key.get_label() != "t*"]
+        handles += axes.plot(failed, bottom, "x", color=FAILED, mew=2, label="rollout failed", **place)
+    handles += [key for key in keys(words, threshold=threshold) if key.get_label() != "t*"]
     title = "" if boundary is None else _draw_boundary(axes, sweep, boundary, handles)
     parameter = sweep.parameters[0]
     axes.set(
-        xlabel=label(parameter.address, sweep.units[0]), ylabel="h(s⁰) = f'(s⁰, t*)", title=title or "Quality at t*"
+        xlabel=label(parameter.address, sweep.units[0]),
+        ylabel=words.result,
+        title=title or f"{words.noun.capitalize()} at t*",
     )
     finish(axes)
     if len(handles) > 1:
@@ -433,15 +494,15 @@ def _draw_boundary(axes: Axes, sweep: Sweep, boundary: Boundary, handles: list[A
 
 
 def _draw_trajectories(axes: Axes, sweep: Sweep) -> None:
-    norm = _norm(sweep)
+    norm, words = _norm(sweep), _Words.of(minimize=sweep.minimize[0])
     width = 1.4 if len(sweep) <= 20 else 0.8
     for point, condition, rollout in zip(sweep.points, sweep.condition, sweep.rollouts, strict=True):
         draw_trajectory(axes, rollout, color=_VALUES(norm(point[0])), style=int(condition), width=width)
     draw_threshold(axes, _threshold(sweep))
-    axes.set(xlabel="time t [s]", ylabel="quality f'(s⁰, t)", title="Quality trajectories")
+    axes.set(xlabel="time t [s]", ylabel=words.trajectory, title=words.title)
     finish(axes)
     axes.legend(
-        handles=keys(threshold=_threshold(sweep), failed=bool(sweep.failed.any())), fontsize="small", loc="best"
+        handles=keys(words, threshold=_threshold(sweep), failed=bool(sweep.failed.any())), fontsize="small", loc="best"
     )
     text = label(sweep.parameters[0].address, sweep.units[0])
     axes.figure.colorbar(ScalarMappable(norm, _VALUES), ax=axes, label=text, pad=0.02)
@@ -456,7 +517,8 @@ def _draw_bars(axes: Axes, sweep: Sweep) -> None:
     spread = min(0.7 * spacing, 0.03 * float(np.ptp(distinct)) or 1.0)
     heights = sweep.points[:, 0] + spread * ((sweep.condition + 0.5) / count - 0.5)
     colors = [_CONDITIONS(number % 10) if count > 1 else _SINGLE for number in sweep.condition]
-    draw_bars(axes, sweep.rollouts, heights, colors=colors, styles=sweep.condition.tolist())
+    words = _Words.of(minimize=sweep.minimize[0])
+    draw_bars(axes, sweep.rollouts, heights, colors=colors, styles=sweep.condition.tolist(), words=words)
     axes.set_ylabel(label(sweep.parameters[0].address, sweep.units[0]))
     finish(axes)
 
