@@ -9,6 +9,7 @@ from tests.folders import open_folder, that_cannot_be_written
 
 SERVO, BUS = "tests.control.servo_machine:ServoMachineScenario", ["--url", "tcpq://127.0.0.1:1"]
 VARY = ["--vary", f"{ANGLE}=0:1:2", "--horizon", "1"]
+NEGATIVE = ["--quality", f"{__name__}:negative", "--of", RATE]
 SWEEP = ["sweep", PENDULUM, *VARY, "--quality", RATE]
 ROLLOUT = ["rollout", ACROBOT, "--horizon", "0.1"]
 BOUNDARY = ["boundary", PENDULUM, "--vary", f"{ANGLE}=0:1", "--horizon", "1", "--quality", RATE, "--threshold", "1"]
@@ -67,7 +68,7 @@ def negative(_: float) -> float:
         (["sweep", PENDULUM, *VARY, "--quality", "nowhere:f", "--of", RATE], "cannot import nowhere"),
         (["sweep", PENDULUM, *VARY, "--quality", "math:hypot"], "needs its arguments: add --of ADDRESS"),
         (["sweep", PENDULUM, *VARY, "--quality", "sim.sys.Pendulum.theta.velocty"], "did you mean"),
-        (["sweep", PENDULUM, *VARY, "--quality", f"{__name__}:negative", "--of", RATE], "finite and not negative"),
+        (["sweep", PENDULUM, *VARY, *NEGATIVE, "--on-error", "raise"], "finite and not negative"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=0:1"], "LOWER:UPPER:POINTS"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=a:1:2"], "with numbers"),
         (["sweep", PENDULUM, "--horizon", "1", "--quality", RATE, "--vary", f"{ANGLE}=1:0:2"], "lower < upper"),
@@ -160,7 +161,14 @@ def test_failures_are_listed_below_the_table_once() -> None:
     lines = result.stdout.splitlines()
     assert [line.split()[-1] for line in lines[2:4]] == ["failed", "horizon"]
     assert lines[4].startswith("failed (1): RuntimeError: An internal mass matrix")
-    assert lines[-1] == "best: h = 0 at sim.sys.Acrobot.lower_link.mass = 1"
+    assert lines[-1] == "best: h = 0 at sim.sys.Acrobot.lower_link.mass = 1 kg (the upper end of its range)"
+
+
+def test_a_quality_that_fails_everywhere_is_told_below_the_table() -> None:
+    result = run("sweep", PENDULUM, *VARY, *NEGATIVE)
+    assert result.exit_code == 1
+    assert "failed (2): QualityError: the quality function negative" in result.stdout
+    assert "Error: all 2 rollouts failed; the first: QualityError" in result.stderr
 
 
 def test_traceback_on_request() -> None:

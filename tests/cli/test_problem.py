@@ -34,7 +34,10 @@ def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> Non
         for p, r in zip(expected.points[:, 0], expected.rollouts, strict=True)
     ]
     (point, h) = expected.best()
-    assert lines[-2:] == [f"best: h = {h:.6g} at {ANGLE} = {point[ANGLE]:.6g}", f"boundary: {expected.boundary()}"]
+    assert lines[-2:] == [
+        f"best: h = {h:.6g} at {ANGLE} = {point[ANGLE]:.6g} rad (the upper end of its range)",
+        f"boundary: {expected.boundary()}",
+    ]
     np.testing.assert_array_equal(Sweep.load(files[1]).h, expected.h)
     assert files[0].read_text().splitlines()[0] == f"{ANGLE},condition,h,t_star,end,message,wall_time"
     assert files[2].read_bytes().startswith(b"\x89PNG")

@@ -78,6 +78,12 @@ executor_options: Callable[[F], F] = _all(
     option("--executor", "Where rollouts run.", type=click.Choice(NAMES), default=NAMES[0]),
     option("--workers N", "The number of threads or processes.  [default: one per core]", type=click.IntRange(min=1)),
 )
+on_error_option: Callable[[F], F] = option(
+    "--on-error",
+    "If the quality function raises: record the rollout as failed, or end the run.",
+    type=click.Choice(["record", "raise"]),
+    default="record",
+)
 _FILES = ("save", "csv", "plot")
 _file_options: Callable[[F], F] = _all(
     option("--save FILE", "Write the sweep for vtbdrake.optimization.Sweep.load.", parse=output()),
@@ -188,12 +194,14 @@ def _function(text: str) -> Callable[..., Any]:
 )
 @option("--threshold F", "f_m: a rollout whose f exceeds it ends there.", default=inf)
 @executor_options
+@on_error_option
 @_file_options
 def sweep(
     scenario: Scenario,
     vary: tuple[tuple[Parameter, int], ...],
     executor: str,
     workers: int | None,
+    on_error: str,
     **problem: Any,
 ) -> None:
     """Simulate every point of a grid: which one is best?
@@ -208,7 +216,7 @@ def sweep(
     """
     files = {name: problem.pop(name) for name in _FILES}
     stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
-    found = stated.sweep([points for _, points in vary], executor=executor, workers=workers)
+    found = stated.sweep([points for _, points in vary], executor=executor, workers=workers, on_error=on_error)
     click.echo(_points_table(found))
     _write_files(found, **files)
     _reject_failures(found)
@@ -236,6 +244,7 @@ def sweep(
 )
 @option("--jitter J", "The largest change of the parameter in a repetition, as a fraction of its range.", default=1e-06)
 @executor_options
+@on_error_option
 @_file_options
 def boundary(
     scenario: Scenario,
@@ -246,6 +255,7 @@ def boundary(
     jitter: float,
     executor: str,
     workers: int | None,
+    on_error: str,
     **problem: Any,
 ) -> None:
     """Find how far a parameter may go before f exceeds the threshold.
@@ -261,7 +271,13 @@ def boundary(
     files = {name: problem.pop(name) for name in _FILES}
     stated = make_problem(scenario, [vary], **problem)
     found = stated.boundary(
-        resolution=resolution, coarse=coarse, repeats=repeats, jitter=jitter, executor=executor, workers=workers
+        resolution=resolution,
+        coarse=coarse,
+        repeats=repeats,
+        jitter=jitter,
+        executor=executor,
+        workers=workers,
+        on_error=on_error,
     )
     assert found.sweep is not None
     _write_files(found.sweep, boundary=found, **files)

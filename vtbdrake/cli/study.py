@@ -13,7 +13,7 @@ import click
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import converted, option, output, parse_choice, parse_field, parse_scaled_range, settings
 from vtbdrake.cli.output import table, write_csv
-from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, problem_options
+from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, on_error_option, problem_options
 from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint
@@ -108,12 +108,7 @@ def study() -> None:
     "Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
     default=None,
 )
-@option(
-    "--on-error",
-    "If the quality function raises: record the rollout as failed, or end the run.",
-    type=click.Choice(["record", "raise"]),
-    default="record",
-)
+@on_error_option
 @option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True)
 def run(
     file: Path,
