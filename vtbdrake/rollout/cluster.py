@@ -20,7 +20,7 @@ from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import failed
 from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
-from vtbdrake.rollout.worker_processes import ProcessExecutor, checked_time_limit
+from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor, checked_time_limit
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
@@ -50,7 +50,8 @@ class DaskExecutor(Executor):
     Args:
         client: A client of the cluster, which stays open, or the address of the scheduler; by default the address in
             the environment variable ``DASK_SCHEDULER_ADDRESS``.
-        time_limit: The wall time for one rollout, in seconds, without building its testbed.
+        time_limit: The wall time for one rollout, in seconds, without building its testbed; an hour by default, ``inf``
+            for none.
         in_flight: The number of rollouts that the cluster has at a time; by default twice its threads.
 
     Raises:
@@ -61,7 +62,7 @@ class DaskExecutor(Executor):
     cancels = False
 
     def __init__(
-        self, client: Client | str | None = None, *, time_limit: float = inf, in_flight: int | None = None
+        self, client: Client | str | None = None, *, time_limit: float = TIME_LIMIT, in_flight: int | None = None
     ) -> None:
         if in_flight is not None and in_flight < 1:
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")

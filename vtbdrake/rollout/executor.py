@@ -13,7 +13,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from math import inf
 from typing import Any, Self
 
 from tqdm.auto import tqdm
@@ -29,6 +28,9 @@ from vtbdrake.testbed.interrupt import Interruptible
 Parameters = Mapping[str, Any]
 
 _log = logging.getLogger(__name__)
+
+# A thread whose rollout has not stopped after so many seconds is not waited for any more.
+GRACE = 10.0
 
 NAMES = ("auto", "serial", "threads", "processes", "dask")
 
@@ -117,15 +119,14 @@ class SerialExecutor(Executor):
 
 @dataclass(frozen=True)
 class _Job:
-    """One rollout for a thread, which puts exactly one item into ``done``."""
+    """One rollout for a thread. Its state is that of its future: pending, running, finished, or cancelled."""
 
+    future: concurrent.futures.Future[RolloutResult]
     task: RolloutTask
-    index: int
     point: Parameters
     start: Start | None
     cutoff: Cutoff | None
     cancel: threading.Event
-    done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException]
 
 
 class ThreadExecutor(Executor):
@@ -145,7 +146,7 @@ class ThreadExecutor(Executor):
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         # The threads hold no reference to the executor, so that one that was not closed can be freed.
-        weakref.finalize(self, _stop, self._jobs, self._threads)
+        self._end = weakref.finalize(self, self._jobs.put, None)
 
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
@@ -160,50 +161,54 @@ class ThreadExecutor(Executor):
             thread = threading.Thread(target=_work, args=(self._jobs, self._runners), name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
+        # Ctrl-C may come between any two steps: what is to be waited for is asked of the jobs, never counted here.
         cancel = threading.Event()
-        done: queue.SimpleQueue[tuple[int, RolloutResult] | BaseException] = queue.SimpleQueue()
-        open_jobs = 0
+        indices: dict[concurrent.futures.Future[RolloutResult], int] = {}
+        landed: queue.SimpleQueue[concurrent.futures.Future[RolloutResult]] = queue.SimpleQueue()
         try:
             for index, point in enumerate(points):
-                self._jobs.put(_Job(task, index, point, starts[index], cutoff, cancel, done))
-                open_jobs += 1
-            while open_jobs:
-                result = done.get()
-                open_jobs -= 1
-                if isinstance(result, CancelledError):
+                future: concurrent.futures.Future[RolloutResult] = concurrent.futures.Future()
+                future.add_done_callback(landed.put)
+                indices[future] = index
+                self._jobs.put(_Job(future, task, point, starts[index], cutoff, cancel))
+            for _ in points:
+                future = landed.get()
+                try:
+                    result = future.result()
+                except CancelledError:
                     continue
-                if isinstance(result, BaseException):
-                    raise result
-                yield result
+                yield indices[future], result
         finally:
             cancel.set()
-            for _ in range(open_jobs):
-                done.get()
+            # A job that can be cancelled has not begun, and never will; the others end at their next sample.
+            begun = [future for future in indices if not future.cancel()]
+            if concurrent.futures.wait(begun, GRACE).not_done:
+                _log.error("a rollout does not stop: its thread is left behind, and may keep a core busy for ever")
 
     def close(self) -> None:
-        _stop(self._jobs, self._threads)
+        self._jobs.put(None)
         for thread in self._threads:
-            thread.join()
+            thread.join(GRACE)
         self._threads.clear()
         self._runners.clear()
-
-
-def _stop(jobs: queue.SimpleQueue[_Job | None], threads: Sequence[threading.Thread]) -> None:
-    for _ in threads:
-        jobs.put(None)
+        self._end.detach()
+        self._jobs = queue.SimpleQueue()
+        self._end = weakref.finalize(self, self._jobs.put, None)
 
 
 def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
     while (job := jobs.get()) is not None:
-        try:
-            if job.cancel.is_set():
-                raise CancelledError
-            result = runners.run(job.task, job.point, start=job.start, cutoff=job.cutoff, cancel=job.cancel)
-            job.done.put((job.index, result))
-        except BaseException as error:  # Raised again where the results are read.
-            job.done.put(error)
+        if job.future.set_running_or_notify_cancel():
+            try:
+                result = runners.run(job.task, job.point, start=job.start, cutoff=job.cutoff, cancel=job.cancel)
+            except BaseException as error:  # Raised again where the results are read.
+                job.future.set_exception(error)
+            else:
+                job.future.set_result(result)
+                del result
         # Keep nothing of the last job while waiting for the next one.
         del job
+    jobs.put(None)  # For the other threads.
 
 
 def checked_workers(workers: int | None) -> int:
@@ -284,7 +289,8 @@ def make_executor(
         testbed: The testbed of the rollouts; serial rollouts and threads use it.
         rollouts: The number of rollouts; a single one is run in this thread.
         workers: The number of threads or processes; by default the number of cores.
-        time_limit: The longest wall time of one rollout, in seconds; only processes and Dask can end one.
+        time_limit: The longest wall time of one rollout, in seconds; only processes and Dask can end one, by default
+            after an hour.
 
     Raises:
         ValueError: The executor is unknown, or cannot use ``workers`` or ``time_limit``.
@@ -315,7 +321,7 @@ def make_executor(
 
 
 def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_limit: float | None) -> Executor:
-    from vtbdrake.rollout.worker_processes import ProcessExecutor
+    from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor
 
     if name in ("serial", "threads") and time_limit is not None:
         raise ValueError(
@@ -327,7 +333,7 @@ def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_li
     makers: dict[str, Callable[[], Executor]] = {
         "serial": lambda: SerialExecutor(testbed),
         "threads": lambda: ThreadExecutor(workers, testbed=testbed),
-        "processes": lambda: ProcessExecutor(workers, time_limit=inf if time_limit is None else time_limit),
+        "processes": lambda: ProcessExecutor(workers, time_limit=TIME_LIMIT if time_limit is None else time_limit),
         "dask": lambda: _dask(None, workers=workers, time_limit=time_limit),
     }
     if name not in makers:
@@ -337,9 +343,10 @@ def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_li
 
 def _dask(client: Any, *, workers: int | None, time_limit: float | None) -> Executor:
     from vtbdrake.rollout.cluster import DaskExecutor
+    from vtbdrake.rollout.worker_processes import TIME_LIMIT
 
     _refuse("a Dask cluster", workers=workers)
-    return DaskExecutor(client, time_limit=inf if time_limit is None else time_limit)
+    return DaskExecutor(client, time_limit=TIME_LIMIT if time_limit is None else time_limit)
 
 
 def _refuse(what: str, **options: float | None) -> None:

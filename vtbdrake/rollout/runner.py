@@ -6,7 +6,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -22,7 +21,7 @@ from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Beginning, Start
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
-from vtbdrake.testbed.integrator import apply_simulator_config
+from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.interrupt import Interruptible
 
 
@@ -70,12 +69,14 @@ class RolloutRunner:
             # A copy of the running robot is simulated.
             self.testbed.switch(self._s0, "sim")
         self._timings = self.testbed.event_timings()
+        self._controls_error = controls_error(self.testbed.simulator_config) and bool(self._s0.num_continuous_states())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
         self._world_state = _world_state(self.testbed, self._context)
         self._copier = self.testbed.copier_from(self.testbed)
         self._beginning = Beginning(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
+        self._timed = False  # Whether the times are those of the present start.
         self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
@@ -199,7 +200,8 @@ class RolloutRunner:
 
     def _begin(self, start: Start | None) -> None:
         """Set where the next rollouts begin."""
-        if start is not self._beginning.start:
+        if start is not self._beginning.start or not self._timed:
+            self._timed = False  # Ctrl-C may come before the times are set.
             try:
                 self._beginning.set(start)
             finally:
@@ -213,6 +215,7 @@ class RolloutRunner:
             self._windows = self._player.begins(self._instants)
             by_default = self.task.start is None and self._beginning.start is None
             self._recordings = self._player.recordings(self._instants) if by_default else {}
+        self._timed = True
 
     def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
         """Return the recorded motion, in which the parameters of the followers are as in s0; record it if necessary.
@@ -278,10 +281,33 @@ class RolloutRunner:
     def _advance(self, t: float, instant: float) -> SimulatorStatus:
         if t == 0.0:
             return self._initialized  # A system may ask for the end there already.
-        with _failures_as_outcomes:
-            status = self._simulator.AdvanceTo(instant)
-        self._refuse_nonfinite(t)
+        try:
+            with _failures_as_outcomes:
+                self._refuse_nonfinite_derivatives()
+                status = self._simulator.AdvanceTo(instant)
+            self._refuse_nonfinite(t)
+        except SimulationError as failure:
+            raise self._with_command(failure) from failure.__cause__
         return status
+
+    def _refuse_nonfinite_derivatives(self) -> None:
+        # An integrator with error control would never end its first step. It needs these derivatives anyway.
+        if self._controls_error:
+            derivatives = self.testbed.diagram.EvalTimeDerivatives(self._context)
+            if not np.isfinite(derivatives.CopyToVector()).all():
+                raise SimulationError(
+                    f"the time derivatives are not finite at t = {self._context.get_time() - self._t0:g} s"
+                )
+
+    def _with_command(self, failure: SimulationError) -> SimulationError:
+        """Return the failure; if the DPS commands what is not finite, with the name of that signal."""
+        own = self.testbed.dps.GetMyContextFromRoot(self._context)
+        for signal in self.testbed.interface.act:
+            with suppress(Exception, SystemExit):
+                command = self.testbed.dps.GetOutputPort(signal.name).Eval(own) if signal.is_vector else np.zeros(0)
+                if not np.isfinite(command).all() and signal.name not in str(failure):
+                    return SimulationError(f"the DPS commands {signal.name} = {command}; {failure}")
+        return failure
 
     def _refuse_nonfinite(self, t: float) -> None:
         # NaN is allowed in a DPS, for unknown values, but not in the simulated world.
@@ -327,7 +353,7 @@ class _FailuresAsOutcomes:
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception | SystemExit):
+        if isinstance(error, Exception | SystemExit) and not isinstance(error, SimulationError):
             raise SimulationError(error_text(error)) from error
 
 
@@ -482,6 +508,14 @@ def failed(point: Mapping[str, Any], message: str) -> RolloutResult:
     return RolloutResult(parameters=dict(point), end=FAILED, message=message, times=np.array([]), quality=np.array([]))
 
 
+class _Building:
+    """A testbed, once it has been built by the thread that holds the lock."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.testbed: VirtualTestbed | None = None
+
+
 class Testbeds:
     """The testbeds last used, built once per distinct scenario and shared by threads.
 
@@ -495,7 +529,7 @@ class Testbeds:
             raise ValueError(f"at least one testbed must be kept, not {kept}")
         self.kept = kept
         self._known = known if known is not None and known.scenario is not None else None
-        self._built: OrderedDict[Hashable, Future[VirtualTestbed]] = OrderedDict()
+        self._built: OrderedDict[Hashable, _Building] = OrderedDict()
         self._lock = threading.Lock()
 
     def get(self, scenario: Scenario) -> VirtualTestbed:
@@ -504,29 +538,30 @@ class Testbeds:
         if self._known is not None and self._known.scenario is not None and key == _key(self._known.scenario.record()):
             return self._known
         with self._lock:
-            mine = key not in self._built
-            future = self._built.setdefault(key, Future())
+            building = self._built.setdefault(key, _Building())
             self._built.move_to_end(key)
             if len(self._built) > self.kept:
                 self._built.popitem(last=False)
-        if mine:
-            try:
-                future.set_result(scenario.build())
-            except BaseException as error:
-                with self._lock:
-                    self._built.pop(key, None)
-                future.set_exception(error)
-        return future.result()
+        with building.lock:
+            if building.testbed is None:
+                try:
+                    building.testbed = scenario.build()
+                except BaseException:  # The next thread that waits tries again.
+                    with self._lock:
+                        if self._built.get(key) is building:
+                            del self._built[key]
+                    raise
+            return building.testbed
 
     def touch(self, testbed: VirtualTestbed) -> None:
         """Mark ``testbed`` as just used."""
         with self._lock:
-            for key in [key for key, future in self._built.items() if _gave(future, testbed)]:
+            for key in [key for key, building in self._built.items() if building.testbed is testbed]:
                 self._built.move_to_end(key)
 
     def __contains__(self, testbed: object) -> bool:
         with self._lock:
-            return testbed is self._known or any(_gave(future, testbed) for future in self._built.values())
+            return testbed is self._known or any(building.testbed is testbed for building in self._built.values())
 
     def __len__(self) -> int:
         return len(self._built)
@@ -617,10 +652,6 @@ class Runners:
         """Forget the runners of all threads, and the testbeds."""
         self._threads = threading.local()
         self._testbeds.clear()
-
-
-def _gave(future: Future[VirtualTestbed], testbed: object) -> bool:
-    return future.done() and not future.exception() and future.result() is testbed
 
 
 def _key(values: Mapping[str, Any]) -> Hashable:

@@ -34,6 +34,8 @@ _BRIEF = 0.1
 _SMALL = 1 << 16
 # A rollout stops at its first sample after a cutoff's deadline. If it does not, after so many seconds, it hangs.
 _GRACE = 0.5
+# A rollout that takes longer than so many seconds hangs, unless the user says otherwise.
+TIME_LIMIT = 3600.0
 # What a worker sends besides its answers: the rollout with a time limit begins; its memory has grown too much.
 _BEGUN, _GROWN = b"B", b"G"
 
@@ -52,16 +54,17 @@ class ProcessExecutor(Executor):
 
     Args:
         workers: The number of processes; by default the number of cores.
-        time_limit: The wall time for one rollout, in seconds.
+        time_limit: The wall time for one rollout, in seconds; an hour by default, ``inf`` for none. Drake's integrators
+            can loop for ever, for example on a NaN, and nothing but the end of the process stops them.
         kept: The number of testbeds that each process keeps, for points with different scenario fields.
         growth: The number of bytes by which the memory of a process may grow after its first rollout.
     """
 
     def __init__(
-        self, workers: int | None = None, *, time_limit: float = inf, kept: int = KEPT, growth: float = 1e9
+        self, workers: int | None = None, *, time_limit: float = TIME_LIMIT, kept: int = KEPT, growth: float = 1e9
     ) -> None:
         self._count = checked_workers(workers)
-        self._time_limit = checked_time_limit(time_limit)
+        self.time_limit = checked_time_limit(time_limit)
         self._growth = as_number("the growth of a worker's memory", growth)
         if not self._growth > 0.0:
             raise ValueError(f"the growth of a worker's memory must be positive, not {growth} bytes")
@@ -169,7 +172,7 @@ class ProcessExecutor(Executor):
         """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
         waiting, cutoff = call.waiting, call.cutoff
         index = waiting[0]
-        limited = self._time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
+        limited = self.time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
         announced = limited and not worker.has_testbed(call, index)
         start = call.starts[index]
         sent = None if worker.has(start) else start
@@ -196,7 +199,7 @@ class ProcessExecutor(Executor):
     def _expect(self, worker: _Worker, call: _Call) -> None:
         """Limit the time until a worker begins its next rollout, if it has the testbed of that already."""
         if worker.has_testbed(call, worker.jobs[0]):
-            worker.begin(self._time_limit, call.cutoff)
+            worker.begin(self.time_limit, call.cutoff)
 
     def _replies(self, call: _Call) -> list[tuple[_Worker, int, Any]]:
         """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
@@ -220,7 +223,7 @@ class ProcessExecutor(Executor):
                 try:
                     message = connection.recv_bytes()
                     if message == _BEGUN:
-                        worker.begin(self._time_limit, cutoff)
+                        worker.begin(self.time_limit, cutoff)
                     elif message == _GROWN:
                         worker.grown = True
                     else:
@@ -234,7 +237,7 @@ class ProcessExecutor(Executor):
                     replies.append((worker, index, f"its worker process died (exit code {code})"))
             elif time.monotonic() >= worker.deadline:
                 hung = cutoff is not None and cutoff.is_over
-                reason = "it did not stop" if hung else f"it took longer than its time limit of {self._time_limit:g} s"
+                reason = "it did not stop" if hung else f"it took longer than its time limit of {self.time_limit:g} s"
                 replies.append((worker, index, reason))
         return replies
 

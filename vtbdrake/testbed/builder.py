@@ -12,6 +12,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, Output
 from vtbdrake.argument_checks import as_addresses
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, name_systems
+from vtbdrake.testbed.integrator import controls_error
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, BeliefRule, VirtualTestbed, check_mode
@@ -249,7 +250,10 @@ class VirtualTestbedBuilder:
         self.finish_world()
         sense_position, act_position = MODES[mode]
         u = {s.name: s.default_vector() for s in self.interface.commands if s.name not in self._commands}
-        switches = Switches(self.diagram_builder, self.interface, sense_position, act_position, self._dps, u)
+        guarded = self._guarded_commands(self._dps)
+        switches = Switches(
+            self.diagram_builder, self.interface, sense_position, act_position, self._dps, u, guarded=guarded
+        )
         self._connect_switches(switches, self._dps)
         commands = tuple(switches.command_variables(self.interface.commands))
         for command in commands:
@@ -320,6 +324,20 @@ class VirtualTestbedBuilder:
                 self.scene_graph = scene_graph if scene_graph is not None and is_scene_graph(scene_graph) else None
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
+
+    def _guarded_commands(self, dps: System) -> tuple[str, ...]:
+        """Return the actuator signals whose commands are checked before they enter the simulated world.
+
+        NaN and infinity make the time derivatives of a continuous world useless, and an integrator with error control
+        then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead. The check is in
+        Python. So it is there only for a DPS that computes in Python itself.
+        """
+        own = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
+        if not controls_error(self.simulator_config) or not any(is_python(system) for _, system in own):
+            return ()
+        if not any(system.num_continuous_states() for system in self.diagram_builder.GetSystems()):
+            return ()
+        return tuple(signal.name for signal in self.interface.act if signal.is_vector)
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():

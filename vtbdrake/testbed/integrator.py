@@ -4,6 +4,17 @@ from __future__ import annotations
 
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
+_FIXED_STEPS = ("explicit_euler", "runge_kutta2", "semi_explicit_euler")
+
+
+def controls_error(config: SimulatorConfig) -> bool:
+    """Return whether the integrator shortens its steps until their error is small, without a least step for NaN.
+
+    CENIC is none of these: its solver refuses what is not finite.
+    """
+    fixed = config.integration_scheme in (*_FIXED_STEPS, "cenic")
+    return bool(config.use_error_control) and not fixed
+
 
 def apply_simulator_config(config: SimulatorConfig, simulator: Simulator) -> None:
     """Apply ``config`` as Drake does, and make the solver of CENIC faster at the same tolerance.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 from vtbdrake.state.declarations import DISCRETE, NO_DICT, Codec, Element, weakly
 from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variables import Variable, VariableError, X
-from vtbdrake.testbed.signal import Interface, Signal
+from vtbdrake.testbed.signal import Interface, Signal, SignalError
 
 SIM, REAL, TWIN = "sim", "real", "twin"
 SENSE_POSITIONS = (SIM, REAL)
@@ -84,6 +84,48 @@ SwitchBoard = SwitchBoard_[None]
 _POSITION_CODEC = Codec(
     encode=lambda port: {"port": np.array(int(port))}, decode=lambda arrays: InputPortIndex(int(arrays["port"]))
 )
+
+
+@TemplateSystem.define("FiniteCommand_")  # type: ignore[untyped-decorator]
+def FiniteCommand_(T: type) -> type:
+    """Make the class `FiniteCommand` for the scalar type ``T``.
+
+    A finite command refuses NaN and infinity where an actuator command of a DPS in Python enters a continuous world.
+    Integrators with error control would divide their step by ten for ever. It computes only when the DPS has.
+
+    .. pydrake_system::
+
+        name: FiniteCommand
+        input_ports:
+        - command
+        output_ports:
+        - command
+    """
+
+    class Impl(LeafSystem_[T]):
+        __slots__ = NO_DICT
+
+        def _construct(self, signal: str, size: int, converter: SystemScalarConverter | None = None) -> None:
+            LeafSystem_[T].__init__(self, converter)
+            self._signal = signal
+            self._command = self.DeclareVectorInputPort("command", size)
+            self.DeclareVectorOutputPort("command", size, weakly(self, Impl._calc), {self._command.ticket()})
+            self.variables = ()
+
+        def _construct_copy(self, other: Any, converter: SystemScalarConverter | None = None) -> None:
+            Impl._construct(self, other._signal, other._command.size(), converter=converter)
+
+        def _calc(self, context: Any, output: Any) -> None:
+            command = self._command.Eval(context)
+            if T is float and not np.isfinite(command).all():
+                time = context.get_time()
+                raise SignalError(f"the DPS commands {self._signal} = {command} at t = {time:g} s, which is not finite")
+            output.SetFromVector(command)
+
+    return Impl
+
+
+FiniteCommand = FiniteCommand_[None]
 
 
 class Selector:
@@ -155,6 +197,7 @@ class Switches:
 
     Args:
         u: Default values of the constant commands, by signal.
+        guarded: The actuator signals whose commands a `FiniteCommand` checks before they enter the simulated world.
     """
 
     def __init__(
@@ -165,6 +208,8 @@ class Switches:
         act_position: str,
         dps: System,
         u: Mapping[str, np.ndarray],
+        *,
+        guarded: Collection[str] = (),
     ) -> None:
         self._builder = builder
         sense = {f"{T_SENSE}{signal.name}": signal for signal in interface.sense}
@@ -196,7 +241,8 @@ class Switches:
         for name, signal in act.items():
             command = dps.GetOutputPort(signal.name)
             idle = self._idle(name, signal)
-            self.sim_act[signal.name] = self._choose(name, f"{name}.sim", signal, command, idle, command)
+            checked = self._finite(name, signal, command) if signal.name in guarded else command
+            self.sim_act[signal.name] = self._choose(name, f"{name}.sim", signal, checked, idle, checked)
             if signal.is_vector:
                 none = self._board.GetOutputPort(f"{name}.none")
                 self.real_act[signal.name] = self._choose(name, f"{name}.real", signal, none, command, command)
@@ -220,6 +266,11 @@ class Switches:
             return self._board.GetOutputPort(f"{name}.idle")
         source = ConstantValueSource(Value(signal.idle))
         return self._builder.AddNamedSystem(f"{name}.idle", source).get_output_port()
+
+    def _finite(self, switch: str, signal: Signal, command: OutputPort) -> OutputPort:
+        guard = self._builder.AddNamedSystem(f"{switch}.finite", FiniteCommand(signal.name, signal.size))
+        self._builder.Connect(command, guard.get_input_port())
+        return guard.get_output_port()
 
     def _choose(self, switch: str, name: str, signal: Signal, *sources: OutputPort) -> OutputPort:
         inputs, output = self._add_switch(switch, name, signal, ACT_POSITIONS)

@@ -1,0 +1,87 @@
+"""A DPS that commands NaN or infinity after a quarter of a second, in continuous worlds."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, LinearSystem, Multiplexer
+
+from vtbdrake.testbed import Interface, Scenario, Signal
+
+PENDULUM = """
+<robot name="pendulum">
+  <link name="arm"><inertial><mass value="1"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="pin" type="continuous"><parent link="world"/><child link="arm"/><axis xyz="0 1 0"/></joint>
+  <transmission><type>transmission_interface/SimpleTransmission</type><joint name="pin"/><actuator name="pin"/>
+  </transmission>
+</robot>
+"""
+
+
+class FailingLaw(LeafSystem):
+    """Commands 0, and ``bad`` after 0.25 s: at its next sample, or at once."""
+
+    def __init__(self, bad, *, sampled):
+        super().__init__()
+        self._bad = bad
+        self.DeclareVectorInputPort("state", 2)
+        if sampled:
+            state = self.DeclareDiscreteState(1)
+            self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, self._update)
+            self.DeclareStateOutputPort("force", state)
+        else:
+            self.DeclareVectorOutputPort("force", 1, self._calc, {self.time_ticket()})
+
+    def _command(self, context):
+        return [self._bad if context.get_time() > 0.25 else 0.0]
+
+    def _update(self, context, discrete):
+        discrete.set_value(self._command(context))
+
+    def _calc(self, context, output):
+        output.SetFromVector(self._command(context))
+
+
+@dataclass
+class NonfiniteScenario(Scenario):
+    """A mass (a LinearSystem) or a pendulum (a MultibodyPlant) under a force that is not finite any more."""
+
+    simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
+    bad: str = "nan"  # as a text: numbers of a scenario are finite
+    sampled: bool = True
+    plant: bool = False
+    time_step: float = 0.0
+    # The force is that of a system of the world, and is not finite from the beginning.
+    in_world: bool = False
+
+    def interface(self):
+        return Interface(
+            sense=[Signal("state", size=2)], act=[Signal("force", size=1, unit="N", idle=0.0)], commands=[]
+        )
+
+    def make_dps(self):
+        return FailingLaw(0.0 if self.in_world else float(self.bad), sampled=self.sampled)
+
+    def add_world(self, builder):
+        if self.plant:
+            plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
+            Parser(plant).AddModelsFromString(PENDULUM, "urdf")
+            plant.Finalize()
+            builder.sim_sensor("state", plant.get_state_output_port())
+            builder.sim_actuator("force", plant.get_actuation_input_port())
+            if self.in_world:
+                wind = builder.add("env", "wind", ConstantVectorSource([float(self.bad)]))
+                builder.connect(wind.get_output_port(), plant.get_applied_generalized_force_input_port())
+            return
+        system = LinearSystem(np.eye(2, k=1), np.array([[0.0, 0.0], [1.0, 1.0]]), np.eye(2), np.zeros((2, 2)))
+        mass = builder.add("sys", "mass", system)
+        builder.sim_sensor("state", mass.get_output_port())
+        forces = builder.add("sys", "forces", Multiplexer(2))
+        wind = builder.add("env", "wind", ConstantVectorSource([float(self.bad) if self.in_world else 0.0]))
+        builder.connect(wind.get_output_port(), forces.get_input_port(1))
+        builder.connect(forces.get_output_port(), mass.get_input_port())
+        builder.sim_actuator("force", forces.get_input_port(0))

@@ -1,0 +1,126 @@
+"""What is not finite ends a rollout, and is named; Drake's integrators would shorten their step for ever."""
+
+import itertools
+import re
+import threading
+from math import inf
+
+import pytest
+from pydrake.systems.analysis import SimulatorConfig
+
+from tests.interruptions import hanging_fails
+from tests.rollout.nonfinite import NonfiniteScenario
+from tests.testbeds import PendulumScenario
+from vtbdrake.rollout import (
+    ProcessExecutor,
+    Quality,
+    RolloutTask,
+    SerialExecutor,
+    ThreadExecutor,
+    executor,
+    make_executor,
+    worker_processes,
+)
+from vtbdrake.testbed import SignalError
+
+THETA = "sim.sys.Pendulum.theta.position"
+
+
+@pytest.fixture(scope="module")
+def process():
+    """A process in which a rollout that never ends costs a few seconds."""
+    with ProcessExecutor(1, time_limit=20.0) as made:
+        yield made
+
+
+def result(process, scheme, **fields):
+    config = SimulatorConfig(integration_scheme=scheme, max_step_size=0.05, accuracy=1e-3)
+    task = RolloutTask(NonfiniteScenario(config, **fields), 1.0, Quality(abs, "time"))
+    ((_, only),) = process.run(task, [{}])
+    return only
+
+
+WORLDS = [
+    (scheme, False) for scheme in ("runge_kutta3", "runge_kutta5", "bogacki_shampine3", "implicit_euler", "radau3")
+]
+WORLDS += [(scheme, True) for scheme in ("runge_kutta3", "implicit_euler", "radau3", "cenic")]
+
+
+@pytest.mark.parametrize(("scheme", "plant"), WORLDS)
+def test_command_that_is_not_finite_fails_the_rollout_by_name(process, scheme, plant):
+    for bad, sampled in itertools.product(("nan", "inf", "-inf"), (True, False)):
+        failed = result(process, scheme, bad=bad, sampled=sampled, plant=plant)
+        assert failed.end == "failed"
+        assert f"the DPS commands force = [{bad}]" in failed.message
+        assert failed.times[-1] == pytest.approx(0.3 if sampled else 0.25)
+
+
+@pytest.mark.parametrize("fields", [{"plant": True, "time_step": 0.01}, {}])
+def test_command_is_named_where_the_steps_are_fixed(process, fields):
+    failed = result(process, "explicit_euler", **fields)
+    assert failed.end == "failed"
+    assert failed.message.startswith("the DPS commands force = [nan]; ")
+
+
+@pytest.mark.parametrize("scheme", ["runge_kutta3", "implicit_euler", "cenic"])
+@pytest.mark.parametrize("bad", ["nan", "inf"])
+def test_world_that_is_not_finite_fails_at_its_first_sample(process, scheme, bad):
+    failed = result(process, scheme, bad=bad, in_world=True, plant=scheme == "cenic")
+    assert failed.end == "failed"
+    assert "commands" not in failed.message
+    if scheme != "cenic":
+        assert failed.message == "the time derivatives are not finite at t = 0 s"
+
+
+def test_plain_simulation_is_refused_too():
+    testbed = NonfiniteScenario(SimulatorConfig(integration_scheme="runge_kutta3")).build()
+    context = testbed.default_context()
+    with pytest.raises(SignalError, match=r"the DPS commands force = \[nan\] at t = 0.3 s, which is not finite"):
+        testbed.simulator(context).AdvanceTo(1.0)
+
+
+@pytest.mark.parametrize("value", [float("nan"), inf])
+def test_value_that_is_not_finite_is_refused(value):
+    task = RolloutTask(PendulumScenario(), 0.1, Quality(abs, THETA))
+    ((_, only),) = SerialExecutor().run(task, [{THETA: value}])
+    assert only.end == "failed"
+    assert re.search(f"VariableError: .*{THETA}.* finite", only.message)
+
+
+def guards(scenario):
+    return [s.get_name() for s in scenario.build().diagram.GetSystems() if s.get_name().endswith(".finite")]
+
+
+def test_guard_is_only_where_a_nan_would_never_end():
+    adaptive, fixed = SimulatorConfig(integration_scheme="runge_kutta3"), SimulatorConfig(use_error_control=False)
+    assert guards(NonfiniteScenario(adaptive)) == ["T_act.force.finite"]
+    assert guards(NonfiniteScenario(fixed)) == []
+    assert guards(NonfiniteScenario(adaptive, plant=True, time_step=0.01)) == []
+    assert guards(NonfiniteScenario(SimulatorConfig(integration_scheme="cenic"), plant=True)) == []
+
+
+def test_processes_have_a_time_limit_by_default():
+    testbed = PendulumScenario().build()
+    with make_executor("processes", testbed=testbed, rollouts=0) as made:
+        assert made.time_limit == ProcessExecutor(1).time_limit == worker_processes.TIME_LIMIT < inf
+    with make_executor("processes", testbed=testbed, rollouts=0, time_limit=inf) as made:
+        assert made.time_limit == inf
+
+
+def test_thread_that_does_not_stop_is_left_behind(monkeypatch, caplog):
+    release = threading.Event()
+
+    def stuck(theta):
+        if theta > 0.5:
+            release.wait()
+        return theta
+
+    monkeypatch.setattr(executor, "GRACE", 0.1)
+    made = ThreadExecutor(2)
+    rollouts = made.run(RolloutTask(PendulumScenario(), 0.1, Quality(stuck, THETA)), [{THETA: 0.1}, {THETA: 1.0}])
+    assert next(rollouts)[0] == 0
+    with hanging_fails("what does not stop is not waited for"):
+        rollouts.close()
+    assert "a rollout does not stop: its thread is left behind" in caplog.text
+    release.set()
+    made.close()
