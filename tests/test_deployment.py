@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -14,6 +15,7 @@ from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.servo_machine import COMMAND, ServoMachineScenario
 from tests.control.test_loop import Ear
 from tests.lcm.hub.clients import Client
+from tests.machine.looking import LookingScenario
 from vtbdrake.control.bridge import Bridge, BridgeError
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import Hold, Silence
@@ -117,6 +119,27 @@ def test_signals_without_max_age_are_refused_outside_of_lock_step() -> None:
     deployment.in_lock_step("speed").check(ageless)
 
 
+def test_signal_that_is_not_sent_in_every_cycle_is_refused_in_lock_step() -> None:
+    """Machine and loop would wait for each other."""
+    deployment = LookingScenario().deployment()
+    with pytest.raises(ValueError, match=r"image is sent every 0\.02 s only, .* a command every 0\.01 s"):
+        deployment.in_lock_step("image")
+    assert deployment.in_lock_step("speed").pace == "speed"
+
+
+@pytest.mark.parametrize(("hint", "expected"), [("press the green button", "press the green"), ("", "a command u")])
+def test_refused_reset_says_what_to_do(hint: str, expected: str) -> None:
+    machine = Machine(Deployment(continuity={"velocity": ("speed", 1.2)}, hint=hint))
+    machine.runtime.write({"u.target": [0.05, 0.0]})
+    machine.take_over()
+    machine.runtime.run(cycles=5)
+    machine.runtime.guards.latch("told", machine.clock.now(), {})
+    machine.runtime.write({"u.target": [0.9, 0.0]})
+    machine.runtime.run(cycles=2)
+    with pytest.raises(SwitchRefusedError, match=f"1.2 is allowed: .*{expected}"):
+        machine.runtime.reset()
+
+
 def test_fields_of_a_deployment_can_be_replaced() -> None:
     deployment = Deployment.of(ServoMachineScenario(), period=0.002, pace="speed")
     assert (deployment.period, deployment.pace) == (0.002, "speed")
@@ -128,7 +151,7 @@ def test_fallback_is_that_of_the_deployment() -> None:
     machine.take_over()
     machine.runtime.run(cycles=20)
     last = machine.bridge.sent[-1][1]["velocity"]
-    machine.runtime.send_fallback("because")
+    machine.runtime.leave("because")
     assert np.array_equal(machine.bridge.sent[-1][1]["velocity"], last)
     assert np.any(last != 0.0)
 
@@ -219,6 +242,31 @@ def test_error_in_the_block_sends_the_fallback_once(error: type[BaseException]) 
             runtime.run(until=fail)
         heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_machine_without_time_out_is_left_at_rest(interrupted: bool, tmp_path: Path) -> None:
+    scenario = ServoMachineScenario(rate=2.0, leave_time=0.4)
+    with Hub(port=0, protect=[COMMAND]) as hub, MachineProcess(scenario, hub.url, timeout=1e3, brake="hold"):
+        ear = Ear(hub.url)
+
+        def interrupt() -> bool:
+            raise KeyboardInterrupt
+
+        with (
+            suppress(KeyboardInterrupt),
+            scenario.deploy(hub.url, record=tmp_path / "servo.lcm", values={"u.target": [0.1, -0.05]}) as runtime,
+        ):
+            runtime.take_over()
+            runtime.run(cycles=100)
+            if interrupted:
+                runtime.run(until=interrupt)
+        heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
+    assert np.abs(heard).max() > 0.1
+    assert np.abs(np.diff(heard, axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
+    assert heard[-1].tolist() == [0.0, 0.0]
+    report = replay(tmp_path / "servo.lcm")
+    assert report.identical and report.cycles == runtime.cycles
 
 
 def test_block_without_take_over_commands_nothing() -> None:

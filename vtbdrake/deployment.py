@@ -34,6 +34,10 @@ def _not_blocked(bridge: Bridge) -> str | None:
     return None
 
 
+def _not_released(bridge: Bridge) -> bool:
+    return False
+
+
 @dataclass(frozen=True, kw_only=True)
 class Deployment:
     """The description of a DPS on its machine: the messages, the guards, and the clock of its cycles.
@@ -53,12 +57,14 @@ class Deployment:
     Attributes:
         protocol: The LCM channels and messages of the machine. None if it has none.
         period: The period of a cycle, in seconds.
-        guards: Options of `Guards`, such as ``fallback`` and ``max_missed``.
+        guards: Options of `Guards`, such as ``fallback``, ``max_missed`` and ``leave_time``.
         continuity: Actuator signal -> (sensor signal, largest difference): where actuator commands start from, see
             `Runtime`. Required for each vector actuator signal of a protocol; None lets the commands of one jump when
             it is switched to real, where no sensor signal tells what the machine does. (A limited rate or acceleration
             needs one.)
         blocked_by: Returns why the machine behind a bridge must not be commanded yet, or None.
+        hint: What to do where commands would not continue what is measured, see `Runtime`.
+        released_by: Returns whether the machine behind a bridge confirms that it does without commands, see `Runtime`.
         pace: The sensor signal whose messages begin the cycles. If empty, the clock does.
         patience: The number of periods without such a message after which the clock begins a cycle.
         check_age: False accepts sensor values of any age, for a machine whose time stops between two messages.
@@ -70,6 +76,8 @@ class Deployment:
     guards: Mapping[str, Any] = field(default_factory=dict)
     continuity: Continuity = field(default_factory=dict)
     blocked_by: Callable[[Bridge], str | None] = _not_blocked
+    hint: str = ""
+    released_by: Callable[[Bridge], bool] = _not_released
     pace: str = ""
     patience: float = 3.0
     check_age: bool = True
@@ -139,7 +147,17 @@ class Deployment:
             signal: A sensor signal in the last message of the machine's cycle. Each of its messages begins a cycle of
                 the loop, however late it is.
             wait: The time without a message after which a cycle begins anyway, in seconds.
+
+        Raises:
+            ValueError: The signal is not sent in every cycle: machine and loop would wait for each other.
         """
+        protocol = self.protocol or Protocol(sense=[], act=[])
+        for channel in (map.channel for map in protocol.sense if signal in map.signals):
+            if round(protocol.periods.get(channel, self.period) / self.period) > 1:
+                raise ValueError(
+                    f"{signal} is sent every {protocol.periods[channel]:g} s only, but a machine in lock-step waits "
+                    f"for a command every {self.period:g} s: name a signal that is sent in every cycle"
+                )
         return replace(self, pace=signal, patience=wait / self.period, check_age=False)
 
     def runtime(
@@ -153,7 +171,9 @@ class Deployment:
             period=self.period,
             guards=self._guards(target.interface),
             continuity=self.continuity,
+            hint=self.hint,
             blocked_by=lambda: self.blocked_by(bridge),
+            released_by=lambda: self.released_by(bridge),
             pace=self.pace or None,
             patience=self.patience,
             **options,
@@ -207,9 +227,7 @@ def deploy(
         try:
             yield runtime
         finally:
-            # After Ctrl-C or an error in `Runtime.run`, the loop has done so already.
-            if not any(fault.kind == "told" for fault in runtime.guards.latched):
-                runtime.send_fallback("the deployment ended")
+            runtime.leave("the deployment ended")
     if recorder is not None:
         if recorder.lost:
             raise RecordingError(f"{recorder.lost} of {runtime.cycles} cycles of the loop are not in the log {record}")

@@ -24,6 +24,7 @@ class ServoMachineScenario(ServoScenario):
 
     max_age: float = PATIENCE
     lock_step: bool = False
+    leave_time: float = 0.0
 
     def interface(self) -> Interface:
         interface = super().interface()
@@ -38,7 +39,7 @@ class ServoMachineScenario(ServoScenario):
         deployment = Deployment(
             protocol=protocol,
             period=PERIOD,
-            guards={"max_missed": inf, "pace_tolerance": inf},
+            guards={"max_missed": inf, "pace_tolerance": inf, "leave_time": self.leave_time},
             continuity={"velocity": ("speed", 5.0)},
             pace="position",
             patience=PATIENCE / PERIOD,

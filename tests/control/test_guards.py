@@ -258,10 +258,57 @@ def test_faults_on_sim_are_reported_without_latching() -> None:
 
 
 def test_latch_outlasts_switch_to_sim() -> None:
-    loop = Loop(TORQUE)
+    loop = Loop(TORQUE, leave_time=0.0)
     loop.cycle({"torque": [nan, 0.0]})
     assert loop.cycle({}).actuation == {}
     assert loop.guards.latched
+
+
+@pytest.mark.parametrize("latched", [False, True])
+def test_fallback_commands_a_signal_that_has_left_real(latched: bool) -> None:
+    loop = Loop(TORQUE, POSITION, leave_time=0.0505)
+    for k in range(20):
+        loop.cycle({"torque": [RATE * T * (k + 1), 0.0], "position": [0.0]})
+    if latched:
+        loop.guards.latch("told", loop.now, {})
+    begin, sent = loop.now, []
+    for _ in range(100):
+        verdict = loop.cycle({"position": [0.0]})
+        assert "position" in verdict.actuation and verdict.ok != latched
+        if "torque" in verdict.actuation:
+            assert loop.guards.leaving == {"torque"}
+            sent.append(verdict.actuation["torque"][0])
+    assert begin == pytest.approx(0.02) and len(sent) == 51
+    # From 2 N m to zero within the limit of the rate.
+    first = 18 if latched else 19
+    assert sent[:19] == pytest.approx([RATE * T * max(first - k, 0) for k in range(19)], abs=1e-12)
+    assert set(sent[20:]) == {0.0}
+    assert loop.guards.leaving == frozenset()
+    assert not loop.guards.limiters["torque"].has_start
+
+
+def test_released_machine_gets_no_fallback() -> None:
+    loop = Loop(TORQUE)
+    loop.cycle({"torque": [0.05, 0.0]})
+    assert set(loop.cycle({}).actuation) == {"torque"}
+    assert loop.cycle({}, released=True).actuation == {}
+    assert loop.cycle({}).actuation == {}
+
+
+def test_signal_back_on_real_is_not_left_to_its_fallback() -> None:
+    loop = Loop(TORQUE, leave_time=1.0)
+    loop.cycle({"torque": [0.05, 0.0]})
+    loop.cycle({})
+    loop.guards.start("torque", [0.0, 0.0])
+    for _ in range(2000):
+        assert loop.cycle({"torque": [0.05, 0.0]}).actuation["torque"].tolist() == [0.05, 0.0]
+    assert loop.guards.leaving == frozenset()
+
+
+def test_silent_fallback_leaves_a_signal_at_once() -> None:
+    loop = Loop(TORQUE, fallback={"torque": Silence()})
+    loop.cycle({"torque": [0.05, 0.0]})
+    assert loop.cycle({}).actuation == {}
 
 
 def test_limited_signal_without_start_is_not_sent() -> None:
@@ -276,7 +323,7 @@ def test_limited_signal_without_start_is_not_sent() -> None:
 
 
 def test_signal_back_on_real_needs_new_start() -> None:
-    loop = Loop(TORQUE)
+    loop = Loop(TORQUE, leave_time=0.0)
     loop.cycle({"torque": [0.0, 0.0]})
     loop.cycle({})
     assert kinds(loop.cycle({"torque": [0.0, 0.0]})) == [("torque", "not started")]
@@ -553,6 +600,8 @@ def test_abstract_actuator_signal_is_passed_and_held() -> None:
         ({"fallback": {"torqe": Zero()}}, "fallback is given for torqe, but the signals are torque"),
         ({"jump_tolerance": {"speed": 1.0}}, "jump_tolerance is given for speed, but the signals are velocity"),
         ({"max_missed": -1}, "max_missed"),
+        ({"leave_time": -1.0}, "leave_time is a number of seconds"),
+        ({"leave_time": nan}, "leave_time is a number of seconds"),
         ({"fallback": {"torque": Brake("speed", gain=1.0)}}, "the brake of torque"),
     ],
 )

@@ -183,7 +183,8 @@ def test_endless_python_step_is_ended_and_fallback_sent() -> None:
         "    with RealTime(longest_step=0.3, awake=False) as r: runtime.run(cycles=1000)\n"
         "except RunawayError as error: reason = str(error)\n"
         "tell(before=before, after=state(), reason=reason, sent=bridge.sent[-1][1]['velocity'].tolist(),\n"
-        "     latched=str(runtime.guards.latched[0]), commanded=bridge.sent[-2][1]['velocity'].tolist())"
+        "     latched=str(runtime.guards.latched[0]),\n"
+        "     commanded=[c['velocity'].tolist() for _, c in bridge.sent if c['velocity'].any()][-1])"
     )
     assert "computed for 0.3 s without waiting" in found["reason"]
     assert found["latched"] == "the loop ended"

@@ -139,9 +139,105 @@ def test_world_starts_from_belief_after_switch_to_sim():
     runtime.switch("sim")
     axes = runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")
     assert np.array_equal(axes, [0.05, 0.0])
+
+
+# -- leaving real
+
+
+@pytest.mark.parametrize("pace", [None, "position"])
+@pytest.mark.parametrize("way", ["sim", "shadow", {"act": "sim"}, {"sense": {"speed": "sim"}, "act": "sim"}])
+def test_machine_without_time_out_is_left_at_rest(way, pace):
+    """It keeps the last command; here, a velocity."""
+    guards = Guards(ServoScenario(rate=2.0).interface(), PERIOD, leave_time=0.5)
+    runtime, bridge, clock = switched(rate=2.0, guards=guards, pace=pace)
+    runtime.run(cycles=200)
+    assert np.abs(sent(bridge)[-1]).max() > 0.2
+    runtime.switch(**way) if isinstance(way, dict) else runtime.switch(way)
+    begin, count = clock.now(), len(bridge.sent)
+    runtime.run(cycles=1000)
+    times = np.array([t for t, _ in bridge.sent[count:]]) - begin
+    assert times[-1] == pytest.approx(0.5, abs=2 * PERIOD) and len(times) == pytest.approx(500, abs=2)
+    assert np.abs(np.diff(sent(bridge), axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0]
+    assert runtime.guards.latched == ()
+
+
+def test_fallback_ends_when_the_machine_confirms():
+    brakes = []
+    runtime, bridge, clock = switched(rate=0.0, released_by=lambda: bool(brakes))
+    runtime.run(cycles=5)
+    runtime.switch("shadow")
+    runtime.run(cycles=20)
+    assert len(bridge.sent) == 25
+    brakes.append("engaged")
+    runtime.run(cycles=20)
+    assert len(bridge.sent) == 25
+
+
+def test_fallback_ends_when_another_publisher_commands():
+    class Contended(ScriptedBridge):
+        competing_publisher = None
+
+    scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
+    bridge = Contended(scenario.interface(), clock, still)
+    runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
+    runtime.cycle()
+    runtime.switch("real")
+    runtime.run(cycles=5)
+    runtime.switch("shadow")
+    runtime.run(cycles=5)
+    bridge.competing_publisher = "somebody else commands"
+    runtime.run(cycles=5)
+    assert len(bridge.sent) == 10
+    runtime.leave("the loop ended")
+    assert len(bridge.sent) == 10
+
+
+def test_signal_back_on_real_departs_from_measurement():
+    runtime, bridge, _ = switched(rate=2.0)
+    runtime.run(cycles=300)
+    runtime.switch("sim")
+    runtime.run(cycles=10)
+    bridge.sensors = lambda t: {"position": [0.05, 0.0], "speed": [-0.3, 0.0]}
+    runtime.run(cycles=1)
     count = len(bridge.sent)
-    runtime.run(cycles=50)
-    assert len(bridge.sent) == count
+    runtime.switch("real")
+    runtime.run(cycles=800)
+    steps = np.abs(np.diff(sent(bridge)[count:], axis=0, prepend=[[-0.3, 0.0]]))
+    assert steps.max() <= 2.0 * PERIOD * (1 + 1e-9)
+    assert sent(bridge)[-1] == pytest.approx(5.0 * (TARGET - [0.05, 0.0]))
+
+
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("rate", [0.0, 2.0])
+def test_interrupted_loop_leaves_the_machine_at_rest(rate, alone):
+    guards = Guards(ServoScenario(rate=rate).interface(), PERIOD, leave_time=0.5)
+    runtime, bridge, clock = switched(rate=rate, alone=alone, guards=guards)
+    runtime.run(cycles=300)
+    steps, count = runtime.steps, len(bridge.sent)
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        runtime.run(until=interrupt)
+    begin = bridge.sent[count][0]
+    times = np.array([t for t, _ in bridge.sent[count + 1 :]]) - begin
+    assert times[-1] == pytest.approx(0.5, abs=2 * PERIOD) and len(times) == pytest.approx(501, abs=2)
+    assert np.abs(np.diff(sent(bridge), axis=0)).max() <= (2.0 * PERIOD * (1 + 1e-9) if rate else np.inf)
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0]
+    assert runtime.steps == steps + 1  # The DPS is not stepped any more.
+    left = len(bridge.sent)
+    runtime.leave("again")
+    assert len(bridge.sent) == left
+
+
+def test_loop_without_commands_leaves_at_once():
+    runtime, bridge, clock = make()
+    runtime.run(cycles=5)
+    begin = clock.now()
+    runtime.leave("the loop ended")
+    assert bridge.sent == [] and clock.now() == begin
 
 
 @pytest.mark.parametrize("ways", [["real"], ["twin"], ["sim", "real"]])
@@ -167,10 +263,9 @@ def test_dps_with_invalid_belief_can_be_switched_to_sim(caplog):
     runtime, bridge, _ = switched(rate=0.0)
     bridge.sensors = lambda t: {**still(t), "position": [np.nan, 0.0]}
     runtime.run(cycles=3)
-    count = len(bridge.sent)
     runtime.switch("sim")
     runtime.cycle()
-    assert len(bridge.sent) == count == 3
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0]
     assert np.isfinite(runtime.target.read(runtime.context, "sim.sys.axes.discrete_state_0")).all()
     assert "the belief cannot be set" in caplog.text
 
@@ -376,7 +471,7 @@ def test_age_of_samples_is_checked_after_a_long_step(took, kind, options):
 def test_reset_with_discontinuous_command_is_refused():
     runtime, bridge, _ = switched(rate=0.0, continuity={"velocity": ("speed", 1.2)})
     runtime.run(cycles=5)
-    runtime.send_fallback("told")
+    runtime.leave("told")
     runtime.write({"u.target": [0.9, -0.1]})
     runtime.run(cycles=3)
     with pytest.raises(SwitchRefusedError, match=r"velocity\[0\] is 4.25 away from speed\[0\]; 1.2 is"):
@@ -677,7 +772,7 @@ def test_first_command_after_outage_departs_from_measurement():
     assert np.abs(np.diff(sent(bridge)[count:], axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
 
 
-def test_interruption_sends_the_fallback_once():
+def test_interruption_sends_the_fallback():
     runtime, bridge, _ = switched(rate=0.0)
 
     def interrupt():

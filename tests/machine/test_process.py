@@ -125,6 +125,28 @@ def test_machine_in_lock_step_and_simulation_agree_bit_for_bit(hub: Hub) -> None
             listener.command(command, k + 1)
 
 
+def test_sense_latency_in_lock_step_is_refused(hub: Hub) -> None:
+    """The machine would wait for the answer to a state that it holds back."""
+    reason = (
+        r"no sense_latency, unlike 0\.002 s: .* \(ErrorModel\(latency=\.\.\.\)\), or let the clock begin the cycles"
+    )
+    with pytest.raises(ValueError, match=reason):
+        MachineProcess(RobotScenario(), hub.url, lock_step=True, sense_latency=0.002)
+    loop = MachineLoop(Machine(RobotScenario(), MachineConfig(sense_latency=0.002)), hub.url)
+    with pytest.raises(ValueError, match=reason):
+        loop.run(lock_step=True)
+    loop.close()
+
+
+def test_act_latency_in_lock_step_delays_commands(hub: Hub) -> None:
+    listener = Listener(hub.url)
+    with MachineProcess(RobotScenario(), hub.url, lock_step=True, act_latency=0.002) as process:
+        for k in range(5):
+            listener.wait(lambda heard, k=k: heard and utime(heard[-1]) == k * 1000)
+            listener.command(0.5, k + 1)
+        assert process.until(lambda status: status.cycle == 5).accepted["torque"] == 3
+
+
 def test_machine_sends_its_state_every_period(hub: Hub) -> None:
     listener = Listener(hub.url)
     with MachineProcess(RobotScenario(), hub.url, period=0.01):

@@ -90,8 +90,8 @@ def run(
 
     It runs without its simulated world, until Ctrl-C. The method deployment() of the scenario describes the channels
     and the guards. The DPS commands as soon as all its sensor signals are fresh and plausible and the machine is ready.
-    After a fault the fallbacks command, until vtbdrake reset. At the end they command once. The exit code is 1 if the
-    machine was not ready, if the fallbacks were commanding at the end, or if the log lacks cycles.
+    After a fault the fallbacks command, until vtbdrake reset. At the end they command for a second more. The exit code
+    is 1 if the machine was not ready, if the fallbacks were commanding at the end, or if the log lacks cycles.
 
     \b
     Example:

@@ -44,6 +44,9 @@ class Guards:
     that must not be commanded. A fault *latches* in the same cycle: from then on the fallbacks command all signals that
     are on real, until `reset`. While nothing is on real, faults are reported, but nothing latches.
 
+    A signal that leaves real is not left alone with its last command: its fallback commands it for ``leave_time``, or
+    until the machine is released (see `check`).
+
     A signal with a limit of its rate or acceleration needs `start` before it is commanded. A signal that has neither a
     start nor a sent command is not sent at all: there is nothing to hold.
 
@@ -67,11 +70,13 @@ class Guards:
         pace_tolerance: For a loop that messages pace, the largest difference between their pace and the period,
             relative to the period (see `PaceMonitor`); more is a fault. The default covers clocks that differ by some
             per cent. Infinite: no pace is a fault.
+        leave_time: Seconds for which the fallbacks go on commanding signals that have left real.
         log_size: Number of faults that `log` keeps.
 
     Attributes:
         period: Period of the loop, in seconds.
         pace_tolerance: As given.
+        leave_time: As given.
         limiters: The limiter of each actuator signal, with its counts.
         monitors: The monitor of each sensor signal.
         log: The newest faults, each once while it lasts.
@@ -92,6 +97,7 @@ class Guards:
         max_delay: Mapping[str, float] | None = None,
         max_missed: float = 10,
         pace_tolerance: float = 0.1,
+        leave_time: float = 1.0,
         log_size: int = 1000,
     ) -> None:
         fallback, jump_tolerance, max_delay = dict(fallback or {}), dict(jump_tolerance or {}), dict(max_delay or {})
@@ -102,8 +108,11 @@ class Guards:
             raise ValueError(f"max_missed is a number of deadlines, not {max_missed}")
         if not pace_tolerance > 0.0:
             raise ValueError(f"pace_tolerance is a positive share of the period, not {pace_tolerance}")
+        if not leave_time >= 0.0:
+            raise ValueError(f"leave_time is a number of seconds from 0 on, not {leave_time}")
         self.period = period
         self.pace_tolerance = pace_tolerance
+        self.leave_time = leave_time
         self.limiters: dict[str, RateLimiter | PassThrough] = {
             s.name: RateLimiter(s, period=period) if s.is_vector else PassThrough() for s in interface.act
         }
@@ -125,6 +134,7 @@ class Guards:
         self._begun: set[Fallback] = set()
         self._failed: set[Fallback] = set()
         self._active: tuple[str, ...] = ()
+        self._leaving: dict[str, float] = {}  # Actuator signals that have left real, and when their fallback ends.
         self._last: float | None = None  # Time of the last cycle.
         # By actuator signal, for how many cycles nothing has left: it could not, or a fallback is silent.
         self._unsent: dict[str, int] = {}
@@ -144,6 +154,11 @@ class Guards:
     def driven(self) -> frozenset[str]:
         """The actuator signals that were on real in the last cycle."""
         return frozenset(self._active)
+
+    @property
+    def leaving(self) -> frozenset[str]:
+        """The actuator signals that have left real, and that their fallbacks still command."""
+        return frozenset(self._leaving)
 
     def start(self, name: str, value: Any) -> None:
         """Let the commands of an actuator signal depart from ``value``, at rest.
@@ -175,6 +190,7 @@ class Guards:
         blocked: str | None = None,
         pace: str | None = None,
         at: float = nan,
+        released: bool = False,
         others: Mapping[str, ReceivedSignal] = _NONE,
     ) -> Verdict:
         """Judge one cycle. The returned commands count as sent, unless `note_unsent` is called before the next cycle.
@@ -191,12 +207,15 @@ class Guards:
             pace: How the pace of the cycles differs from the period, if it does.
             at: Time of the commands in seconds, on the clock by which their rates are limited: a command counts for
                 the time since the last one, at most for a period. NaN: every command counts for a period.
+            released: Whether the machine does without commands, or another one commands it: signals that have left
+                real are not commanded any more.
             others: Sensor signals that are not on real; fallbacks may use them.
         """
         if self._unconfirmed:
             self.note_unsent(())
         self._unconfirmed = True
-        self._activate(tuple(active if active is not None else self._active if error else actuation))
+        self._activate(tuple(active if active is not None else self._active if error else actuation), now)
+        self._end_leaving(now, released)
         causes = self._general_faults(now, error, missed, blocked, pace)
         causes += self._depart_anew(now, received, others)
         wanted = []
@@ -219,10 +238,13 @@ class Guards:
             if not self._active:
                 self._accept_steady()
         if self._latched:
-            return Verdict(self._fall_back(now, {**others, **received}, at), False, self._faults)
+            return Verdict(self.fall_back(now, {**others, **received}, at=at), False, self._faults)
+        commands = {name: limiter.send(values, at) for name, limiter, values in wanted}
+        if self._leaving:
+            commands |= self._fallback_commands(self._leaving, now, {**others, **received}, at)
         self._last = now
-        self._silent = frozenset()
-        return Verdict({name: limiter.send(values, at) for name, limiter, values in wanted}, True, self._faults)
+        self._silent = frozenset(self._leaving) - frozenset(commands)
+        return Verdict(commands, True, self._faults)
 
     def note_unsent(self, names: Collection[str]) -> None:
         """Record which commands of the last verdict did not leave: they do not count as sent.
@@ -236,8 +258,9 @@ class Guards:
         for name in names:
             self.limiters[name].take_back()
         self._held_back = frozenset(names)
-        left = frozenset(self._active) - self._held_back - self._silent
-        self._unsent = {name: self._unsent.get(name, 0) + 1 for name in self._active if name not in left}
+        commanded = frozenset((*self._active, *self._leaving))
+        left = commanded - self._held_back - self._silent
+        self._unsent = {name: self._unsent.get(name, 0) + 1 for name in commanded - left}
         self._departing -= left
 
     def latch(self, reason: str, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> Verdict:
@@ -250,7 +273,7 @@ class Guards:
         self.log.append(told)
         if not self._latched:
             self._latch((told,))
-        return Verdict(self._fall_back(now, received, at), False, (*self._faults, told))
+        return Verdict(self.fall_back(now, received, at=at), False, (*self._faults, told))
 
     def reset(
         self, now: float, received: Mapping[str, ReceivedSignal], against: Collection[str] = ()
@@ -281,13 +304,24 @@ class Guards:
             self._latched = ()
         return reasons
 
-    def _activate(self, names: tuple[str, ...]) -> None:
-        """Record which signals are on real; reset the limiters of signals that have left it."""
+    def _activate(self, names: tuple[str, ...], now: float) -> None:
+        """Record which signals are on real; let the fallbacks command those that have left it."""
         if names != self._active:
             for name in set(self._active) - set(names):
+                self._leaving[name] = now + self.leave_time
+                if not self._latched:
+                    self._begun -= set(self._fallbacks[name])
+            for name in names:
+                self._leaving.pop(name, None)
+            self._active = names
+
+    def _end_leaving(self, now: float, released: bool) -> None:
+        """Reset the limiters of signals that have left real, and need no command any more."""
+        for name, end in tuple(self._leaving.items()):
+            if released or now >= end or not self.limiters[name].has_start:
                 self.limiters[name].release()
                 self._departing -= {name}
-            self._active = names
+                del self._leaving[name]
 
     def _general_faults(
         self, now: float, error: BaseException | None, missed: int, blocked: str | None, pace: str | None
@@ -309,18 +343,19 @@ class Guards:
     ) -> list[Fault]:
         """Restart the limiters from the measured values where the machine may have moved; return the faults."""
         pause = 0.0 if self._last is None else now - self._last
+        commanded = (*self._active, *self._leaving)
         if pause > self._longest_pause:
             self._departing |= {
                 name
-                for name in self._active
+                for name in commanded
                 if name in self.measured_by and pause > self.monitors[self.measured_by[name]].max_age
             }
         if not self._unsent and not self._departing:
             return []
         faults = []
-        for name in self._active:
+        for name in commanded:
             count = self._unsent.get(name, 0)
-            if count > self._most_unsent and name in self._held_back:
+            if count > self._most_unsent and name in self._held_back and name in self._active:
                 reason = f"the last {count} actuator commands {name} could not be sent"
                 faults.append(Fault(now, name, "not sent", reason))
             limiter, sensor = self.limiters[name], self.measured_by.get(name)
@@ -350,10 +385,22 @@ class Guards:
         self._failed.clear()
         _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
 
-    def _fall_back(self, now: float, received: Mapping[str, ReceivedSignal], at: float) -> dict[str, Any]:
-        """Return the fallbacks' commands, within the limits."""
-        dt = self.period if self._last is None else now - self._last
+    def fall_back(self, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> dict[str, Any]:
+        """Return the commands of the fallbacks, within the limits, for all signals that are on real or leave it.
+
+        The arguments are those of `check`, which does the same while a fault is latched.
+        """
+        names = (*self._active, *self._leaving)
+        commands = self._fallback_commands(names, now, received, at)
         self._last = now
+        self._silent = frozenset(names) - frozenset(commands)
+        return commands
+
+    def _fallback_commands(
+        self, names: Iterable[str], now: float, received: Mapping[str, ReceivedSignal], at: float
+    ) -> dict[str, Any]:
+        """Return the commands of the fallbacks of some signals, within the limits."""
+        dt = self.period if self._last is None else now - self._last
         sensed = {
             name: signal.value for name, signal in received.items() if self.monitors[name].check(now, signal) is None
         }
@@ -364,12 +411,10 @@ class Guards:
         }
         actuation = {
             name: self._fallback_command(name, now, sensed, known, dt, at)
-            for name in self._active
+            for name in names
             if self.limiters[name].has_start
         }
-        sent = {name: command for name, command in actuation.items() if command is not NO_COMMAND}
-        self._silent = frozenset(self._active) - frozenset(sent)
-        return sent
+        return {name: command for name, command in actuation.items() if command is not NO_COMMAND}
 
     def _fallback_command(
         self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float, at: float

@@ -81,6 +81,11 @@ class Runtime(Stepped):
             With the sensor signal alone, the largest difference is what the rate of the actuator signal allows in a
             period. None, as for a signal that is left out: its commands may jump.
         blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None.
+        hint: What an operator does where a switch or a reset is refused because a command would not continue what is
+            measured. It is a part of the reason.
+        released_by: Returns whether the machine confirms that it does without commands, because its brakes have engaged
+            for example: the fallbacks end, which otherwise go on for the guards' ``leave_time`` after a signal has left
+            real, and after the end of a loop.
         statistics: Statistics of the loop's timing, made for the same period.
         watchers: Called with every `Cycle`. One that raises is removed, and the loop goes on.
 
@@ -105,6 +110,8 @@ class Runtime(Stepped):
         patience: float = 3.0,
         continuity: Continuity | None = None,
         blocked_by: Callable[[], str | None] = lambda: None,
+        hint: str = "",
+        released_by: Callable[[], bool] = lambda: False,
         statistics: LoopStatistics | None = None,
         watchers: tuple[Callable[[Cycle], None], ...] = (),
     ) -> None:
@@ -127,11 +134,14 @@ class Runtime(Stepped):
         _check_fit(self.guards, self.statistics, target.interface, period)
         self.guards.measured_by = {name: sensor for name, (sensor, _) in self.continuity.items()}
         self.blocked_by = blocked_by
+        self.hint = hint or "let the DPS command what is measured, by a command u for example, or move the machine"
+        self.released_by = released_by
         self.cycles = 0
         self.pace = pace
         self._pace_monitor = None
         if pace is not None:
             self._pace_monitor = PaceMonitor(pace, period, tolerance=self.guards.pace_tolerance)
+        self._left = -1  # The number of cycles after which the loop left.
         self._paced = 0  # The count of the newest message that has begun a cycle.
         self._patience = patience * period
         self._watchers = list(watchers)
@@ -162,7 +172,7 @@ class Runtime(Stepped):
     def run(
         self, *, cycles: int | None = None, seconds: float | None = None, until: Callable[[], bool] = lambda: False
     ) -> None:
-        """Run cycles until a limit is reached or `stop` is called. Ctrl-C sends the fallback commands once.
+        """Run cycles until a limit is reached or `stop` is called; after Ctrl-C or an error, `leave`.
 
         What has arrived since the last run is read before the first cycle, which gets the newest values. If values that
         have waited may be older than their signal's ``max_age``, newer ones are waited for (``max_age`` or 0.1 s).
@@ -197,7 +207,7 @@ class Runtime(Stepped):
                         return
                     deadline = self._next(due, lateness)
         except BaseException:
-            self.send_fallback("the loop ended")
+            self.leave("the loop ended")
             raise
 
     def watch(self, watcher: Callable[[Cycle], None]) -> None:
@@ -284,6 +294,7 @@ class Runtime(Stepped):
             blocked=self.blocked_reason() if active else None,
             pace=pace,
             at=self._time_of_commands(due, stepped),
+            released=bool(self.guards.leaving) and self._released,
             others=self.bridge.sensed,
         )
         unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
@@ -385,14 +396,33 @@ class Runtime(Stepped):
             reason = self.bridge.competing_publisher or "another publisher commands the machine"
             _log.error("ALARM: %s (heard so far: %d)", reason, self.statistics.foreign)
 
-    def send_fallback(self, reason: str) -> None:
-        """Latch the guards and send the fallback commands once, as the last commands of a loop that ends."""
-        now = self.clock.now()
-        verdict = self.guards.latch(reason, now, self.watched, at=nan if self._in_lock_step else now)
-        # The verdict covers the signals that were on real in the last cycle and have been commanded before.
-        last = {name: command for name, command in verdict.actuation.items() if name in self.active}
-        if last:
-            self.bridge.publish(last)
+    def leave(self, reason: str) -> None:
+        """Latch the guards, and let the fallbacks command without the DPS, as the last commands of a loop that ends.
+
+        They command for the guards' ``leave_time``, until the machine is released, or until they send nothing more. A
+        machine in lock-step gets one command: it stands still afterwards. Without a cycle since the last call, nothing
+        is done.
+        """
+        if self._left == self.cycles:
+            return
+        self._left = self.cycles
+        deadline = now = self.clock.now()
+        end = now if self._in_lock_step else now + self.guards.leave_time
+        verdict = self.guards.latch(reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now)
+        commands = verdict.actuation
+        while commands:
+            self.guards.note_unsent(self.bridge.publish(commands))
+            deadline += self.period
+            if deadline > end or self._released:
+                return
+            now = self.clock.wait_until(deadline)
+            self.bridge.poll()
+            commands = self.guards.fall_back(now, self.bridge.sensed, at=now)
+
+    @property
+    def _released(self) -> bool:
+        """Whether the machine needs no fallback: it does without commands, or another publisher commands it."""
+        return self.released_by() or self.bridge.competing_publisher is not None
 
     @property
     def pace_problem(self) -> str | None:

@@ -152,21 +152,26 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
             continue  # A DPS that has not started has no command.
         gap = np.abs(command - measured)
         if not (gap <= limit).all():
-            found.append(_discontinuity(name, sensor, command, measured, limit))
+            found.append(_discontinuity(name, sensor, command, measured, limit, runtime.hint))
     return found
 
 
 def _discontinuity(
-    name: str, sensor: str, command: NDArray[np.float64], measured: NDArray[np.float64], limit: NDArray[np.float64]
+    name: str,
+    sensor: str,
+    command: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    limit: NDArray[np.float64],
+    hint: str,
 ) -> str:
-    """Return the reason why a command does not continue a measurement, with the entry that exceeds its limit most."""
+    """Return why a command does not continue a measurement, at the entry that exceeds its limit most; and a remedy."""
     gap = np.abs(command - measured)
     k = int(np.argmax(np.where(gap <= limit, -np.inf, gap - limit)))
     entry = f"[{k}]" if len(gap) > 1 else ""
     reason = f"the actuator command {name}{entry} is {gap[k]:.3g} away from {sensor}{entry}; {limit[k]:g} is allowed"
     if (np.abs(command + measured) <= limit).all():
-        reason += ", and it would fit with the opposite sign: the machine may measure with another sign than it obeys"
-    return reason
+        hint = "it would fit with the opposite sign, so the machine may measure with another sign than it obeys"
+    return f"{reason}: {hint}"
 
 
 def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:

@@ -125,7 +125,10 @@ class MachineLoop:
 
         Raises:
             RuntimeError: The simulation failed.
+            ValueError: The config does not allow lock-step.
         """
+        if lock_step:
+            self.machine.config.check_lock_step()
         end = self.machine.cycle + cycles
         self.machine.reject_late(not lock_step)
         self._messages = self.machine.messages()

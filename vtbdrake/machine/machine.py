@@ -74,6 +74,19 @@ class MachineConfig:
             if not 0.0 <= deviation < inf:
                 raise ValueError(f"the noise of {name} must be a standard deviation from 0 on, not {deviation!r}")
 
+    def check_lock_step(self) -> None:
+        """Check that a machine with this configuration can run in lock-step.
+
+        Raises:
+            ValueError: It would hold back a state, and wait for the command that answers it.
+        """
+        if self.sense_latency:
+            raise ValueError(
+                f"in lock-step a machine has no sense_latency, unlike {self.sense_latency} s: it would hold back the "
+                "state that the command it waits for answers; give the latency to the sensors of the scenario "
+                "(ErrorModel(latency=...)), or let the clock begin the cycles"
+            )
+
     def _check(self, valid: bool, name: str, expected: str) -> None:
         if not valid:
             raise ValueError(f"{name} of a machine {expected}, not {getattr(self, name)!r}")

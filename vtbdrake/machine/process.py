@@ -53,6 +53,9 @@ class MachineProcess(ChildService):
         cycles: The number of cycles after which it ends; by default it goes on.
         priority: The priority of SCHED_FIFO, where the system grants it; 0 for ordinary scheduling.
         options: Fields of the config, which replace those of ``config``.
+
+    Raises:
+        ValueError: A value of the config is out of its range, or it does not allow lock-step.
     """
 
     name, error = "the machine", MachineError
@@ -71,6 +74,8 @@ class MachineProcess(ChildService):
         self.scenario = scenario
         self.url = url
         self.config = replace(config or MachineConfig(), **options)
+        if lock_step:
+            self.config.check_lock_step()
         self._run = {"lock_step": lock_step, "cycles": inf if cycles is None else cycles, "priority": priority}
         self._paused = False
 

@@ -13,8 +13,10 @@ import pytest
 from drake import lcmt_force_torque, lcmt_iiwa_command, lcmt_iiwa_status, lcmt_scope
 
 from tests.control.scripted import ScriptedBridge
+from tests.diagrams.manipulator.test_safety import gravity
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
@@ -65,6 +67,35 @@ def test_alone_from_a_snapshot_it_commands_what_the_whole_testbed_does(law: str,
     whole = commands(scenario, snapshot, alone=False, cycles=60)
     assert np.array_equal(alone, whole)
     assert np.ptp(alone, axis=0).max() > 0.1
+
+
+def test_refused_reset_is_accepted_after_its_remedy() -> None:
+    """The arm was led away while it floated, and rests there."""
+    scenario = ManipulatorScenario(law="joint_impedance")
+    pose, clock = np.array(Arm().home), SimulatedClock()
+    sensed = {"joint_velocity": np.zeros(7), "wrench": np.zeros(6), "joint_torque_measured": gravity(pose)}
+
+    def sensors(t: float) -> dict[str, Any]:
+        return {**sensed, "joint_position": pose.copy()}
+
+    bridge = ScriptedBridge(scenario.interface(), clock, sensors)
+    runtime: Runtime = Deployment.of(scenario, pace="").runtime(DpsAlone(scenario), bridge, clock=clock)
+    runtime.take_over()
+    runtime.run(cycles=20)
+    assert runtime.guards.latched == ()
+    runtime.guards.latch("told", clock.now(), bridge.sensed)
+    for _ in range(60):
+        pose[:4] += 1e-2
+        runtime.run(cycles=1)
+    sensed["joint_torque_measured"] = gravity(pose)
+    runtime.run(cycles=50)
+    with pytest.raises(SwitchRefusedError, match=r"joint_torque.* is .* set u\.motion to 0 \(follow\)"):
+        runtime.reset()
+    runtime.write({"u.motion": 0.0})
+    runtime.run(cycles=200)  # The DPS limits the rate of its own torque.
+    runtime.reset()
+    runtime.run(cycles=50)
+    assert runtime.guards.latched == ()
 
 
 def test_the_motion_is_chosen_over_lcm() -> None:
