@@ -70,7 +70,9 @@ def make_dps(
         drift: The drift of the dead reckoning.
     """
     builder = DiagramBuilder()
-    sense = builder.AddNamedSystem("sense", make_calibration({"imu": 6, "odometry": 1}))
+    sense = builder.AddNamedSystem(
+        "sense", make_calibration({"imu": 6, "odometry": 1}, largest={"imu": 1.0, "odometry": 0.5})
+    )
     env = builder.AddNamedSystem("env", _make_env(world_map, localizer, signals, latency=latency, drift=drift))
     impl = builder.AddNamedSystem("impl", _make_impl())
     for signal in ("imu", "odometry"):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from math import inf
 from typing import Any
 
 import numpy as np
@@ -202,7 +201,7 @@ class PresentPose(LeafSystem):
         index = int(estimate)
         patience = self.DeclareNumericParameter(BasicVector([_PATIENCE]))
         self.variables = (
-            parameter("patience", int(patience), unit="s", bounds=(0.0, inf)),
+            parameter("patience", int(patience), unit="s", bounds=(0.0, 3600.0)),
             discrete_state("time", index, unit="s"),
             discrete_state("position", index, start=1, shape=(2,), unit="m"),
             discrete_state("heading", index, start=3, unit="rad"),

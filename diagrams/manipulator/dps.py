@@ -10,7 +10,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
 
 from vtbdrake.components.casadi_system import CasadiSystem
-from vtbdrake.state import discrete_state
+from vtbdrake.state import discrete_state, parameter
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
 from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
@@ -22,6 +22,11 @@ States = dict[str, tuple[object, str]]
 _STATE = "state"
 
 SENSOR_SIGNALS = {"joint_position": JOINTS, "joint_velocity": JOINTS, "joint_torque_measured": JOINTS, "wrench": 6}
+
+# What sensors and drives that work can be off by, in rad, rad/s, N m, and N m and N.
+LARGEST_OFFSETS = {"joint_position": 0.1, "joint_velocity": 0.5, "joint_torque_measured": 20.0, "wrench": 100.0}
+LARGEST_TOOL = 15.0
+"""The largest mass of a tool that the DPS can be told, in kg."""
 
 
 def make_dps(
@@ -74,6 +79,8 @@ def _make_sense() -> Diagram:
     raw = builder.AddNamedSystem("raw", Multiplexer(list(SENSOR_SIGNALS.values())))
     size = sum(SENSOR_SIGNALS.values())
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(size)))
+    largest = np.concatenate([np.full(SENSOR_SIGNALS[signal], most) for signal, most in LARGEST_OFFSETS.items()])
+    offset.variables = (parameter("value", 0, shape=(size,), bounds=(-largest, largest)),)
     measured = builder.AddNamedSystem("measured", Adder(2, size))
     for k, signal in enumerate(SENSOR_SIGNALS):
         builder.ExportInput(raw.get_input_port(k), signal)
@@ -100,7 +107,7 @@ def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
     z = casadi.SX.sym("measured", sum(SENSOR_SIGNALS.values()))
     q, v, tau, wrench_S = casadi.vertsplit(z, [0, *np.cumsum(list(SENSOR_SIGNALS.values())).tolist()])
     gains: Declared = {
-        "tool_mass": (model.arm.tool_mass, "kg", (0.0, float("inf"))),
+        "tool_mass": (model.arm.tool_mass, "kg", (0.0, LARGEST_TOOL)),
         "tool_center": (model.arm.tool_inertia().get_com(), "m", (-1.0, 1.0)),
         "wrench_time_constant": (0.002, "s", (0.0, 1.0)),
         "observer_rate": (100.0, "1/s", (0.0, 1.0 / period)),
@@ -159,7 +166,8 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
     gains: Declared = {
         **chosen.parameters,
         **parameters(model.arm),
-        "torque_rate": (model.arm.torque_rates, "N m/s", (0.0, float("inf"))),
+        # At most from one end of the range to the other within a period.
+        "torque_rate": (model.arm.torque_rates, "N m/s", (0.0, 2.0 * np.array(model.arm.torques) / period)),
     }
     p = _symbols(gains)
     state: States = {
@@ -199,6 +207,8 @@ def _make_act(arm: Arm, size: int) -> Diagram:
     limits = np.array(arm.torques)
     torque = builder.AddNamedSystem("torque", Demultiplexer([JOINTS, size - JOINTS]))
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(JOINTS)))
+    largest = LARGEST_OFFSETS["joint_torque_measured"]
+    offset.variables = (parameter("value", 0, shape=(JOINTS,), unit="N m", bounds=(-largest, largest)),)
     calibrated = builder.AddNamedSystem("calibrated", Adder(2, JOINTS))
     limited = builder.AddNamedSystem("limited", Saturation(-limits, limits))
     builder.ExportInput(torque.get_input_port(), "controlled")

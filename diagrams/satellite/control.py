@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
-
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
@@ -90,22 +88,24 @@ class ArmController(LeafSystem):
         self.DeclareStateOutputPort("reaction", torque)
         self._command, self._memory, self._momentum, self._reaction = map(int, (command, memory, momentum, torque))
         declared = {
-            "position_gain": (1.0, "1/s"),
-            "orientation_gain": (1.0, "1/s"),
-            "speed": (0.12, "m/s"),
-            "turn_rate": (0.25, "rad/s"),
-            "acceleration": (ACCELERATION if wheels else UNLIMITED, "m/s^2"),
-            "largest_reaction": (LARGEST_REACTION if wheels else UNLIMITED, "N m"),
-            "joint_rate": (0.4, "rad/s"),
-            "posture_gain": (0.3, "1/s"),
-            "damping": (0.05, "1"),
-            "lead": (0.2, "rad"),
-            "brake_time": (1.5, "s"),
-            "finger_rate": (0.03, "m/s"),
-            "back_off": (4.0, "s"),
-            "back_off_speed": (0.08, "m/s"),
+            # Value, unit, and the largest value. What is written while the arm moves comes to it: a gain times the
+            # period stays far below 1, speeds and rates lie within what its drives follow.
+            "position_gain": (1.0, "1/s", 10.0),
+            "orientation_gain": (1.0, "1/s", 10.0),
+            "speed": (0.12, "m/s", 0.5),
+            "turn_rate": (0.25, "rad/s", 1.0),
+            "acceleration": (ACCELERATION if wheels else UNLIMITED, "m/s^2", UNLIMITED),
+            "largest_reaction": (LARGEST_REACTION if wheels else UNLIMITED, "N m", UNLIMITED),
+            "joint_rate": (0.4, "rad/s", 1.0),
+            "posture_gain": (0.3, "1/s", 10.0),
+            "damping": (0.05, "1", 10.0),
+            "lead": (0.2, "rad", 1.0),
+            "brake_time": (1.5, "s", 60.0),
+            "finger_rate": (0.03, "m/s", 0.1),
+            "back_off": (4.0, "s", 60.0),
+            "back_off_speed": (0.08, "m/s", 0.5),
         }
-        self.DeclareNumericParameter(BasicVector([value for value, _ in declared.values()]))
+        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
         self.variables = (
             discrete_state("joint_position", self._command, shape=(len(JOINT_NAMES),), unit="rad, m"),
             discrete_state("joint_rate_command", self._memory, shape=(ARM_JOINTS,), unit="rad/s"),
@@ -117,8 +117,8 @@ class ArmController(LeafSystem):
             discrete_state("holding", self._momentum, start=3, bounds=(0.0, 1.0)),
             discrete_state("reaction", self._reaction, shape=(3,), unit="N m"),
             *(
-                parameter(name, 0, start=k, unit=unit, bounds=(0.0, inf))
-                for k, (name, (_, unit)) in enumerate(declared.items())
+                parameter(name, 0, start=k, unit=unit, bounds=(0.0, most))
+                for k, (name, (_, unit, most)) in enumerate(declared.items())
             ),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -242,7 +242,7 @@ class AttitudeController(LeafSystem):
         self.DeclareNumericParameter(BasicVector([0.5]))
         self.variables = (
             discrete_state("wheel_torque", int(torque), shape=(3,), unit="N m"),
-            parameter("bandwidth", 0, unit="rad/s", bounds=(0.0, inf)),
+            parameter("bandwidth", 0, unit="rad/s", bounds=(0.0, 5.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

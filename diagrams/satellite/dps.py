@@ -70,7 +70,10 @@ def make_dps(sensing: TargetSensors, *, period: float = PERIOD, wheels: bool = F
     Every part is sampled with ``period`` (s) and shows its own state: no input feeds through.
     """
     builder = DiagramBuilder()
-    sense = builder.AddNamedSystem("sense", make_calibration({"joint_position": len(JOINT_NAMES), "imu": 6}))
+    sense = builder.AddNamedSystem(
+        "sense",
+        make_calibration({"joint_position": len(JOINT_NAMES), "imu": 6}, largest={"joint_position": 0.1, "imu": 1.0}),
+    )
     env = builder.AddNamedSystem("env", _make_env(sensing, period=period))
     impl = builder.AddNamedSystem("impl", _make_impl(period=period, wheels=wheels))
     act = builder.AddNamedSystem("act", _make_act(wheels=wheels))

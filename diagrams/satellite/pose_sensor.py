@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,7 +114,7 @@ class PoseReader(LeafSystem):
             discrete_state("last_time", self._arrived, unit="s"),
             discrete_state("waiting", self._arrived, start=1, bounds=(0.0, 1.0)),
             parameter("latency", 0, unit="s", bounds=(0.0, 1.0)),
-            parameter("deviation", 0, start=1, unit="m", bounds=(0.0, inf)),
+            parameter("deviation", 0, start=1, unit="m", bounds=(0.0, 10.0)),
         )
         self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,24 +186,25 @@ class Supervisor(LeafSystem):
         smooth = self.DeclareDiscreteState(ARM_JOINTS)
         self._state, self._memory, self._smooth = int(guidance), int(memory), int(smooth)
         declared = {
-            "standoff": (0.25, "m"),
-            "closing_speed": (0.06, "m/s"),
-            "acceleration": (acceleration, "m/s^2"),
-            "position_tolerance": (0.03, "m"),
-            "orientation_tolerance": (0.12, "rad"),
-            "grip_tolerance": (0.012, "m"),
-            "grip_time": (0.2, "s"),
-            "hold_after": (1.0, "s"),
-            "lost_after": (3.0, "s"),
-            "reach": (1.46, "m"),
-            "largest_angle": (1.05, "rad"),
-            "largest_speed": (0.15, "m/s"),
-            "time_limit": (60.0, "s"),
-            "attempts": (3.0, "1"),
-            "still_rate": (2e-3, "rad/s"),
-            "still_time": (1.0, "s"),
+            # Value, unit, and the largest value.
+            "standoff": (0.25, "m", 2.0),
+            "closing_speed": (0.06, "m/s", 0.5),
+            "acceleration": (acceleration, "m/s^2", 1e6),  # that is, unlimited
+            "position_tolerance": (0.03, "m", 1.0),
+            "orientation_tolerance": (0.12, "rad", np.pi),
+            "grip_tolerance": (0.012, "m", 0.1),
+            "grip_time": (0.2, "s", 60.0),
+            "hold_after": (1.0, "s", 60.0),
+            "lost_after": (3.0, "s", 600.0),
+            "reach": (1.46, "m", 10.0),
+            "largest_angle": (1.05, "rad", np.pi),
+            "largest_speed": (0.15, "m/s", 1.0),
+            "time_limit": (60.0, "s", 3600.0),
+            "attempts": (3.0, "1", 100.0),
+            "still_rate": (2e-3, "rad/s", 1.0),
+            "still_time": (1.0, "s", 60.0),
         }
-        self.DeclareNumericParameter(BasicVector([value for value, _ in declared.values()]))
+        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
         self._names = tuple(declared)
         self.variables = (
             discrete_state("mode", self._state, bounds=(0.0, ABORT)),
@@ -221,8 +221,8 @@ class Supervisor(LeafSystem):
             discrete_state("attempts_made", self._memory, start=4),
             discrete_state("last_fingers", self._memory, start=5, shape=(2,), unit="m"),
             *(
-                parameter(name, 0, start=k, unit=unit, bounds=(0.0, inf))
-                for k, (name, (_, unit)) in enumerate(declared.items())
+                parameter(name, 0, start=k, unit=unit, bounds=(0.0, most))
+                for k, (name, (_, unit, most)) in enumerate(declared.items())
             ),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)

@@ -103,9 +103,9 @@ class Calibration(LeafSystem):
             discrete_state("imu", 0, shape=(6,), unit="rad/s, m/s^2"),
             discrete_state("joint_encoders", 0, start=6, shape=(joints,), unit="rad"),
             discrete_state("foot_contact", 0, start=6 + joints, shape=(feet,), bounds=(0.0, 1.0)),
-            parameter("gyro_bias", 0, shape=(3,), unit="rad/s"),
-            parameter("accelerometer_bias", 0, start=3, shape=(3,), unit="m/s^2"),
-            parameter("encoder_offset", 0, start=6, shape=(joints,), unit="rad"),
+            parameter("gyro_bias", 0, shape=(3,), unit="rad/s", bounds=(-1.0, 1.0)),
+            parameter("accelerometer_bias", 0, start=3, shape=(3,), unit="m/s^2", bounds=(-1.0, 1.0)),
+            parameter("encoder_offset", 0, start=6, shape=(joints,), unit="rad", bounds=(-0.1, 0.1)),
             parameter("imu_time_constant", 0, start=6 + joints + feet, unit="s", bounds=(0.0, 10.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -146,7 +146,7 @@ class CommandLimiter(LeafSystem):
             discrete_state("joint_position", 0, shape=(size,), unit="rad"),
             parameter("lower", 0, shape=(size,), unit="rad", bounds=(-np.pi, np.pi)),
             parameter("upper", 0, start=size, shape=(size,), unit="rad", bounds=(-np.pi, np.pi)),
-            parameter("rate", 0, start=2 * size, unit="rad/s", bounds=(0.0, np.inf)),
+            parameter("rate", 0, start=2 * size, unit="rad/s", bounds=(0.0, morphology.joint_speed)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

@@ -69,7 +69,7 @@ class Arrival(LeafSystem):
         self.variables = (
             discrete_state("time", self._time, unit="s"),
             discrete_state("number", self._number, bounds=(0.0, inf)),
-            parameter("age", 0, unit="s", bounds=(0.0, inf)),
+            parameter("age", 0, unit="s", bounds=(0.0, 60.0)),
         )
         self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)

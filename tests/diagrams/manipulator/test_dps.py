@@ -19,7 +19,7 @@ from vtbdrake_diagrams.manipulator.world import add_arm
 T = 0.001
 ARM = Arm()
 HOME = np.array(ARM.home)
-REACH = 1e9  # N m/s: no limit of the torque's rate
+REACH = 2.0 * np.array(ARM.torques) / T  # N m/s: from one end of the range to the other within a period
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ class Bench:
         self.simulator = Simulator(self.dps)
         self.context: Context = self.simulator.get_mutable_context()
         self.variables: Variables = collect(self.dps)
-        self.variables.write(self.context, {"impl.torque_rate": np.full(7, REACH), **parameters})
+        self.variables.write(self.context, {"impl.torque_rate": REACH, **parameters})
         self.period = 0
         self.feed(joint_position=HOME, motion=[1.0])
         for name, size in SENSOR_SIGNALS.items():

@@ -204,13 +204,13 @@ class DeadReckoning(LeafSystem):
             discrete_state("mean_force", counts, start=4, shape=(3,), unit="m/s^2"),
             discrete_state("shaking", counts, start=7, unit="m^2/s^4", bounds=bounds),
             discrete_state("least_shaking", counts, start=8, unit="m^2/s^4", bounds=bounds),
-            parameter("sway", settings, unit="m/s^2", bounds=bounds),
-            parameter("still_speed", settings, start=1, unit="m/s", bounds=bounds),
-            parameter("still_rate", settings, start=2, unit="rad/s", bounds=bounds),
-            parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=bounds),
-            parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=bounds),
-            parameter("axle", settings, start=5, unit="m"),
-            parameter("still_force", settings, start=6, unit="m/s^2", bounds=bounds),
+            parameter("sway", settings, unit="m/s^2", bounds=(0.0, 10.0)),
+            parameter("still_speed", settings, start=1, unit="m/s", bounds=(0.0, 1.0)),
+            parameter("still_rate", settings, start=2, unit="rad/s", bounds=(0.0, 1.0)),
+            parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=(0.0, 1.0)),
+            parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=(0.0, 1.0)),
+            parameter("axle", settings, start=5, unit="m", bounds=(-10.0, 10.0)),
+            parameter("still_force", settings, start=6, unit="m/s^2", bounds=(0.0, 10.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

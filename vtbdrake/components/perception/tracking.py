@@ -295,14 +295,14 @@ class TargetTracker(LeafSystem):
         model = motion or MotionModel()
         model.check()
         declared = {
-            "rate_noise": (model.rate_noise, "rad/s^1.5", (0.0, inf)),
-            "velocity_noise": (model.velocity_noise, "m/s^1.5", (0.0, inf)),
-            "first_rate": (model.first_rate, "rad/s", (0.0, inf)),
-            "first_velocity": (model.first_velocity, "m/s", (0.0, inf)),
-            "gate": (22.5, "", (0.0, inf)),
-            "patience": (5.0, "", (1.0, inf)),
-            "fewest": (4.0, "", (1.0, inf)),
-            "lost_after": (3.0, "s", (0.0, inf)),
+            "rate_noise": (model.rate_noise, "rad/s^1.5", (0.0, 1.0)),
+            "velocity_noise": (model.velocity_noise, "m/s^1.5", (0.0, 1.0)),
+            "first_rate": (model.first_rate, "rad/s", (0.0, 10.0)),
+            "first_velocity": (model.first_velocity, "m/s", (0.0, 10.0)),
+            "gate": (22.5, "", (0.0, 1e3)),
+            "patience": (5.0, "", (1.0, 1e6)),
+            "fewest": (4.0, "", (1.0, 1e6)),
+            "lost_after": (3.0, "s", (0.0, 3600.0)),
         }
         self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
         self._inertia = int(self.DeclareNumericParameter(BasicVector(model.inertia)))
@@ -330,7 +330,7 @@ class TargetTracker(LeafSystem):
                 parameter(name, 0, start=k, unit=unit, bounds=bounds)
                 for k, (name, (_, unit, bounds)) in enumerate(declared.items())
             ),
-            parameter("inertia", self._inertia, shape=(6,), unit="kg m^2"),
+            parameter("inertia", self._inertia, shape=(6,), unit="kg m^2", bounds=(-1e6, 1e6)),
         )
         self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
         self.DeclareStateOutputPort("status", DiscreteStateIndex(self._status))

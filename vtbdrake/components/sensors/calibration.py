@@ -8,16 +8,21 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer
 
+from vtbdrake.state import parameter
 
-def make_calibration(signals: Mapping[str, int]) -> Diagram:
+
+def make_calibration(signals: Mapping[str, int], *, largest: Mapping[str, float] | None = None) -> Diagram:
     """Return a system that adds the parameter ``offset`` to raw values; each signal is an input and an output port.
 
     Args:
         signals: The sizes of the vector signals, by name.
+        largest: The largest offset of a signal, in its unit; without one, any.
     """
     builder, sizes = DiagramBuilder(), list(signals.values())
     raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
+    most = np.concatenate([np.full(size, (largest or {}).get(name, np.inf)) for name, size in signals.items()])
+    offset.variables = (parameter("value", 0, shape=most.shape, bounds=(-most, most)),)
     measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
     split = builder.AddNamedSystem("split", Demultiplexer(sizes))
     builder.Connect(raw.get_output_port(), measured.get_input_port(0))
