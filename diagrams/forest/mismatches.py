@@ -2,7 +2,8 @@
 
 ``python -m vtbdrake_diagrams.forest.mismatches [--pairs N] [--seed S]`` draws random pairs of each kind, matches them
 (`ConstellationMap.locate`), and prints how many were sure: each of them is wrong. It also prints the largest logarithm
-of the likelihood ratio beside the least one that would have sufficed. The kinds:
+of the likelihood ratio, and the one that came nearest to what is required. Only poses without a rival of more than half
+of it count there: in the rows of plantations many poses have large ratios, and refuse each other. The kinds:
 
 * ``mirrored``: the map of the same stand in a mirror, so that density, diameters and the kind of pattern are the same;
   whole or only a square of 20 to 60 m around the place.
@@ -152,17 +153,18 @@ def pairs(count: int, *, seed: int = SEED, recordings: bool = True) -> Iterator[
 
 def row(kind: str, found: list[Pair]) -> tuple[str, ...]:
     """Return the row of the table of one kind of pairs."""
-    nearest = max(found, key=lambda pair: pair.fix.log_likelihood - pair.required)
+    alone = [pair for pair in found if 2.0 * pair.fix.margin >= pair.fix.log_likelihood]
+    nearest = max(alone, key=lambda pair: pair.fix.log_likelihood - pair.required, default=None)
     return (
         kind,
         str(len(found)),
         str(sum(pair.fix.is_sure for pair in found)),
         f"{max(pair.fix.log_likelihood for pair in found):.1f}",
-        f"{nearest.fix.log_likelihood:.1f} of {nearest.required:.1f}",
+        f"{nearest.fix.log_likelihood:.1f} of {nearest.required:.1f}" if nearest else "",
     )
 
 
-HEADER = ("kind", "pairs", "wrong and sure", "largest ln L", "nearest to what is required")
+HEADER = ("kind", "pairs", "wrong and sure", "largest ln L", "nearest to what is required, without a rival")
 
 
 def main() -> None:

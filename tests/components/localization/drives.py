@@ -14,6 +14,7 @@ from vtbdrake_diagrams.forest.stand import MapErrors, Stand
 PERIOD = 0.2
 SIZE = 60.0
 DRIFT = DriftModel()
+ODOMETRY = Odometry(scale=0.005)
 
 
 @dataclass
@@ -44,6 +45,7 @@ def drive(
     reach=13.0,
     elsewhere=None,
     start=None,
+    odometry=ODOMETRY,
 ) -> Drive:
     """Simulate a drive; with ``elsewhere``, the map is that of the stand with that seed."""
     rng = np.random.default_rng([seed, 11])
@@ -52,7 +54,7 @@ def drive(
     wood = Wood.of(stand, false=false, rng=rng)
     first = [*(start or rng.uniform(25.0, 35.0, 2)), rng.uniform(-3.0, 3.0)]
     poses = arc(first, length=step * (scans - 1), curvature=rng.uniform(-0.05, 0.05), step=step)
-    reckoned = dead_reckoned(poses, Odometry(scale=0.005), rng)
+    reckoned = dead_reckoned(poses, odometry, rng)
     detector = Detector(reach=reach, false=false, range_bias=bias)
     seen = [wood.detected(pose, detector, rng)[0] for pose in poses]
     return Drive(poses, reckoned, seen, map_landmarks(mapped.map(errors)))

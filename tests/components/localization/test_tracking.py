@@ -12,6 +12,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.tracking import Tracker, TrackState
 from vtbdrake.state.codecs import codec_of
+from vtbdrake_diagrams.forest.detections import Odometry
 from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE
 
 pytestmark = pytest.mark.one_python
@@ -167,6 +168,27 @@ def test_an_uncertain_position_loses_the_track():
         # Along the way, its deviation is 0.03 m times the root of the metres.
         after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), duration=0.0)
         assert tracker.is_lost(after) == is_lost
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_worse_dead_reckoning_than_assumed_is_noticed(share):
+    """A car with a steering angle for a gyro: five to ten times the drift of the model, and scans with few trees."""
+    squares, drifts = [], []
+    for seed in range(8):
+        one = drive(seed, ACCURATE, odometry=Odometry(scale=0.05, position=0.1, heading=0.01))
+        rng = np.random.default_rng(seed)
+        thin = replace(one, scans=[scan.select(rng.random(len(scan)) < share) for scan in one.scans])
+        tracker, states = tracked(thin)
+        assert not tracker.is_lost(states[-1])
+        squares.append(nees(states[-1].pose, tracker.pose_covariance(states[-1]), one.poses[-1]))
+        drifts.append(np.mean([state.drift for state in states[5:]]))
+    assert np.mean(squares) < 6.0
+    assert 3.0 < np.median(drifts) < 50.0
+
+
+def test_dead_reckoning_as_assumed_is_believed():
+    factors = [state.drift for seed in range(8) for state in tracked(drive(seed, ACCURATE))[1]]
+    assert min(factors) == 1.0 and np.mean(factors) < 1.5
 
 
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE, POOR])

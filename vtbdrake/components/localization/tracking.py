@@ -84,8 +84,18 @@ _JUDGED_FROM = 6
 # With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
 _LARGEST_TURN = 0.2
 
+# The factor of the variance of dead reckoning: by which share it follows the ratio of a scan, the largest ratio that
+# counts, the factor of a scan that fails, and the largest value.
+_FOLLOWS, _LARGEST_RATIO, _FAILED, _LARGEST_DRIFT = 0.1, 25.0, 4.0, 1e3
+
+# Units in which errors of x, y (m) and heading (rad) are of the same size, as a landmark at 10 m shows them.
+_SCALES = np.array([1.0, 1.0, 0.1])
+
 # Degrees of freedom of the distortions: displacement, rotation, scale and shear, which are affine.
 _DISTORTIONS = 6
+
+# Beyond this multiple of the gate of distortions, matches are wrong, and the track is lost.
+_TANGLED = 10.0
 
 # The share of first matches that are assumed to be by chance although the pose is right.
 _CHANCE = 0.2
@@ -103,6 +113,7 @@ class TrackState:
         evidence: Cumulative log-likelihood ratio of first matches, see `Tracker`.
         failures: The number of scans in succession that failed, see `Tracker`.
         distortion: The test statistic of a distorted map after the last scan that was fused, see `Tracker`.
+        drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1, see `Tracker`.
     """
 
     mean: Array
@@ -112,6 +123,7 @@ class TrackState:
     evidence: float = 0.0
     failures: int = 0
     distortion: float = 0.0
+    drift: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("mean", "covariance", "indices", "is_recent"):
@@ -209,11 +221,17 @@ class Tracker:
     log-likelihood ratio of right matches is summed up to at most ``credit``; below 0, the track is lost (the cumulative
     sum of Page, Biometrika 41, 1954).
 
+    Drift: dead reckoning may be worse than the model of its noise says, by wheels that slip or a steering angle that is
+    measured badly. The change d of the pose by a scan has the covariance D, the pose's before the scan less that after
+    it. So s = dᵀ D⁻¹ d / 3 is 1 on average; the variance of the next motion is multiplied by a factor that follows s
+    (by a tenth of its difference from 1 per scan), and that grows fourfold with a scan that fails. It is at least 1.
+
     Doubt: a map that is bent, sheared or scaled fits everywhere nearly, and leads astray all the same. It shows in the
     corrections c of the landmarks in the state, their estimates less their positions on the map: on a right map they
     have the covariance K (less what is not known yet), on a distorted one they change with the position. With the
     functions B = [1, x, y], the statistic T = Σ |(Bᵀ K⁻¹ B)^(-1/2) Bᵀ K⁻¹ c|² over both axes is at most chi-square
-    distributed with 6 degrees of freedom on a right map. Beyond ``distortion_gate``, the pose is doubtful. Between its
+    distributed with 6 degrees of freedom on a right map. Beyond ``distortion_gate``, the pose is doubtful, and far
+    beyond, lost: so large are corrections by wrong matches. Between its
     95 % quantile and that, the covariance of the pose is multiplied by the ratio of T to the quantile (the ratio of
     Birge, Physical Review 40, 1932).
 
@@ -356,7 +374,7 @@ class Tracker:
         mean[:3] = compose(mean[:3], move)
         P[:3] = F @ P[:3] + B @ P[_ODOMETRY:_FIXED]
         P[:, :3] = P[:, :3] @ F.T + P[:, _ODOMETRY:_FIXED] @ B.T
-        P[:3, :3] += G @ np.asarray(covariance, dtype=float) @ G.T
+        P[:3, :3] += state.drift * G @ np.asarray(covariance, dtype=float) @ G.T
         P[_RATE, _RATE] += self.rate_walk**2 * duration
         kept = float(np.exp(-np.hypot(*measured[:2]) / self.odometry_length))
         mean[_ODOMETRY] *= kept
@@ -375,7 +393,7 @@ class Tracker:
         if not len(landmarks):
             return state, _NO_MATCHES
         found = self._associate(state, landmarks)
-        failed = replace(state, failures=state.failures + 1)
+        failed = replace(state, failures=state.failures + 1, drift=min(_FAILED * state.drift, _LARGEST_DRIFT))
         if self._is_elsewhere(state, landmarks, found.pairs):
             return failed, Matches(found.pairs)
         if len(found.pairs) < 2:
@@ -388,13 +406,15 @@ class Tracker:
         if self._is_elsewhere(state, landmarks, matches.pairs):
             return failed, Matches(matches.pairs)
         evidence = min(self.credit, state.evidence + self._evidence(new.squares))
-        return replace(fused, evidence=evidence, failures=0), matches
+        drift = _drift(state, fused) if matches.is_fused else state.drift
+        return replace(fused, evidence=evidence, failures=0, drift=drift), matches
 
     def is_lost(self, state: TrackState) -> bool:
         """Return whether the track is lost, so that its pose must not be used any more."""
         limits = np.array([self.largest_deviation, self.largest_deviation, _LARGEST_TURN])
         is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
-        return state.failures >= self.patience or state.evidence < 0.0 or is_vague
+        is_tangled = state.distortion > _TANGLED * chi_square_quantile(self.distortion_gate, _DISTORTIONS)
+        return state.failures >= self.patience or state.evidence < 0.0 or is_vague or is_tangled
 
     def is_doubtful(self, state: TrackState) -> bool:
         """Return whether the last scan failed or the map seems distorted, so that the pose must not be used now."""
@@ -636,6 +656,20 @@ def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, thresho
     np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
     best = np.argmax(agreement.sum(axis=0))
     return squares[:, best], np.maximum(np.linalg.det(spread[:, best]), 1e-12)
+
+
+def _drift(before: TrackState, after: TrackState) -> float:
+    """Return the factor of the variance of dead reckoning after a scan that was fused, see `Tracker`."""
+    change = after.pose - before.pose
+    D = before.pose_covariance - after.pose_covariance
+    # Directions of which the scan says nothing have no variance, and no change.
+    values, directions = np.linalg.eigh(D / np.outer(_SCALES, _SCALES))
+    along = directions.T @ (change / _SCALES)
+    says = values > 1e-3 * values.max()
+    if not says.any() or values.max() <= 0.0:
+        return before.drift
+    ratio = float((along[says] ** 2 / values[says]).mean())
+    return min(max(1.0, before.drift * (1.0 + _FOLLOWS * (min(ratio, _LARGEST_RATIO) - 1.0))), _LARGEST_DRIFT)
 
 
 def _variance_within(gate: float) -> float:
