@@ -9,10 +9,11 @@ because it stays: total momentum is zero, so the base stops with the arm, and q 
 begins, and which the attitude control has to take back. The deviation on the way passes; it is a constraint that it is
 at no time larger than the largest one on the straight path. (It cannot vanish, since the base reacts at once to every
 joint. But the arm can turn it back on the way, as a cat does that lands on its feet, so that q = 0.) Further
-constraints: the positions, rates and torques of the joints, and the points of the arm keep clear of base and panels.
+constraints: the positions, rates and torques of the joints, and the arm keeps clear of base, panels and itself.
 
 The unknowns are the inner knots of a clamped B-spline in joint space; two equal knots at each end let it begin and end
-at rest. Positions and rates are limited at every instant, by the convex hull of the curve; the others at instants.
+at rest. Positions and rates are limited at every instant, by the convex hull of the curve; the others at instants. What
+a solver proposes is then checked between the instants, too: see `MoveSpace.clearance`.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.plant import MultibodyPlant
 
-from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, MomentumModel
+from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, MomentumModel, base_poses
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake.spline import Spline
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, Servicer
+from vtbdrake_diagrams.satellite.clearance import CLEARANCE, ArmClearance
 from vtbdrake_diagrams.satellite.plant import add_servicer
 
 Array = NDArray[np.float64]
@@ -44,10 +46,11 @@ REACH = 1.2
 _STEPS_PER_PIECE = 6
 # Where the bar is in the middle of the arm's workspace, the gripper looking ahead (rad).
 REACHING = (0.0, 0.9, 0.0, 1.9, 0.0, 1.0, 0.0)
-# Points of the arm that keep clear of the base: the origins of these frames.
-_POINTS = ("link_3", "link_4", "link_5", "link_6", "hand", "gripper")
-# m, around box and panels: more than the radius of a link.
-_MARGIN = 0.1
+# Instants per step of the integration at which solvers see the clearance; and by how much they keep more of it, in m,
+# because of what lies between.
+_INSTANTS_PER_STEP, _MARGIN = 2, 0.005
+# The accuracy of the least clearance of a plan, in m.
+_ACCURACY = 5e-4
 FEASIBILITY = 1e-5
 """The share of a limit by which a solver may exceed it. The limits are tightened by twice as much."""
 
@@ -60,6 +63,7 @@ class MoveSpace:
         servicer: The satellite.
         model: Its momentum model, fingers open.
         reaction: The function that computes the motion of the base and the torques.
+        arm: The distances of the arm from base, panels and itself.
     """
 
     def __init__(self, *, duration: float = 20.0, knots: int = 9, servicer: Servicer | None = None) -> None:
@@ -87,17 +91,13 @@ class MoveSpace:
         self.reaction = BaseReaction(self.model, self.spline, steps=self.steps)
         self._instants = np.linspace(0.0, duration, self.steps + 1)
         q = casadi.SX.sym("q", ARM_JOINTS)
-        points = [self.model.point(plant.GetFrameByName(name), q) for name in _POINTS]
         rate, change = casadi.SX.sym("rate", ARM_JOINTS), casadi.SX.sym("change", ARM_JOINTS)
         torque = self.model.torque(q, rate, change)
+        self._velocity = casadi.Function("velocity", [q, rate], [self.model.base_velocity(q, rate)], {"cse": True})
         self._torque = casadi.Function("torque", [q, rate, change], [torque], {"cse": True})
-        self._clearance = casadi.Function("clearance", [q], [casadi.vertcat(*map(self._clear, points))], {"cse": True})
-
-    def _clear(self, p_BoP_B: Expression) -> Expression:
-        """Return a number above 1 outside of the zone of base and panels, which extends along y."""
-        x, _, z = self.servicer.box
-        at_x, at_z = p_BoP_B[0] / (x / 2 + _MARGIN), p_BoP_B[2] / (z / 2 + _MARGIN)
-        return (at_x**6 + at_z**6) ** (1 / 6)
+        self.arm = ArmClearance(self.servicer)
+        # At the ends the arm is where it is.
+        self._watched = np.linspace(0.0, duration, _INSTANTS_PER_STEP * self.steps + 1)[1:-1]
 
     @cached_property
     def functions(self) -> tuple[casadi.Function, casadi.Function]:
@@ -109,39 +109,102 @@ class MoveSpace:
         z, ends = casadi.MX.sym("z", ARM_JOINTS * self.free), casadi.MX.sym("ends", 2 * ARM_JOINTS)
         start, goal = ends[:ARM_JOINTS], ends[ARM_JOINTS:]
         knots = casadi.horzcat(start, start, casadi.reshape(z, ARM_JOINTS, self.free), goal, goal)
-        # Inlined, the parts of a function have derivatives of their own.
-        rotation = self.reaction.function.call([knots], True, False)[0]
+        rotation = self.reaction.function(knots)[0]
         deviation = 4.0 * casadi.sum1(rotation[1:, 1:] ** 2).T
         at, rate, change = (knots @ casadi.DM(self.spline.matrix(self._instants, k).T) for k in range(3))
         # The acceleration is linear between the breaks of the curve: there, and halfway, the torque is known well.
         some = slice(None, None, _STEPS_PER_PIECE // 2)
-        torques = self._torque.map(len(self._instants[some]))(at[:, some], rate[:, some], change[:, some])
-        torques /= casadi.DM(self.servicer.torques)
+        limits, count = self.servicer.torques, len(self._instants[some])
+        torques = self._torque.map(count)(at[:, some], rate[:, some], change[:, some])
+        torques /= casadi.DM(limits)
         rates = knots @ casadi.DM(self.spline.bezier(1).T) / casadi.DM(self.servicer.speeds)
-        clear = self._clearance.map(self.steps + 1)(at)
+        clear = self.arm.soft.map(len(self._watched))(knots @ casadi.DM(self.spline.matrix(self._watched).T))
         cost = deviation[-1]
         g = casadi.vertcat(deviation, casadi.vec(torques), casadi.vec(rates), casadi.vec(clear))
         value = casadi.Function("arm_move", [z, ends], [cost, g], ["z", "ends"], ["cost", "g"])
-        slopes = [cost, casadi.gradient(cost, z), g, casadi.jacobian(g, z)]
-        return value, casadi.Function("arm_move_slopes", [z, ends], slopes)
+        # The deviation follows from the velocities at the ends and in the middles of the steps.
+        halves = np.linspace(0.0, self.spline.duration, 2 * self.steps + 1)
+        at, rate = (knots @ casadi.DM(self.spline.matrix(halves, k).T) for k in range(2))
+        V = casadi.MX.sym("V", 6, len(halves))
+        squares = 4.0 * casadi.sum1(base_poses(self.steps, self.spline.duration)(V)[0][1:, 1:] ** 2).T
+        by_velocity = casadi.Function("by_velocity", [V], [casadi.jacobian(squares, V)])
+        turned = by_velocity(self._velocity.map(len(halves))(at, rate)) @ self._slope(self._velocity, knots, halves, 2)
+        slope = casadi.vertcat(
+            turned,
+            self._slope(self._torque, knots, self._instants[some], 3) / casadi.DM(np.tile(limits, count)),
+            casadi.jacobian(casadi.vec(rates), z),
+            self._slope(self.arm.soft, knots, self._watched, 1),
+        )
+        return value, casadi.Function("arm_move_slopes", [z, ends], [cost, turned[-1, :].T, g, slope])
 
-    def bounds(self, largest: float) -> tuple[Array, Array]:
+    def _slope(self, function: casadi.Function, knots: Expression, times: Array, count: int) -> Expression:
+        """Return the Jacobian of a function of a plan by its free knots, shape (m p, 7 k).
+
+        Args:
+            function: The function of positions, rates and accelerations, or of the first ``count`` of them, shape (m,).
+            knots: All knots, shape (7, n).
+            times: Shape (p,), in s.
+            count: 1, 2 or 3.
+        """
+        symbols = [casadi.SX.sym(f"q_{k}", ARM_JOINTS) for k in range(count)]
+        value = function(*symbols)
+        own = [casadi.densify(casadi.jacobian(value, symbol)).T for symbol in symbols]
+        matrices = [self.spline.matrix(times, k) for k in range(count)]
+        parts = (
+            casadi.Function("own_slope", symbols, own, {"cse": True})
+            .map(len(times))
+            .call([knots @ casadi.DM(matrix.T) for matrix in matrices])
+        )
+        rows = value.numel()
+
+        def by_knot(j: int) -> Expression:
+            weights = (casadi.DM(np.repeat(matrix[:, [j]], rows, axis=0)) for matrix in matrices)
+            return sum(part.T * casadi.repmat(w, 1, ARM_JOINTS) for part, w in zip(parts, weights, strict=True))
+
+        return casadi.horzcat(*map(by_knot, range(RESTING, RESTING + self.free)))
+
+    def bounds(self, largest: float, clear: Array) -> tuple[Array, Array]:
         """Return the lower and upper bounds of g.
 
         Args:
             largest: Deviation of the base in rad.
+            clear: The least clearance of each group of `ArmClearance` in m.
         """
         torques = len(self._instants[:: _STEPS_PER_PIECE // 2])
         counts = self.steps, ARM_JOINTS * torques, ARM_JOINTS * len(self.spline.bezier(1))
-        clear = len(_POINTS) * (self.steps + 1)
-        least = np.repeat([-inf, -1.0, -1.0, 1.0], [*counts, clear])
-        most = np.repeat([4.0 * np.sin(largest / 2.0) ** 2, 1.0, 1.0, inf], [*counts, clear])
-        return least + 2.0 * FEASIBILITY, most - 2.0 * FEASIBILITY * np.minimum(most, 1.0)
+        least = np.repeat([-inf, -1.0, -1.0], counts)
+        most = np.repeat([4.0 * np.sin(largest / 2.0) ** 2, 1.0, 1.0], counts)
+        clear = np.tile(clear, len(self._watched))
+        lower, upper = np.concatenate([least, clear]), np.concatenate([most, np.full(clear.size, inf)])
+        return lower + 2.0 * FEASIBILITY, upper - 2.0 * FEASIBILITY * np.minimum(upper, 1.0)
 
-    def clearances(self, knots: Array) -> float:
-        """Return the least clearance of a plan, shape (n, 7); 1 is the edge of the zone."""
-        at = self.spline.matrix(self._instants) @ knots
-        return float(np.min(self._clearance.map(self.steps + 1)(at.T).full()))
+    def clearance(self, knots: Array) -> float:
+        """Return a lower bound of the clearance of a plan, shape (n, 7), over all of its duration, in m.
+
+        Between two instants with the distances a and b, h seconds apart, the distance is at least (a + b - L h) / 2,
+        where L bounds its rate: the sum of the joints' rates times their reach. Intervals are halved until these bounds
+        are within 0.5 mm of the least distance.
+        """
+        bend = np.max(np.abs(self.spline.extremes(knots, 2)), axis=0)
+        samples = self._sample(self._instants, knots)
+        left, right, least, bound = samples[:-1], samples[1:], samples[:, 1].min(), inf
+        while True:
+            h = right[:, 0] - left[:, 0]
+            rates = np.maximum(left[:, 2:], right[:, 2:]) + 0.5 * h[:, None] * bend
+            bounds = 0.5 * (left[:, 1] + right[:, 1] - h * (rates @ self.arm.reaches))
+            halve = bounds < least - _ACCURACY
+            bound = min(bound, bounds[~halve].min(initial=inf))
+            if not halve.any():
+                return float(bound)
+            left, right = left[halve], right[halve]
+            middle = self._sample(0.5 * (left[:, 0] + right[:, 0]), knots)
+            least = min(least, middle[:, 1].min())
+            left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+
+    def _sample(self, times: Array, knots: Array) -> Array:
+        """Return time, least distance and the joints' rates at some times of a plan, shape (p, 2 + 7)."""
+        q, rates = (self.spline.matrix(times, k) @ knots for k in range(2))
+        return np.column_stack([times, self.arm.least(q), np.abs(rates)])
 
 
 @dataclass(frozen=True)
@@ -152,11 +215,23 @@ class Move:
         space: The moves of that duration.
         start: Joint positions in rad, shape (7,).
         goal: Joint positions in rad, shape (7,).
+
+    Raises:
+        ValueError: The arm is closer than `CLEARANCE` to base, panels or itself at the start or at the goal.
     """
 
     space: MoveSpace
     start: Array
     goal: Array
+
+    def __post_init__(self) -> None:
+        for name, q in (("start", self.start), ("goal", self.goal)):
+            distance, pair = self.space.arm.nearest(q)
+            if not distance >= CLEARANCE:
+                raise ValueError(
+                    f"the {name} is in collision, or nearly: the distance of {pair} is {1e3 * distance:.1f} mm by the "
+                    f"spheres that cover the arm; choose one of at least {1e3 * CLEARANCE:g} mm"
+                )
 
     @property
     def ends(self) -> Array:
@@ -170,9 +245,14 @@ class Move:
         return self.start + share[:, None] * (self.goal - self.start)
 
     @cached_property
+    def straight_motion(self) -> BaseMotion:
+        """Return how the base moves on the straight path."""
+        return self.motion(self.straight)
+
+    @property
     def largest(self) -> float:
         """Return the largest deviation on the straight path, in rad, which no plan may exceed."""
-        return float(self.space.reaction(self.straight).angle.max())
+        return float(self.straight_motion.angle.max())
 
     def knots(self, z: ArrayLike) -> Array:
         """Return all knots, shape (n, 7), of the free ones, shape (7 k,)."""
@@ -186,6 +266,16 @@ class Move:
         lower, upper = np.maximum(straight - REACH, servicer.lower), np.minimum(straight + REACH, servicer.upper)
         return lower.ravel(), upper.ravel()
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the lower and upper bounds of the constraints g of `MoveSpace.functions`.
+
+        The clearance is less than `CLEARANCE` plus a margin where it is so at the start or at the goal.
+        """
+        soft = self.space.arm.soft
+        ends = np.minimum(*(soft(q).full().ravel() for q in (self.start, self.goal)))
+        return self.space.bounds(self.largest, np.minimum(ends, CLEARANCE + _MARGIN))
+
     def motion(self, knots: Array) -> BaseMotion:
         """Return how the base moves under a plan, shape (n, 7)."""
         return self.space.reaction(knots)
@@ -193,7 +283,7 @@ class Move:
     def excess(self, knots: Array) -> dict[str, float]:
         """Return by how much a plan, shape (n, 7), exceeds each limit that it does not keep, by name.
 
-        ``position`` is in rad, the others are shares of the limit.
+        ``position`` is in rad, ``clearance`` in m, the others are shares of the limit.
         """
         servicer, motion = self.space.servicer, self.motion(knots)
         lowest, highest = self.space.spline.extremes(knots)
@@ -203,9 +293,24 @@ class Move:
             "rate": np.max(rates / servicer.speeds) - 1.0,
             "torque": np.max(np.abs(motion.torque) / np.array(servicer.torques)) - 1.0,
             "deviation": motion.angle.max() / self.largest - 1.0,
-            "clearance": 1.0 - self.space.clearances(knots),
+            "clearance": CLEARANCE - self.space.clearance(knots),
         }
-        return {name: float(value) for name, value in found.items() if value > 1e-9}
+        return {name: float(value) for name, value in found.items() if not value <= 1e-9}
+
+    def touched(self, knots: Array) -> list[str]:
+        """Return the limits that a plan, shape (n, 7), uses to 99 %, by the names of `excess`, and ``reach``.
+
+        For the clearance that is the one which solvers keep, and ``reach`` is `REACH`.
+        """
+        servicer, motion = self.space.servicer, self.motion(knots)
+        used = {
+            "rate": np.max(np.abs(self.space.spline.extremes(knots, 1)) / servicer.speeds),
+            "torque": np.max(np.abs(motion.torque) / np.array(servicer.torques)),
+            "deviation": motion.angle.max() / self.largest,
+            "clearance": (CLEARANCE + _MARGIN) / self.space.clearance(knots),
+            "reach": np.abs(knots - self.straight).max() / REACH,
+        }
+        return [name for name, share in used.items() if share >= 0.99]
 
 
 @cache

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.satellite.arm_motion import BASE, DEVIATION, PLAN, ArmMotionScenario, deviation, limits
 from vtbdrake_diagrams.satellite.plant import plant_config
-from vtbdrake_diagrams.satellite.trajectory import Comparison, compare, plot, random_scenarios, search_problem, simulate
+from vtbdrake_diagrams.satellite.trajectory import (
+    Comparison,
+    Course,
+    Survey,
+    compare,
+    plot,
+    random_scenarios,
+    search_problem,
+    simulate,
+)
 
 
 def bent(scenario: ArmMotionScenario) -> np.ndarray:
@@ -47,9 +58,9 @@ def test_mental_testbed_has_no_forces_and_the_same_addresses():
 @pytest.mark.one_python
 def test_the_decision_on_board_turns_the_base_ten_times_less():
     comparison = compare(ArmMotionScenario(onboard=True))
-    assert comparison.ratio > 10.0
+    assert comparison.factor > 10.0
     assert comparison.within_limits
-    assert np.all(comparison.best.deviations[:100] < 1e-9)  # It thinks for 10 s.
+    assert np.all(comparison.best.deviations[comparison.best.times < 10.0] < 1e-9)  # It thinks for 10 s.
     assert plot({"straight": comparison.straight, "best": comparison.best}).axes[0].get_lines()
 
 
@@ -79,12 +90,51 @@ def test_random_motions_repeat_and_keep_the_limits():
     assert not any(scenario.move().excess(scenario.move().straight) for scenario in first)
 
 
-def test_a_comparison_tells_what_exceeds_a_limit():
-    course = simulate(ArmMotionScenario(thinking_time=0.2))
+@pytest.fixture(scope="module")
+def course() -> Course:
+    """The straight path, at every fiftieth instant."""
+    found = simulate(ArmMotionScenario(thinking_time=0.2))
+    series = {name: getattr(found, name)[::50] for name in ("times", "deviations", "positions")}
+    return replace(found, **series)
+
+
+def test_a_comparison_tells_what_exceeds_a_limit(course):
     assert Comparison(course, course).within_limits
-    half = type(course)(course.times, 0.5 * course.deviations, course.rates, course.torques, course.miss)
+    half = replace(course, deviations=0.5 * course.deviations)
     assert not Comparison(half, course).within_limits
-    assert Comparison(course, half).ratio == pytest.approx(2.0)
+    assert Comparison(course, half).factor == pytest.approx(2.0)
+
+
+def test_a_motion_through_the_panel_is_not_within_the_limits(course):
+    positions = course.positions.copy()
+    positions[10] = 2.2, 1.0, 2.8, 1.8, 0.9, 0.1, -2.4
+    colliding = replace(course, positions=positions)
+    assert course.nearest[0] > 0.02
+    assert colliding.nearest[0] < 0.0
+    assert "panel" in colliding.nearest[1]
+    assert not Comparison(course, colliding).within_limits
+
+
+@pytest.mark.parametrize(
+    ("factors", "holds"),
+    [
+        ([30.0] * 20, True),
+        ([30.0] * 15 + [5.0] * 5, True),
+        # Eleven of 20 may be chance.
+        ([30.0] * 11 + [5.0] * 9, False),
+        ([5.0] * 20, False),
+    ],
+)
+def test_the_answer_can_be_no(factors, holds, course):
+    comparisons = [Comparison(course, replace(course, deviations=course.deviations / factor)) for factor in factors]
+    survey = Survey(tuple(comparisons))
+    assert survey.holds == holds
+    assert survey.median == pytest.approx(np.median(factors))
+    assert survey.successes == sum(factor > 10.0 for factor in factors)
+    assert f"{survey.successes} reach 10" in str(survey)
+    # One plan beyond a limit is enough.
+    fast = replace(comparisons[0].best, rates=1.2 * np.ones(7))
+    assert not Survey((*comparisons[1:], Comparison(course, fast))).holds
 
 
 @pytest.mark.parametrize(

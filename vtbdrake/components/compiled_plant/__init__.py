@@ -6,6 +6,7 @@ from vtbdrake.components.compiled_plant.momentum import (
     BaseMotion,
     BaseReaction,
     MomentumModel,
+    base_poses,
     momentum_world,
     rotation_angle,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "PlantRollouts",
     "RolloutBatch",
     "UnsupportedPlantError",
+    "base_poses",
     "compiled_world",
     "momentum_world",
     "plant_dynamics",

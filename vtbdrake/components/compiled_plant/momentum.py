@@ -172,13 +172,10 @@ class MomentumModel(PlantDynamics):
         knots = casadi.MX.sym("knots", m, spline.knots)
         halves = 0.5 * h * np.arange(2 * steps + 1)
         at, rate, change = (knots @ casadi.DM(spline.matrix(halves, derivative).T) for derivative in range(3))
-        V = velocity.map(2 * steps + 1)(at, rate)
-        begin = casadi.DM([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        poses = _pose_step(h).mapaccum(steps)(begin, V[:, :-1:2], V[:, 1::2], V[:, 2::2])
-        poses = casadi.horzcat(begin, poses)
+        rotation, position = base_poses(steps, spline.duration)(velocity.map(2 * steps + 1)(at, rate))
         torques = torque.map(steps + 1)(at[:, ::2], rate[:, ::2], change[:, ::2])
         return casadi.Function(
-            "base_motion", [knots], [poses[:4, :], poses[4:, :], torques], ["knots"], ["rotation", "position", "torque"]
+            "base_motion", [knots], [rotation, position, torques], ["knots"], ["rotation", "position", "torque"]
         )
 
     # -- parts
@@ -273,6 +270,22 @@ class BaseReaction:
         evaluate()
         found = result.reshape(len(self._times), -1).copy()
         return BaseMotion(self._times, found[:, :4], found[:, 4:7], found[:, 7:])
+
+
+def base_poses(steps: int, duration: float) -> casadi.Function:
+    """Return the function (V) -> rotation, position, by the Runge-Kutta method of fourth order.
+
+    V are velocities V_B0B_B at the 2 N + 1 ends and middles of the N steps, shape (6, 2 N + 1); ``rotation`` and
+    ``position`` are those of `MomentumModel.motion`.
+
+    Args:
+        steps: Number N of steps.
+        duration: Duration of all steps in seconds.
+    """
+    V, begin = casadi.MX.sym("V", 6, 2 * steps + 1), casadi.DM([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    following = _pose_step(duration / steps).mapaccum(steps)(begin, V[:, :-1:2], V[:, 1::2], V[:, 2::2])
+    poses = casadi.horzcat(begin, following)
+    return casadi.Function("base_poses", [V], [poses[:4, :], poses[4:, :]], ["V"], ["rotation", "position"])
 
 
 def momentum_world(model: MomentumModel, positions: ArrayLike, *, period: float) -> CasadiSystem:
