@@ -274,6 +274,7 @@ class SatelliteScenario(Scenario):
                 plant.GetFrameByName("camera"),
                 period=1.0 / self.camera_rate,
                 info=self.camera_info,
+                supersampling=2,
                 errors=self.camera_errors,
             )
             builder.add("sense", "docking_camera", camera)

@@ -17,9 +17,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
+from vtbdrake.components.environment import Light, LightConfig
 from vtbdrake.components.perception.markers import (
     Detections,
     MarkerBoard,
@@ -29,6 +31,9 @@ from vtbdrake.components.perception.markers import (
     detect_markers,
     pose_from_markers,
 )
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.components.sensors.camera import Camera, connect_camera
+from vtbdrake.state.systems import collect
 
 INTRINSICS = np.array([400.0, 410.0, 150.0, 125.0])  # Not in the middle, and not square.
 
@@ -106,19 +111,65 @@ def test_pose_from_an_image_is_within_its_covariance(world: Diagram) -> None:
     assert np.mean(distances) < 12.0  # 6 are expected of independent errors of the corners.
 
 
+@pytest.fixture(scope="module")
+def photographed() -> tuple[Diagram, Camera]:
+    """The board before a camera whose pixels are means of four points, with noise, in light of 0.7."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
+    body = plant.AddRigidBody("target", SpatialInertia.SolidBoxWithMass(1.0, 1.0, 1.0, 1.0))
+    add_markers(plant, body, board())
+    plant.Finalize()
+    info = CameraInfo(320, 240, *INTRINSICS)
+    options = {"info": info, "supersampling": 2, "errors": ErrorModel(noise=1.0)}
+    camera = builder.AddNamedSystem("camera", Camera(plant, plant.world_frame(), period=0.1, **options))
+    light = builder.AddNamedSystem("light", Light(LightConfig(direction=[0.3, 0.2, 1.0], intensity=0.7)))
+    connect_camera(builder, camera, scene_graph, light=light)
+    return builder.Build(), camera
+
+
+@pytest.mark.parametrize("distance", [1.8, 2.6, 4.0])
+def test_errors_of_poses_are_as_large_as_their_covariances_say(photographed: tuple, distance: float) -> None:
+    diagram, camera = photographed
+    plant, generator = diagram.GetSubsystemByName("plant"), np.random.default_rng(int(10 * distance))
+    body, squares, depths, corner_errors = plant.GetBodyByName("target"), [], [], []
+    for seed in range(25):
+        tilt = RollPitchYaw(*generator.uniform(-0.5, 0.5, 2), generator.uniform(-np.pi, np.pi))
+        X_CT = RigidTransform(tilt, [*(0.05 * distance * generator.uniform(-1.0, 1.0, 2)), distance])
+        context = diagram.CreateDefaultContext()
+        plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(context), body, X_CT)
+        collect(diagram).write(context, {"camera.seed": seed})
+        Simulator(diagram, context).Initialize()
+        image = camera.GetOutputPort("color_image").Eval(camera.GetMyContextFromRoot(context))
+        seen = detect_markers(image, MarkerDetector(min_perimeter=0.05)).on(board())
+        if len(seen.ids) < 3:
+            continue
+        expected = project(board().corners[board().find(seen.ids)].reshape(-1, 3), X_CT, INTRINSICS)
+        corner_errors.append((seen.corners.reshape(-1, 2) - expected).ravel())
+        estimate = pose_from_markers(seen, board(), INTRINSICS, time=0.0, prediction=X_CT)
+        error = estimate.error_to(X_CT)
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+        depths.append(error[5])
+    assert len(squares) > 15
+    assert np.sqrt(np.mean(np.concatenate(corner_errors) ** 2)) < 0.1
+    # 6 are expected of errors that are exactly as large as supposed.
+    assert 1.0 < np.mean(squares) < 8.0
+    assert sum(square > 22.5 for square in squares) <= 1  # 0.1 % of chi-squared.
+    assert abs(np.mean(depths)) < 4.0 * np.std(depths) / np.sqrt(len(depths)) + 2e-4
+
+
 def errors_and_covariance(distance: float, *, count: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of poses from noisy corners (count, 6), and the covariance that they are told to have."""
     X_CT = RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.0, 0.0, distance])
     exact = project(board().corners.reshape(-1, 3), X_CT, INTRINSICS).reshape(-1, 4, 2)
     generator = np.random.default_rng(1)
-    errors = []
+    errors, options = [], {"corner_noise": noise, "edge_shift": 0.0}
     for _ in range(count):
         noisy = Detections(board().ids, exact + noise * generator.standard_normal(exact.shape))
         estimate = pose_from_markers(
-            noisy, board(), INTRINSICS, time=0.0, prediction=X_CT, corner_noise=noise, residual_limit=5.0 * noise
+            noisy, board(), INTRINSICS, time=0.0, prediction=X_CT, residual_limit=5.0 * noise, **options
         )
         errors.append(estimate.error_to(X_CT))
-    exactly = pose_from_markers(Detections(board().ids, exact), board(), INTRINSICS, time=0.0, corner_noise=noise)
+    exactly = pose_from_markers(Detections(board().ids, exact), board(), INTRINSICS, time=0.0, **options)
     return np.array(errors), exactly.covariance
 
 
@@ -167,7 +218,8 @@ def flat_poses(distance: float, tilts: tuple[float, float], *, helped: bool = Fa
         exact = project(flat.corners.reshape(-1, 3), X_CT, INTRINSICS).reshape(-1, 4, 2)
         seen = Detections(flat.ids, exact + noise * generator.standard_normal(exact.shape))
         prediction = X_CT @ RigidTransform(RollPitchYaw(0.06, 0.06, 0.0), [0.0, 0.0, 0.0]) if helped else None
-        estimate = pose_from_markers(seen, flat, INTRINSICS, time=0.0, prediction=prediction, corner_noise=noise)
+        options = {"prediction": prediction, "corner_noise": noise, "edge_shift": 0.0}
+        estimate = pose_from_markers(seen, flat, INTRINSICS, time=0.0, **options)
         error = estimate.error_to(X_CT)
         found += [error @ np.linalg.solve(estimate.covariance, error)] if estimate.valid else []
     return found

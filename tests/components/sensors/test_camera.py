@@ -120,6 +120,20 @@ def test_pose_and_intrinsics_move_the_image() -> None:
     assert left_edge(scene.render(context)) == before + 20
 
 
+@pytest.mark.parametrize("phase", [0.0, 0.2, 0.4, 0.6, 0.8])
+def test_pixels_of_many_points_count_the_area_that_is_lit(phase: float) -> None:
+    scene = Scene(supersampling=4)
+    context = scene.context()
+    scene.set(context, "intrinsics", [150.0, 140.0, 83.0 + phase, 57.0])
+    image = scene.render(context)
+    lit = np.flatnonzero(image[57] > 100)
+    # The box is 30 pixels wide, from column 68 + phase. Its edges fall between points, a quarter of a pixel apart.
+    assert image[57].sum() / image[57, 83] == pytest.approx(30.0, abs=0.3)
+    middle = (np.arange(160) + 0.5) @ image[57] / image[57].sum()
+    assert middle == pytest.approx(83.0 + phase, abs=0.13)
+    assert len(lit) >= 29
+
+
 def test_depth_is_along_the_optical_axis() -> None:
     scene = Scene(depth=True)
     context = scene.context()
@@ -366,6 +380,7 @@ def test_camera_inside_a_body_is_refused() -> None:
         ({"period": 0.0}, "period is positive"),
         ({"near": 2.0, "far": 1.0}, "0 < near < far"),
         ({"photon_noise": -1.0}, "standard deviation"),
+        ({"supersampling": 0}, "whole number of points"),
         ({"errors": ErrorModel(bias=1.0)}, "no bias"),
         ({"errors": ErrorModel(latency=-1)}, "whole number of periods"),
     ],

@@ -287,7 +287,7 @@ def fit_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
     t = (following - corners) / np.maximum(length, 1e-9)
     # The corners run clockwise in the image, in which y points down.
     n = np.stack([t[..., 1], -t[..., 0]], axis=-1)
-    reach = np.clip(0.9 * length / _CELLS, 1.0, 3.0)
+    reach = np.clip(0.9 * length / _CELLS, 1.0, 2.0)
     along, across = _ALONG * length, _ACROSS * reach
     points = (
         corners[:, :, None, None]
@@ -330,6 +330,11 @@ _CLEAR = 2.0 * log(1000.0)
 _APART = 16.8
 # Up to this angle in rad between two poses, a covariance covers both.
 _NEAR = 0.4
+# Markers that are narrower in the image (in pixels) are left out: a cell then has hardly more than one pixel.
+_NARROWEST = 10.0
+# An edge deviates by this, over the marker's width across it, in pixels; its ends by so many times more to either side;
+# and the number of residuals that this counts for, beside those of an image.
+_DEVIATION, _TURN, _PRIOR_WEIGHT = 0.8, 2.0, 4.0
 
 
 def pose_from_markers(
@@ -339,15 +344,27 @@ def pose_from_markers(
     *,
     time: float,
     prediction: RigidTransform | None = None,
-    corner_noise: float = 0.15,
+    corner_noise: float | None = None,
+    edge_shift: float = 0.05,
     residual_limit: float = 1.5,
     fewest: int = 3,
 ) -> PoseEstimate:
     r"""Estimate the pose X_CT of a body from its markers, by the least squares of the reprojection error.
 
-    With the corners p_i of all markers in T, minimize Σ \|u_i - π(R_CT p_i + p_CT)\|² by Gauss-Newton steps. The
-    covariance is σ² (JᵀJ)⁻¹ with the Jacobian J of the projection and σ the larger one of ``corner_noise`` and the
-    root mean square of the residuals. The steps start at the result of OpenCV's SQPNP.
+    With the corners p_i of all markers in T, at the pixels u_i, the residuals e_i = u_i - π(R_CT p_i + p_CT) - δ d_i.
+    What is measured are the edges: edge k, with its normal n, is off by o_k = n·(e_k + e_k+1) / 2 in its middle, and
+    turned such that its ends are off by t_k = n·(e_k+1 - e_k) / 2 more. Minimize by Gauss-Newton steps
+
+        Σ (o_k / σ_k)² + (t_k / 2 σ_k)² + (δ / edge_shift)²
+
+    All edges may be shifted outwards by the same δ pixels, their corners by δ d_i, because a bright frame that is
+    overexposed or smoothed grows into the black square. The covariance is s² (JᵀJ)⁻¹ with the Jacobian J of all terms
+    r, of which the rows and columns of the pose are taken. The smaller a marker is, the less exact are its edges:
+    σ_k = 0.8 / w_k pixels at the width w_k of the marker across the edge, in pixels, somewhat more than in rendered
+    images whose pixels are means (``supersampling``). By how much it is more or less in an image follows from its
+    residuals: s² = (4 + r·r) / (4 + 2 n - 6) for n corners, as if 4 more residuals were as supposed. Markers that are
+    less than 10 pixels wide are left out: a few of their corners err by pixels. The steps start at the result of
+    OpenCV's SQPNP.
 
     Small markers in one plane have two poses that fit almost equally well, the plane tilted to one side or to the other
     (Oberkampf, DeMenthon and Davis, "Iterative pose estimation using coplanar feature points", CVIU 63, 1996). Both are
@@ -362,7 +379,9 @@ def pose_from_markers(
         intrinsics: [fx, fy, cx, cy] of the camera in pixels, as in Drake's CameraInfo.
         time: When the image was taken, in s.
         prediction: X_CT as it is expected.
-        corner_noise: The standard deviation of a corner's coordinates, in pixels; assumed, not derived.
+        corner_noise: The standard deviation of every corner's coordinates in pixels, if it is known; s is then at
+            least 1, and no marker is too narrow. By default it follows from the image.
+        edge_shift: The standard deviation of δ, in pixels.
         residual_limit: The largest root mean square of the residuals of a valid estimate, in pixels.
         fewest: How many markers suffice without a prediction.
 
@@ -372,28 +391,34 @@ def pose_from_markers(
     Raises:
         ValueError: A corner is not finite.
     """
-    found = detections.on(board)
-    if not len(found.ids) or (prediction is None and len(found.ids) < fewest):
-        return PoseEstimate.missing(time=time)
-    points = board.corners[board.find(found.ids)].reshape(-1, 3)
-    pixels = found.corners.reshape(-1, 2)
-    if not np.isfinite(pixels).all():
+    known = detections.on(board)
+    if not np.isfinite(known.corners).all():
         raise ValueError("corners of markers are finite numbers of pixels: leave out what was not found")
-    intrinsics = np.asarray(intrinsics, dtype=float)
-    start = prediction if len(found.ids) < fewest else _start(points, pixels, intrinsics)
-    fit = None if start is None else _refine(points, pixels, intrinsics, start)
+    wide = _widths(known.corners).min(axis=1) >= (_NARROWEST if corner_noise is None else 0.0)
+    ids, pixels = known.ids[wide], known.corners[wide]
+    if not len(ids) or (prediction is None and len(ids) < fewest):
+        return PoseEstimate.missing(time=time)
+    corners = _Corners(
+        board.corners[board.find(ids)].reshape(-1, 3),
+        pixels.reshape(-1, 2),
+        _edges(pixels) if corner_noise is None else np.tile(np.eye(8) / corner_noise, (len(ids), 1, 1)),
+        edge_shift * _outward(pixels).reshape(-1, 2),
+        np.asarray(intrinsics, dtype=float),
+        least_scale=0.0 if corner_noise is None else 1.0,
+    )
+    start = prediction if len(ids) < fewest else _start(corners)
+    fit = None if start is None else _refine(corners, start)
     if fit is None:
         return PoseEstimate.missing(time=time)
-    back = _fit_at(points, pixels, intrinsics, _tilted_back(points, fit.X_CT))
-    other = None if back is None else _refine(points, pixels, intrinsics, back.X_CT)
-    if other is not None and other.rms < fit.rms:
+    back = _fit_at(corners, _tilted_back(corners.points, fit.X_CT))
+    other = None if back is None else _refine(corners, back.X_CT)
+    if other is not None and other.squares < fit.squares:
         fit, other = other, fit
     if not fit.rms <= residual_limit:
         return PoseEstimate.missing(time=time)
-    sigma = max(corner_noise, fit.rms)
-    estimate = fit.estimate(sigma, time=time)
+    estimate = fit.estimate(fit.scale, time=time)
     # Of a front view, both may be one minimum.
-    rival = next((one for one in (other, back) if one is not None and _is_rival(one, fit, sigma)), None)
+    rival = next((pose for pose in (other, back) if pose is not None and _is_rival(pose, fit)), None)
     if rival is None:
         return estimate
     apart = estimate.error_to(rival.X_CT)
@@ -401,24 +426,84 @@ def pose_from_markers(
         return PoseEstimate.of(estimate.X, estimate.covariance + np.outer(apart, apart), time=time)
     if prediction is None:
         return PoseEstimate.missing(time=time)
-    both = (estimate, rival.estimate(sigma, time=time))
-    return min(both, key=lambda one: float(np.linalg.norm(one.error_to(prediction)[:3])))
+    both = (estimate, rival.estimate(fit.scale, time=time))
+    return min(both, key=lambda pose: float(np.linalg.norm(pose.error_to(prediction)[:3])))
 
 
-def _is_rival(one: _Fit, best: _Fit, sigma: float) -> bool:
+def _widths(corners: Array) -> Array:
+    """Return the width of each marker across each of its edges, (n, 4) in pixels."""
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    across: Array = area[:, None] / np.maximum(length, 1e-9)
+    return across
+
+
+def _edges(corners: Array) -> Array:
+    """Return the matrices that turn errors of the corners into those of the edges over their deviations, (n, 8, 8)."""
+    along = np.roll(corners, -1, axis=1) - corners
+    normals = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-9)
+    rows = 0.5 * normals * _widths(corners)[..., None] / _DEVIATION
+    matrices = np.zeros((len(corners), 4, 2, 4, 2))
+    for k in range(4):
+        for end, turn in ((k, -1.0), ((k + 1) % 4, 1.0)):
+            matrices[:, k, 0, end] = rows[:, k]
+            matrices[:, k, 1, end] = turn / _TURN * rows[:, k]
+    return matrices.reshape(-1, 8, 8)
+
+
+def _outward(corners: Array) -> Array:
+    """Return by how much the corners move if the edges of a marker move outwards by a pixel, (n, 4, 2)."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    edges = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-9)
+    before = np.roll(edges, 1, axis=1)
+    sine = before[..., 0] * edges[..., 1] - before[..., 1] * edges[..., 0]
+    moved: Array = (before - edges) / np.maximum(np.abs(sine), 0.1)[..., None]
+    return moved
+
+
+def _is_rival(pose: _Fit, best: _Fit) -> bool:
     """Return whether a pose is nearly as likely as the best one, but outside of what its covariance allows."""
-    apart = best.J @ best.estimate(sigma, time=0.0).error_to(one.X_CT)
-    excess = len(best.J) * (one.rms**2 - best.rms**2)
-    return bool(excess < _CLEAR * sigma**2 and apart @ apart > _APART * sigma**2)
+    estimate = best.estimate(best.scale, time=0.0)
+    apart = estimate.error_to(pose.X_CT)
+    distance = apart @ np.linalg.solve(estimate.covariance, apart)
+    return bool(pose.squares - best.squares < _CLEAR * best.scale**2 and distance > _APART)
 
 
-def _start(points: Array, pixels: Array, intrinsics: Array) -> RigidTransform | None:
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """The corners of the markers in an image, and the same corners on the body.
+
+    Attributes:
+        points: In T, (n, 3) in m.
+        pixels: In the image, (n, 2).
+        whitening: What turns the errors of the four corners of each marker into numbers of deviation 1, (n / 4, 8, 8).
+        shift: By how much edges that are shifted by one deviation move them, (n, 2) in pixels.
+        intrinsics: [fx, fy, cx, cy] of the camera in pixels.
+        least_scale: The smallest factor of the deviations.
+    """
+
+    points: Array
+    pixels: Array
+    whitening: Array
+    shift: Array
+    intrinsics: Array
+    least_scale: float
+
+    def whitened(self, errors: Array) -> Array:
+        """Return errors in pixels (or columns of them), (2 n, ...), in their deviations, (2 n, ...)."""
+        white: Array = (self.whitening @ errors.reshape(len(self.whitening), 8, -1)).reshape(errors.shape)
+        return white
+
+
+def _start(corners: _Corners) -> RigidTransform | None:
     import cv2
 
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy = corners.intrinsics
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     try:
-        solved, rotation, translation = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+        solved, rotation, translation = cv2.solvePnP(corners.points, corners.pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # All corners are in one place.
         return None
     if not solved or not np.isfinite(rotation).all():
@@ -445,57 +530,78 @@ def _mirror(n: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A pose, and how well the corners fit to it.
+    """A pose and a shift of the edges, and how well the corners fit to them.
 
     Attributes:
+        corners: The corners.
         X_CT: The pose.
-        residual: Measured less projected pixels, (2 n,).
-        J: The Jacobian of the projected pixels, (2 n, 6).
+        shift: The shift of the edges, in its deviations.
+        error: Measured less expected pixels, (2 n,).
+        residual: The same and the shift, over their deviations, (2 n + 1,).
+        J: The Jacobian of what is expected by pose and shift, over the deviations, (2 n + 1, 7).
     """
 
+    corners: _Corners
     X_CT: RigidTransform
+    shift: float
+    error: Array
     residual: Array
     J: Array
 
     @property
-    def rms(self) -> float:
-        """The root mean square of the residuals, in pixels."""
-        return float(np.sqrt(np.mean(self.residual**2)))
+    def squares(self) -> float:
+        """The sum of the squares of the residuals."""
+        return float(self.residual @ self.residual)
 
-    def estimate(self, sigma: float, *, time: float) -> PoseEstimate:
-        """Return the estimate at a time (s) from coordinates with the standard deviation sigma, in pixels."""
-        covariance = sigma**2 * np.linalg.inv(self.J.T @ self.J)
+    @property
+    def rms(self) -> float:
+        """The root mean square of the residuals in pixels."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+    @property
+    def scale(self) -> float:
+        """The true deviations over the supposed ones, by the residuals."""
+        freedom = len(self.residual) - 7
+        scale = np.sqrt((_PRIOR_WEIGHT + self.squares) / (_PRIOR_WEIGHT + freedom))
+        return max(float(scale), self.corners.least_scale)
+
+    def estimate(self, scale: float, *, time: float) -> PoseEstimate:
+        """Return the estimate at a time (s), with deviations of the corners ``scale`` times the supposed ones."""
+        covariance = scale**2 * np.linalg.inv(self.J.T @ self.J)[:6, :6]
         return PoseEstimate.of(self.X_CT, 0.5 * (covariance + covariance.T), time=time)
 
 
-def _fit_at(points: Array, pixels: Array, intrinsics: Array, X_CT: RigidTransform) -> _Fit | None:
+def _fit_at(corners: _Corners, X_CT: RigidTransform, shift: float = 0.0) -> _Fit | None:
     """Return how well the corners fit to a pose; None if it has a corner behind the camera."""
-    fx, fy, cx, cy = intrinsics
-    turned = points @ X_CT.rotation().matrix().T
+    fx, fy, cx, cy = corners.intrinsics
+    turned = corners.points @ X_CT.rotation().matrix().T
     x, y, z = (turned + X_CT.translation()).T
     if z.min() < 1e-3:
         return None
-    residual = pixels - np.stack([fx * x / z + cx, fy * y / z + cy], axis=1)
-    J_p = np.zeros((len(points), 2, 3))
+    expected = np.stack([fx * x / z + cx, fy * y / z + cy], axis=1) + shift * corners.shift
+    J_p = np.zeros((len(turned), 2, 3))
     J_p[:, 0, 0], J_p[:, 0, 2] = fx / z, -fx * x / z**2
     J_p[:, 1, 1], J_p[:, 1, 2] = fy / z, -fy * y / z**2
-    return _Fit(X_CT, residual.ravel(), np.concatenate([-J_p @ cross_matrix(turned), J_p], axis=2).reshape(-1, 6))
+    J = np.concatenate([-J_p @ cross_matrix(turned), J_p, corners.shift[:, :, None]], axis=2)
+    error = (corners.pixels - expected).ravel()
+    residual = np.append(corners.whitened(error), -shift)
+    return _Fit(corners, X_CT, shift, error, residual, np.vstack([corners.whitened(J.reshape(-1, 7)), np.eye(7)[6]]))
 
 
 _MOST_STEPS = 15
 
 
-def _refine(points: Array, pixels: Array, intrinsics: Array, start: RigidTransform) -> _Fit | None:
+def _refine(corners: _Corners, start: RigidTransform) -> _Fit | None:
     """Return the fit to the best pose near ``start``, or None if the steps lead to none."""
-    X_CT = start
+    X_CT, shift = start, 0.0
     for _ in range(_MOST_STEPS):
-        fit = _fit_at(points, pixels, intrinsics, X_CT)
+        fit = _fit_at(corners, X_CT, shift)
         if fit is None:
             return None
         step, *_ = np.linalg.lstsq(fit.J, fit.residual, rcond=None)
-        if np.abs(step).max() < 1e-8:
+        if np.abs(step[:6]).max() < 1e-8:
             return fit
         step *= min(1.0, 0.5 / max(float(np.linalg.norm(step[:3])), 1e-12))
         R = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(step[:3]) @ X_CT.rotation().matrix())
-        X_CT = RigidTransform(R, X_CT.translation() + step[3:])
+        X_CT, shift = RigidTransform(R, X_CT.translation() + step[3:6]), shift + float(step[6])
     return None

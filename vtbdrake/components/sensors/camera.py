@@ -106,6 +106,11 @@ class Camera(LeafSystem):
 
         y = clip(round(m + sigma n), 0, S),   sigma^2 = (g noise)^2 + g photon_noise^2 m / S
 
+    The pixels of a real camera count the light on their whole area, those of VTK that at their centres, smoothed along
+    edges such that bright areas grow into dark ones by up to 0.2 pixels where edges run along rows or columns. With
+    ``supersampling`` k, a pixel is the mean of k x k points, and this error k times smaller. The time for rendering
+    grows with k^2. Where subpixels count, as in measuring markers, take 2 or more.
+
     A pixel saturates last: m is the sum of all light after shadows and haze, and may exceed S, up to 64 S. What is
     brighter than S is rendered again with a quarter of the exposure, as often as needed, so that m is known to 1 %.
     noise is the standard deviation of the read noise, and photon_noise that of the shot noise of a pixel at full scale,
@@ -132,6 +137,7 @@ class Camera(LeafSystem):
         X_FC: RigidTransform | None = None,
         near: float = 0.05,
         far: float = 200.0,
+        supersampling: int = 1,
         photon_noise: float = 0.0,
         stream: int | None = None,
         errors: ErrorModel | None = None,
@@ -148,6 +154,7 @@ class Camera(LeafSystem):
             X_FC: Pose of the camera in F; by default the two are the same.
             near: Distance along z_C in metres below which nothing is seen.
             far: Distance along z_C in metres beyond which nothing is seen.
+            supersampling: How many points across and down a pixel is the mean of.
             photon_noise: Standard deviation of the shot noise at full scale, in counts.
             stream: Number of the random stream, as in `SampledSensor`.
             errors: Read noise (in counts), latency, drop-out and seed; None for an exact camera.
@@ -165,6 +172,8 @@ class Camera(LeafSystem):
             raise ValueError(f"Camera: the period is positive, in s, not {period!r}")
         if not 0.0 < near < far < inf:
             raise ValueError(f"Camera: near and far are distances in m, 0 < near < far, not {near!r} and {far!r}")
+        if not (supersampling >= 1 and supersampling == int(supersampling)):
+            raise ValueError(f"Camera: supersampling is a whole number of points, at least 1, not {supersampling!r}")
         if not (isfinite(photon_noise) and photon_noise >= 0.0):
             raise ValueError(f"Camera: photon_noise is a standard deviation in counts, not {photon_noise!r}")
         if not plant.geometry_source_is_registered():
@@ -172,7 +181,7 @@ class Camera(LeafSystem):
         info = info or CameraInfo(320, 240, np.pi / 4)
         self._width, self._height = info.width(), info.height()
         self._period, self._stream = float(period), random_stream(self, stream)
-        self._near, self._far = float(near), float(far)
+        self._near, self._far, self._supersampling = float(near), float(far), int(supersampling)
         # The number of the frame, because the id of a plant keeps it alive.
         self._frame_number = plant.GetBodyFrameIdOrThrow(frame.body().index()).get_value()
         self._declare_parameters(
@@ -277,7 +286,7 @@ class Camera(LeafSystem):
         X_WC = _pose_of(query, self._frame_number) @ pose_from_array(values[:6])
         self._check_outside(view, X_WC.translation())
         info = CameraInfo(self._width, self._height, *values[6:10])
-        camera = _RenderCamera(scene, view, info, self._near, self._far, X_WC)
+        camera = _RenderCamera(scene, view, info, (self._near, self._far), X_WC, points=self._supersampling)
         # Where nothing changes a pixel that is saturated, there is no need to know how bright it is.
         bracket = _BRACKET if illumination.shadows or haze[0] or values[13] or values[14] else ()
         expected = camera.color(SUN, bracket)
@@ -388,15 +397,17 @@ class _RenderCamera:
         scene: RenderedScene,
         view: QueryObject,
         info: CameraInfo,
-        near: float,
-        far: float,
+        limits: tuple[float, float],
         X_WC: RigidTransform,
+        *,
+        points: int,
     ) -> None:
-        self.view, self._scene, self._info, self._near, self._far, self.X_WC = view, scene, info, near, far, X_WC
+        self.view, self._scene, self._info, self._limits, self.X_WC = view, scene, info, limits, X_WC
+        self._points = points
         self._world = view.inspector().world_frame_id()
 
-    def _core(self, renderer: str) -> RenderCameraCore:
-        return RenderCameraCore(renderer, self._info, ClippingRange(self._near, self._far), RigidTransform())
+    def _core(self, renderer: str, info: CameraInfo) -> RenderCameraCore:
+        return RenderCameraCore(renderer, info, ClippingRange(*self._limits), RigidTransform())
 
     def color(self, renderer: str, bracket: Sequence[float]) -> NDArray[np.float32]:
         """Return the counts of a renderer, shape (h, w, 3); 255 if too bright for the smallest exposure.
@@ -412,15 +423,26 @@ class _RenderCamera:
             darker = np.float32(factor) * self._counts(self._scene.darker(renderer, factor))
             # Brighter by more than rounding explains: saturated, or at an edge the mean of something saturated.
             counts = np.where(darker > counts + 0.75 * factor, darker, counts)
-        return counts
+        k = self._points
+        if k == 1:
+            return counts
+        mean = np.zeros((self._info.height(), self._info.width(), 3), np.float32)
+        for i in range(k):
+            for j in range(k):
+                mean += counts[i::k, j::k]
+        mean /= k * k
+        return mean
 
     def _counts(self, renderer: str) -> NDArray[np.uint8]:
-        image = self.view.RenderColorImage(ColorRenderCamera(self._core(renderer), False), self._world, self.X_WC)
-        return image.data[..., :3]
+        """Return the counts of all points of the pixels, shape (k h, k w, 3)."""
+        k, info = self._points, self._info
+        intrinsics = (k * x for x in (info.focal_x(), info.focal_y(), info.center_x(), info.center_y()))
+        core = self._core(renderer, CameraInfo(k * info.width(), k * info.height(), *intrinsics))
+        return self.view.RenderColorImage(ColorRenderCamera(core, False), self._world, self.X_WC).data[..., :3]
 
     def depth(self) -> NDArray[np.float32]:
         """Return the depth image, shape (h, w)."""
-        camera = DepthRenderCamera(self._core(SUN), DepthRange(self._near, self._far))
+        camera = DepthRenderCamera(self._core(SUN, self._info), DepthRange(*self._limits))
         return np.array(self.view.RenderDepthImage(camera, self._world, self.X_WC).data[..., 0])
 
     @property
