@@ -1,0 +1,45 @@
+"""Row C1 of the table of answers can say no, for each of its parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vtbdrake_diagrams.manipulator.answers import COMPARED, Trials
+from vtbdrake_diagrams.manipulator.trials import FREE, Track
+
+pytestmark = pytest.mark.one_python
+
+
+def track(error: float) -> Track:
+    """Return a track whose tip is off by an error in m in each sample."""
+    n = 10
+    wanted = np.zeros((n, 3))
+    motion = np.full(n, float(FREE[0]))
+    return Track(motion, 0.001 * np.arange(n), wanted, wanted + np.array([error, 0.0, 0.0]), np.zeros((n, 3)))
+
+
+GOOD = Trials(track(0.002), track(0.003), COMPARED, identical=True, latched="")
+
+
+def test_an_arm_that_follows_holds() -> None:
+    assert GOOD.errors == pytest.approx((0.002, 0.003))
+    assert GOOD.holds
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"simulated": track(0.006), "real": track(0.004)},
+        {"simulated": track(np.nan)},
+        {"real": track(0.006), "simulated": track(0.004)},
+        {"real": track(0.0041)},
+        {"identical": False},
+        {"compared": 0},
+        {"latched": "the torque is not finite"},
+    ],
+)
+def test_each_part_of_the_answer_can_fail(change: dict[str, object]) -> None:
+    assert not replace(GOOD, **change).holds
