@@ -225,14 +225,22 @@ class MountAnswer:
 
     @property
     def gain(self) -> float:
-        """Return by how many markers the best placement sees more than the best by hand, in the mean."""
-        return self.best.mean - max(placement.mean for placement in self.by_hand)
+        """Return by how many markers the best placement sees more than the best by hand, in the mean.
+
+        NaN if a capture with one of them failed, so that nothing is claimed.
+        """
+        return float(self.best.mean - np.max([placement.mean for placement in self.by_hand]))
 
     @property
     def best_on_grid(self) -> float:
-        """Return the mean number of markers at the best point of the grid that keeps off the arm."""
+        """Return the mean number of markers at the best point of the grid that keeps off the arm.
+
+        NaN if a rollout failed, so that nothing is claimed.
+        """
+        if self.landscape.failed.any():
+            return float("nan")
         values = [e.values[0] for e in self.landscape.evaluations if e.violations[0] <= 0.0]
-        return float(np.nanmax(values)) / HORIZON
+        return float(np.max(values)) / HORIZON
 
     @property
     def holds(self) -> bool:

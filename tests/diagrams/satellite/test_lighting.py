@@ -11,6 +11,7 @@ from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.satellite import lighting
 from vtbdrake_diagrams.satellite.bodies import Target
 from vtbdrake_diagrams.satellite.lighting import (
+    ACCURACY,
     CANDIDATES,
     CHECKED_ON,
     CHOICE,
@@ -46,7 +47,7 @@ def test_default_is_what_the_robot_does_by_itself() -> None:
 def test_choice_is_a_candidate_checked_on_other_starts() -> None:
     assert CANDIDATES[0] == DEFAULT
     assert CHOICE in CANDIDATES
-    assert len(set(CHOSEN_ON) | set(CHECKED_ON)) == 16
+    assert not set(CHOSEN_ON) & set(CHECKED_ON)
 
 
 def test_conditions_are_all_lights_from_all_starts() -> None:
@@ -76,8 +77,8 @@ def test_choice_holds_the_bar_in_the_grazing_sun(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(lighting, "LIGHTS", {"grazing, 86 deg": LIGHTS["grazing, 86 deg"]})
     found = capture_all([CHOICE], seeds=[1], executor=SerialExecutor())
     assert found.failures.tolist() == [[0]]
-    assert 5.0 < found.times.item() < 20.0
-    assert found.errors.item() < 0.03
+    assert 5.0 < found.times.item() < 30.0
+    assert found.errors.item() < ACCURACY
 
 
 TRIED = (DEFAULT, Settings(closing_speed=0.09), Settings(gain=1.5))
@@ -92,8 +93,8 @@ COSTS = np.array(
 )
 
 
-def _captures(costs: np.ndarray) -> Captures:
-    return Captures(costs, np.where(costs < FAILURE, 0.01, np.nan))
+def _captures(costs: np.ndarray, error: float = 0.5 * ACCURACY) -> Captures:
+    return Captures(costs, np.where(costs < FAILURE, error, np.nan))
 
 
 def test_robust_choice_is_best_in_its_worst_light() -> None:
@@ -109,6 +110,17 @@ def test_robust_choice_is_best_in_its_worst_light() -> None:
 def test_choice_that_is_worse_in_a_light_does_not_hold(worse: list) -> None:
     checked = _captures(np.array([COSTS[0], worse]))
     assert not LightingAnswer(TRIED[2], checked).holds
+
+
+def test_time_is_not_bought_with_accuracy() -> None:
+    errors = np.full(COSTS.shape, 0.5 * ACCURACY)
+    errors[2, 3] = 2.0 * ACCURACY
+    tried = Captures(COSTS, errors)
+    assert tried.accurate.tolist() == [True, True, False]
+    # The second loses a capture in the grazing sun, the third is not accurate in one light.
+    assert tried.robust == 0
+    assert not LightingAnswer(TRIED[2], Captures(COSTS[[0, 2]], errors[[0, 2]])).holds
+    assert _captures(COSTS, 2.0 * ACCURACY).robust == 2
 
 
 def test_plot_has_both_comparisons() -> None:
