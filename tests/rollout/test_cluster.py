@@ -1,19 +1,23 @@
 """Rollouts on a Dask cluster: a real scheduler, worker processes that are killed while they work, and its dashboard."""
 
+import logging
 import os
+import queue
 import time
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import dask
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
 
 from benchmarks.dask_cluster import dask_cluster
 from tests.rollout.scenarios import HANG, KILL, KILL_PARENT, RecordedScenario, TreacherousScenario
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, Start, WorkerError, make_executor
+from vtbdrake.rollout import cluster as cluster_module
 from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -204,6 +208,37 @@ def test_lost_scheduler_is_an_error():
         short.client.shutdown()
         with pytest.raises(WorkerError, match="the Dask scheduler has given up rollouts, or is gone"):
             list(rollouts)
+
+
+def test_scheduler_that_is_dead_before_the_task_is_sent_is_named():
+    with dask_cluster(workers=1) as short, Client(short.address, timeout="1s", set_as_default=False) as client:
+        executor = DaskExecutor(client)
+        short.client.shutdown()
+        with pytest.raises(WorkerError, match="the Dask scheduler has given up rollouts, or is gone"):
+            list(executor.run(TASK, _points(2)))
+        executor.close()
+
+
+def test_cluster_without_workers_is_reported_while_it_is_waited_for(monkeypatch):
+    monkeypatch.setattr(cluster_module, "NO_WORKERS", 0.2)
+    messages = queue.SimpleQueue()
+    handler = logging.Handler()
+    handler.emit = lambda record: messages.put(record.getMessage())
+    log = logging.getLogger(cluster_module.__name__)
+    log.addHandler(handler)
+    try:
+        with (
+            LocalCluster(n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None) as empty,
+            Client(empty, set_as_default=False) as client,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            waiting = pool.submit(lambda: list(DaskExecutor(client).run(TASK, _points(2))))
+            assert "the rollouts wait for one; start `dask worker " in messages.get(timeout=60.0)
+            assert not waiting.done()
+            empty.scale(1)
+            assert len(waiting.result(timeout=60.0)) == 2
+    finally:
+        log.removeHandler(handler)
 
 
 def test_missing_scheduler_is_an_error():

@@ -10,6 +10,7 @@ import time
 import uuid
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from math import inf
 from typing import Any
@@ -30,9 +31,14 @@ except ModuleNotFoundError as error:
 
 _log = logging.getLogger(__name__)
 
+# What a client raises whose scheduler has ended.
+_GONE = (OSError, ClosedClientError)
+
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 # The number of tasks that the workers keep.
 _TASKS = 16
+# A cluster without workers is reported after so many seconds, and again after as many.
+NO_WORKERS = 30.0
 # The period in seconds at which the size of the cluster is read: it may grow while it works.
 _SIZE_PERIOD = 5.0
 
@@ -45,7 +51,8 @@ class DaskExecutor(Executor):
     hangs costs two such processes and becomes a failed result; it costs no Dask worker. When a Dask worker is lost,
     Dask runs its rollouts elsewhere. A rollout that was running when more workers than
     ``distributed.scheduler.allowed-failures`` were lost is tried again alone, because another one may be at fault; if
-    that fails too, it is a failed result. Without any worker left, the executor waits for new ones.
+    that fails too, it is a failed result. Without any worker, the executor waits for one, and logs a warning every half
+    minute.
 
     Args:
         client: A client of the cluster, which stays open, or the address of the scheduler; by default the address in
@@ -89,6 +96,8 @@ class DaskExecutor(Executor):
         tried: set[int] = set()
         flying: dict[Future[bytes], int] = {}
         landed = as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        ended = threading.Event()
+        threading.Thread(target=_report_no_workers, args=(self._client, ended), daemon=True).start()
         try:
             while waiting or flying or suspects:
                 alone = not waiting and not flying
@@ -114,6 +123,7 @@ class DaskExecutor(Executor):
                 else:
                     yield index, pickle.loads(outcome)[1]
         finally:
+            ended.set()
             if flying and self._client.status == "running":
                 self._client.cancel(list(flying))
 
@@ -123,7 +133,7 @@ class DaskExecutor(Executor):
             return self._client.submit(
                 run_on_dask, name, index, pack(point), start, self._time_limit, key=key, pure=False
             )
-        except ClosedClientError as error:
+        except _GONE as error:
             raise _given_up(error) from error
 
     def _send(self, task: PickledTask) -> str:
@@ -132,16 +142,25 @@ class DaskExecutor(Executor):
             name = f"vtbdrake-{task.digest}-{uuid.uuid4().hex}"
             try:
                 self._client.register_plugin(TaskPlugin(task), name=name)
+            except _GONE as error:
+                raise _given_up(error) from error
             except Exception as error:
+                if self._client.status != "running":
+                    raise _given_up(error) from error
                 raise WorkerError(
                     f"the Dask workers cannot read the problem ({type(error).__name__}: {error}): they need the same "
                     "vtbdrake as this process"
                 ) from error
             self._sent[task.digest] = name
             if len(self._sent) > _TASKS:
-                self._client.unregister_worker_plugin(self._sent.popitem(last=False)[1])
+                self._forget(self._sent.popitem(last=False)[1])
         self._sent.move_to_end(task.digest)
         return self._sent[task.digest]
+
+    def _forget(self, name: str) -> None:
+        """Remove a task from the workers; without a scheduler there are none."""
+        with suppress(*_GONE):
+            self._client.unregister_worker_plugin(name)
 
     def _room(self) -> int:
         if self._limit is not None:
@@ -149,7 +168,7 @@ class DaskExecutor(Executor):
         if time.monotonic() >= self._counted + _SIZE_PERIOD:
             try:
                 self._threads = sum(self._client.nthreads().values())
-            except OSError as error:
+            except _GONE as error:
                 raise _given_up(error) from error
             self._counted = time.monotonic()
         return max(2, 2 * self._threads)
@@ -158,7 +177,7 @@ class DaskExecutor(Executor):
         """Remove the tasks from the workers; close the client, unless it belongs to the user."""
         if self._client.status == "running":
             for name in self._sent.values():
-                self._client.unregister_worker_plugin(name)
+                self._forget(name)
         self._sent.clear()
         if self._own:
             self._client.close()
@@ -175,6 +194,24 @@ def _connected(address: str | None) -> Client:
         return Client(address, set_as_default=False)
     except (OSError, TimeoutError) as error:
         raise WorkerError(f"no Dask scheduler answers at {address}: start one with `dask scheduler`") from error
+
+
+def _report_no_workers(client: Client, ended: threading.Event) -> None:
+    """Log a warning, again and again, while a cluster has no worker."""
+    since = time.monotonic()
+    while not ended.wait(NO_WORKERS):
+        try:
+            if client.nthreads():
+                since = time.monotonic()
+                continue
+        except Exception:  # The scheduler is gone, which the executor reports.
+            return
+        waited = time.monotonic() - since
+        _log.warning(
+            "no Dask worker for %.0f s: the rollouts wait for one; start `dask worker %s`, or interrupt the run",
+            waited,
+            client.scheduler_info()["address"],
+        )
 
 
 def _given_up(error: BaseException) -> WorkerError:
