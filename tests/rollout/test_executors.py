@@ -208,7 +208,7 @@ EXECUTORS = {
     "thread pool": lambda get: FuturesExecutor(ThreadPoolExecutor(2)),
     "process pool": lambda get: FuturesExecutor(get("process_pool")),
     "loky": lambda get: FuturesExecutor(get("loky_pool")),
-    "ray": lambda get: FuturesExecutor(get("ray_pool")),
+    "own pool": lambda get: FuturesExecutor(get("own_pool")),
     "dask": lambda get: DaskExecutor(get("cluster").client),
 }
 

@@ -2,10 +2,6 @@
 
 import concurrent.futures
 import os
-import shutil
-import subprocess
-import sys
-import textwrap
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
@@ -29,7 +25,7 @@ SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
 TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
 ROOT = Path(__file__).resolve().parents[2]
-POOLS = ["process_pool", "loky_pool", "ray_pool"]
+POOLS = ["process_pool", "loky_pool", "own_pool"]
 
 
 def _points(count):
@@ -163,45 +159,6 @@ def test_broken_pool_without_replacement_loses_its_rollouts(make, error, tmp_pat
     assert [results[i].failed for i in range(3)] == [False, False, True]
     assert f"the pool broke while it had this rollout ({error}: " in results[2].message
     assert results[2].parameters == points[2]
-
-
-def test_ray_repeats_a_lost_rollout(ray_pool, tmp_path):
-    fuse = tmp_path / "fuse"
-    fuse.touch()
-    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.5, Quality(abs, SHOULDER))
-    results = dict(FuturesExecutor(ray_pool).run(task, [{"dps.gain[0]": gain} for gain in (0.0, KILL, 0.0, 0.0)]))
-    assert not fuse.exists()
-    assert not any(result.failed for result in results.values())
-
-
-def test_mpi_gives_identical_results(tmp_path):
-    pytest.importorskip("mpi4py")
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    mpiexec = shutil.which("mpiexec", path=path)
-    if mpiexec is None:
-        pytest.skip("no MPI here")
-    script = tmp_path / "script.py"
-    script.write_text(
-        textwrap.dedent("""
-            from mpi4py.futures import MPIPoolExecutor
-            from tests.rollout.test_futures import TASK, _points
-            from vtbdrake.rollout import FuturesExecutor, SerialExecutor
-
-            if __name__ == "__main__":
-                expected = dict(SerialExecutor().run(TASK, _points(12)))
-                with MPIPoolExecutor() as pool:
-                    results = dict(FuturesExecutor(pool).run(TASK, _points(12)))
-                    print(pool.num_workers, [results[i].identical(expected[i]) for i in range(12)].count(True))
-        """)
-    )
-    done = subprocess.run(
-        [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.stdout.split() == ["2", "12"], done.stderr
 
 
 def test_pool_after_shutdown_is_an_error():

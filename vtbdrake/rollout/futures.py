@@ -1,4 +1,4 @@
-"""Rollouts on any pool with the interface of `concurrent.futures`: the standard library's, loky's, mpi4py's, Ray's."""
+"""Rollouts on any pool with the interface of `concurrent.futures`."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class FuturesExecutor(Executor):
     unfinished rollouts, so that only the one that kills its process fails. With other pools, the rollouts under way
     fail, and the others end with a `WorkerError`. Any other error of the pool is raised unchanged.
 
-    Ray has no such pool. Write a subclass of `concurrent.futures.Executor` whose ``submit(fn, *args)`` returns
-    ``ray.remote(fn).remote(*args).future()``, and whose ``num_workers`` is the number that run at a time.
+    Any subclass of `concurrent.futures.Executor` will do whose ``submit(fn, *args)`` returns a
+    `concurrent.futures.Future`; if it has an attribute ``num_workers``, that is the number that run at a time.
 
     Args:
         pool: The pool that runs the rollouts.
@@ -136,7 +136,7 @@ class FuturesExecutor(Executor):
 
 
 def _workers(pool: concurrent.futures.Executor) -> int:
-    """Return the number of workers: public in mpi4py, private in the standard library and loky."""
+    """Return the number of workers: that which a pool states, or the private one of the standard library and loky."""
     return int(getattr(pool, "num_workers", None) or getattr(pool, "_max_workers", None) or cores())
 
 
