@@ -31,6 +31,8 @@ SEEDS = range(5)
 # Below this part of a typical gap, an optimum counts as found.
 SOLVED = 1e-4
 GOAL = 1.5
+# The penalty of a violation of 1, far above the multiplier of the constraint.
+PENALTY = 10.0
 AUTO, STUDY = "auto", "study"
 
 ANGLE, RATE, DAMPING = (f"sim.sys.Pendulum.theta.{name}" for name in ("position", "velocity", "damping"))
@@ -50,6 +52,8 @@ class Case:
         true: The cost without noise, which is compared; None if `cost` has no noise.
         corner: The reference point of the hypervolume of two costs.
         rollouts: The number of rollouts of an evaluation.
+        violation: A constraint, which holds where it is at most 0; None if there is none. Only points that keep it
+            count. Solvers that take no constraints get the cost with `PENALTY` times the violation.
     """
 
     cost: Callable[[Point], Costs]
@@ -58,10 +62,17 @@ class Case:
     true: Callable[[Point], Costs] | None = None
     corner: tuple[float, float] | None = None
     rollouts: int = 1
+    violation: Callable[[Point], float] | None = None
 
     @property
     def objectives(self) -> int:
         return 2 if self.corner else 1
+
+    def penalized(self, point: Point) -> Costs:
+        """The costs, with the penalty of a violated constraint."""
+        costs = self.cost(point)
+        beyond = 0.0 if self.violation is None else max(self.violation(point), 0.0)
+        return tuple(cost + PENALTY * beyond for cost in costs)
 
 
 # ------------------------------------------------------------------------------ public test functions
@@ -127,6 +138,29 @@ def _noisy(p: Point) -> Costs:
     """Hartmann's function of three variables with noise that is normal, and the same whenever a point is repeated."""
     seed = np.array(p).view(np.uint32).tolist()
     return (_hartmann(p)[0] + 0.1 * float(np.random.default_rng(seed).standard_normal()),)
+
+
+# The wells, their places as columns, of Shekel's function of four variables and ten wells, and their depths.
+_SHEKEL = np.array(
+    [
+        [4, 1, 8, 6, 3, 2, 5, 8, 6, 7.0],
+        [4, 1, 8, 6, 7, 9, 5, 1, 2, 3.6],
+        [4, 1, 8, 6, 3, 2, 3, 8, 6, 7.0],
+        [4, 1, 8, 6, 7, 9, 3, 1, 2, 3.6],
+    ]
+)
+_SHEKEL_DEPTH = np.array([0.1, 0.2, 0.2, 0.4, 0.4, 0.6, 0.3, 0.7, 0.5, 0.5])
+
+
+def _shekel(p: Point) -> Costs:
+    """Narrow wells in a plain: a search that has found one does not see the others."""
+    distance = np.sum((np.array(p)[:, np.newaxis] - _SHEKEL) ** 2, axis=0)
+    return (float(-np.sum(1.0 / (distance + _SHEKEL_DEPTH))),)
+
+
+def _outside_disk(p: Point) -> float:
+    """Rosenbrock's valley meets the unit circle at its best point: along it the constraint is curved, too."""
+    return float(p[0] ** 2 + p[1] ** 2 - 1.0)
 
 
 def _camel(x: float, y: float) -> float:
@@ -220,6 +254,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "integers": lambda: Case(_ackley, _INTEGERS, 0.0),
     "two_qualities_fonseca": lambda: Case(_fonseca, _box(3, -4.0, 4.0), -_FONSECA, corner=(1.0, 1.0)),
     "two_qualities_zdt1": lambda: Case(_zdt1, _box(4, 0.0, 1.0), -2.0 / 3.0, corner=(1.0, 1.0)),
+    "shekel_4": lambda: Case(_shekel, _box(4, 0.0, 10.0), -10.53644315348353),
+    "curved_constraint": lambda: Case(_rosenbrock, _box(2, -1.5, 1.5), 0.0456748087, violation=_outside_disk),
     STUDY: lambda: Case(_swing, pendulum().parameters, 0.0964855, rollouts=len(DAMPINGS)),
 }
 
@@ -243,9 +279,11 @@ class _Record:
     def __call__(self, point: Point) -> Costs:
         if len(self.costs) == self._budget:
             raise _SpentError
-        self.costs.append(self._case.cost(point))
+        costs = self._case.penalized(point)
+        broken = self._case.violation is not None and self._case.violation(point) > 0.0
+        self.costs.append((math.inf,) if broken else costs)
         self.true.append(self._case.true(point) if self._case.true else self.costs[-1])
-        return self.costs[-1]
+        return costs
 
     def at(self, u: np.ndarray) -> float:
         """The cost at ``u`` in the unit cube, shape (n,)."""
@@ -275,10 +313,26 @@ def _our(name: str, record: _Record, case: Case, seed: int, budget: int) -> None
     start = None
     if name.startswith("LN_"):
         start = tuple(p.from_unit(x) for p, x in zip(case.space, np.random.default_rng(seed).random(9), strict=False))
-    solver = make_solver(name, case.space, objectives=case.objectives, seed=seed, budget=budget, start=start)
+    violation = case.violation
+    solver = make_solver(
+        name,
+        case.space,
+        objectives=case.objectives,
+        constraints=0 if violation is None else 1,
+        seed=seed,
+        budget=budget,
+        start=start,
+    )
+
+    def evaluated(point: Point) -> Evaluation:
+        costs = record(point)
+        if violation is None:
+            return Evaluation(point, tuple(-cost for cost in costs))
+        return Evaluation(point, tuple(-cost for cost in case.cost(point)), (violation(point),))
+
     try:
         while points := solver.ask():
-            solver.tell([Evaluation(point, tuple(-cost for cost in record(point))) for point in points])
+            solver.tell([evaluated(point) for point in points])
     finally:
         solver.close()
 
@@ -430,4 +484,4 @@ def _typical_gap(case: Case) -> float:
     generator = np.random.default_rng(0)
     units = generator.random((200, len(case.space)))
     points = [tuple(p.from_unit(x) for p, x in zip(case.space, u, strict=True)) for u in units]
-    return float(np.median([(case.true or case.cost)(point)[0] for point in points])) - case.lowest
+    return float(np.median([(case.true or case.penalized)(point)[0] for point in points])) - case.lowest

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-from tests.testbeds import PENDULUM, AcrobotScenario
+from tests.testbeds import PENDULUM, AcrobotScenario, PendulumScenario
 from vtbdrake.components.sensors import JointEncoders
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.reasoning import Belief, BeliefError, Starter
@@ -361,3 +361,26 @@ def test_what_is_no_belief_is_refused(tracked):
     belief = Belief.of(testbed, context)
     with pytest.raises(BeliefError, match="has not received angle"):
         Starter(mental).start(replace(belief, dps=replace(belief.dps, received={})))
+
+
+@pytest.mark.parametrize("forked", [True, False])
+@pytest.mark.parametrize("same_stops", [True, False])
+def test_perfect_beliefs_are_the_future_under_error_control_after_a_fork_and_with_the_same_stops(forked, same_stops):
+    scenario = PendulumScenario(simulator_config=SimulatorConfig(max_step_size=0.5, accuracy=1e-4))
+    theta = "sim.sys.Pendulum.theta.position"
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {theta: 0.8})
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(1.13)
+    context = simulator.get_mutable_context()
+    if forked:
+        testbed.fork(simulator)
+    task = RolloutTask(scenario, 3.0, record=[theta], sample_period=0.15)
+    runner = RolloutRunner(task)
+    forecast = runner.run({}, start=Belief.perfect(testbed, context).start(runner.testbed)).record[theta]
+    for instant in task.instants(1.13, testbed.event_timings())[1:] if same_stops else [4.13]:
+        simulator.AdvanceTo(instant)
+    future = testbed.read(context, theta)
+    assert (forecast[-1] == future) == (forked and same_stops)
+    assert abs(forecast[-1] - future) < 1e-2

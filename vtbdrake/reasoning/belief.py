@@ -83,8 +83,10 @@ class Belief:
     def perfect(cls, testbed: VirtualTestbed, context: Context) -> Belief:
         """Return a belief that equals the true simulated world: for tests, and as a bound for any estimator.
 
-        With the same scenario, a mental rollout is then the true future, see `AddressedDiagram.fork`. With another
-        mental scenario, all variables of the world that both scenarios have get their true values.
+        With the same scenario, a mental rollout is then the true future: bit for bit with a discrete plant or fixed
+        steps; under error control up to about the integrator's accuracy, unless the running simulation is forked at
+        this time and advanced to the sample times of the rollout, see `AddressedDiagram.fork`. With another mental
+        scenario, all variables of the world that both scenarios have get their true values.
 
         Raises:
             ValueError: The context belongs to another testbed.

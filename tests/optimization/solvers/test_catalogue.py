@@ -90,7 +90,7 @@ def test_what_a_solver_cannot_do_is_refused_by_name(name, arguments, message):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in known_solvers() if not {name} & {*ALGORITHMS, "SNOPT", "IPOPT", "GP"}]
+    "name", [name for name in known_solvers() if not {name} & {*ALGORITHMS, "COBYQA", "SNOPT", "IPOPT", "GP"}]
 )
 def test_batches_are_as_wide_as_asked_for(name):
     sizes = []
@@ -113,7 +113,7 @@ def test_every_stage_of_auto_is_as_wide_as_asked_for(size):
     assert all(max(sizes) >= 40 for sizes in widths.values()), widths
 
 
-@pytest.mark.parametrize("name", ["LN_BOBYQA", "SNOPT"])
+@pytest.mark.parametrize("name", ["LN_BOBYQA", "COBYQA", "SNOPT"])
 def test_a_method_of_single_points_refuses_to_be_wide(name):
     make_solver(name, box(2, 0.0, 1.0), parallel=1)
     with pytest.raises(SolverError, match=f"{name} chooses each point by the last one, and cannot evaluate 8 side by"):
@@ -222,12 +222,16 @@ def test_auto_chooses_by_the_problem(space, arguments, method):
     assert solver.method == method
 
 
+# Searches in other basins, of which there are none.
+_OTHERS = ["LN_BOBYQA in another basin"] * 3
+
+
 @pytest.mark.parametrize(
     ("size", "budget", "methods"),
     [
         (2, 30, ["bayesian"]),
         (21, 100, ["sobol", "CMA-ES, start 1, population 13"]),
-        (2, 180, ["bayesian", "LN_BOBYQA around the best", "CMA-ES, start 1, population 6"]),
+        (2, 300, ["bayesian", "LN_BOBYQA around the best", *_OTHERS, "CMA-ES, start 1, population 6"]),
     ],
 )
 def test_auto_has_a_plan_for_every_budget(size, budget, methods, short_model):
@@ -253,7 +257,7 @@ def test_the_start_takes_from_the_budget_of_auto_once():
     assert [method for _, method in solver.changes] == ["start", "bayesian"]
 
 
-@pytest.mark.parametrize(("continuous", "method"), [(2, "LN_BOBYQA around the best"), (1, "LN_COBYLA around the best")])
+@pytest.mark.parametrize(("continuous", "method"), [(2, "LN_BOBYQA around the best"), (1, "COBYQA around the best")])
 def test_auto_searches_locally_with_the_integers_held(continuous, method, short_model):
     solver = make_solver("auto", (COUNT, *box(continuous, -3.0, 4.0)), budget=150)
     log = drive(solver, lambda p: (p[0] - 2) ** 2 + sum((x - 0.1 * p[0]) ** 2 for x in p[1:]))
@@ -305,9 +309,10 @@ def test_auto_starts_anew_with_larger_populations_and_another_method(short_model
         if solver.method not in methods:
             methods.append(solver.method)
         solver.tell([evaluation(p, ACKLEY.cost) for p in points])
-    assert methods[:5] == [
+    assert methods[:6] == [
         "bayesian",
         "LN_BOBYQA around the best",
+        "LN_BOBYQA in another basin",
         "CMA-ES, start 1, population 7",
         "CMA-ES, start 2, population 14",
         "differential-evolution, start 3",
@@ -333,3 +338,18 @@ def test_auto_evaluates_the_given_start_first():
     solver = make_solver("auto", SPHERE.space, start=(3.0, 3.5))
     assert solver.ask() == [(3.0, 3.5)]
     solver.close()
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize("seed", [0, 3])
+def test_auto_leaves_a_well_that_is_not_the_deepest(seed):
+    """Shekel's function: ten narrow wells; the second one is half as deep as the first."""
+    wells = np.array([[4.0, 4], [1, 1], [8, 8], [6, 6], [3, 7], [2, 9], [5, 3], [8, 1], [6, 2], [7, 3.6]])[
+        :, [0, 1, 0, 1]
+    ]
+    wells[6] = [5.0, 5.0, 3.0, 3.0]
+    depths = np.array([0.1, 0.2, 0.2, 0.4, 0.4, 0.6, 0.3, 0.7, 0.5, 0.5])
+    solver = make_solver("auto", box(4, 0.0, 10.0), seed=seed, budget=400)
+    log = drive(solver, lambda p: float(-np.sum(1.0 / (np.sum((np.array(p) - wells) ** 2, axis=1) + depths))))
+    best = max(log, key=lambda e: e.values[0])
+    np.testing.assert_allclose(best.point, [4.0] * 4, atol=0.01)

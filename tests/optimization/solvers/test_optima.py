@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from tests.optimization.solvers.driver import (
     ACKLEY,
@@ -12,6 +13,7 @@ from tests.optimization.solvers.driver import (
     ROSENBROCK,
     SPHERE,
     Function,
+    box,
     drive,
     half_plane,
     solve,
@@ -57,7 +59,9 @@ def test_global_solvers_find_the_value_of_branin(name):
 CONSTRAINED_NLOPT = sorted(name for name, algorithm in ALGORITHMS.items() if algorithm.constraints)
 
 
-@pytest.mark.parametrize("name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", *CONSTRAINED_NLOPT])
+@pytest.mark.parametrize(
+    "name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", "COBYQA", *CONSTRAINED_NLOPT]
+)
 def test_under_a_constraint_it_finds_the_kkt_point(name):
     options = {"tolerance": 1e-5} if name == "differential-evolution" else {}
     solver, best = solve(name, CONSTRAINED, violations=half_plane, limit=4000, **options)
@@ -68,7 +72,7 @@ def test_under_a_constraint_it_finds_the_kkt_point(name):
         np.testing.assert_allclose(best.point, CONSTRAINED.best, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", ["SNOPT", "LD_SLSQP", "LN_COBYLA"])
+@pytest.mark.parametrize("name", ["SNOPT", "LD_SLSQP", "LN_COBYLA", "COBYQA"])
 def test_an_optimum_at_the_bounds_is_found(name):
     function = Function(lambda p: (p[0] - 9.0) ** 2 + np.exp(p[1]), SPHERE.space, (4.0, -3.0))
     solver, best = solve(name, function)
@@ -193,3 +197,28 @@ def test_a_front_much_smaller_than_the_costs_is_approached():
     log = drive(made, lambda p: (1e3 * p[1] ** 2 + 1e-3 * p[0], 1e3 * p[1] ** 2 - 1e-3 * p[0]))
     best = min(-e.values[0] for e in log)
     assert best < 1.0 < min(-e.values[0] for e in log[:5])
+
+
+def _best_on_the_disk(log):
+    """The distance of the best point within the unit circle from the least of Rosenbrock's function on that circle."""
+    on_circle = minimize_scalar(
+        lambda angle: ROSENBROCK.cost((np.cos(angle), np.sin(angle))), bounds=(0.0, 1.5), options={"xatol": 1e-12}
+    )
+    return min(-e.values[0] for e in log if e.violations[0] <= 0.0) - on_circle.fun
+
+
+def _beyond_the_disk(p):
+    return (p[0] ** 2 + p[1] ** 2 - 1.0,)
+
+
+@pytest.mark.parametrize("start", [(0.2, 0.2), (-0.5, 0.5), (0.0, -0.9)])
+def test_cobyqa_follows_a_curved_constraint(start):
+    solver = make_solver("COBYQA", box(2, -1.5, 1.5), constraints=1, start=start, budget=120)
+    assert _best_on_the_disk(drive(solver, ROSENBROCK.cost, violations=_beyond_the_disk)) < 1e-6
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize("seed", [0, 1])
+def test_auto_follows_a_curved_constraint(seed):
+    solver = make_solver("auto", box(2, -1.5, 1.5), constraints=1, seed=seed, budget=300)
+    assert _best_on_the_disk(drive(solver, ROSENBROCK.cost, violations=_beyond_the_disk)) < 1e-6

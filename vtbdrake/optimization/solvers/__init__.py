@@ -11,6 +11,7 @@ from typing import Any
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers.auto import Auto
 from vtbdrake.optimization.solvers.bayesian import Bayesian
+from vtbdrake.optimization.solvers.cobyqa import Cobyqa
 from vtbdrake.optimization.solvers.designs import Grid, LatinHypercube, RandomSearch, Sobol
 from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS, Ipopt, Nlopt, Snopt
 from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution
@@ -36,6 +37,7 @@ CATALOGUE: Mapping[str, type[Solver]] = {
     **dict.fromkeys(SAMPLERS, OptunaSolver),
     "SNOPT": Snopt,
     "IPOPT": Ipopt,
+    "COBYQA": Cobyqa,
     **dict.fromkeys(ALGORITHMS, Nlopt),
 }
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.solvers.bayesian import Bayesian
+from vtbdrake.optimization.solvers.cobyqa import Cobyqa
 from vtbdrake.optimization.solvers.designs import Grid, Listed, Sobol, discrete_size
 from vtbdrake.optimization.solvers.drake_solvers import Nlopt
 from vtbdrake.optimization.solvers.evolution import CmaEs, DifferentialEvolution, default_population
@@ -29,6 +31,8 @@ MODEL_SIZE = 20
 MODEL_POINTS, MODEL_LIMIT, MODEL_BATCHES = 25, 120, 4
 # Half widths of the boxes of local searches, as parts of the ranges: after the model, and last.
 LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
+# The same for searches in other basins, which end with this tolerance; so many in a row may find nothing better.
+BASIN_RADIUS, BASIN_TOLERANCE, BASINS = 0.2, 1e-3, 3
 
 
 class Auto(Solver):
@@ -38,8 +42,10 @@ class Auto(Solver):
       objective: a grid;
     * several objectives, or a categorical parameter: Bayesian optimization to the end;
     * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most; a local search from its
-      best point, for at most a third of the remaining budget; then CMA-ES from the best point. If the budget left for
-      CMA-ES is less than ten generations, Bayesian optimization gets all of it;
+      best point, for at most a third of the remaining budget, and another one while it ends at the border of its box;
+      local searches from the best points outside of the basins that were searched, until three in a row have found
+      nothing better; then CMA-ES from the best point. If the budget left for CMA-ES is less than ten generations,
+      Bayesian optimization gets all of it;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
     Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations. If more
@@ -53,8 +59,8 @@ class Auto(Solver):
     better than that of the model, a tenth of the budget at most goes into another local search, and the rest into
     Bayesian optimization.
 
-    The local searches (BOBYQA, or COBYLA with constraints or one continuous parameter) stay in a box around the best
-    point and hold its integers. They need at most 20 parameters, of which at least one is continuous.
+    The local searches (BOBYQA, or COBYQA with constraints or one continuous parameter) stay in a box around the point
+    from which they begin, and hold its integers. They need at most 20 parameters, of which at least one is continuous.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
     """
@@ -71,6 +77,8 @@ class Auto(Solver):
         self._limit = math.inf
         # The start of a local search, whose integers are held.
         self._held: Point | None = None
+        # The starts of all local searches.
+        self._searched: list[Point] = []
         self._stage_best: Evaluation | None = None
         self._without_progress = 0
         # The evaluations of the first stages; a new model is fitted to them.
@@ -118,8 +126,8 @@ class Auto(Solver):
         yield
         found = self._best
         if found is not None and self._has_local:
-            self._begin_local(radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
-            yield
+            yield from self._descent(found.point)
+            yield from self._other_basins()
         fruitless, start = 0, 0
         while fruitless < PATIENCE and self._left_but_polish() > 0:
             before = self._best
@@ -128,7 +136,8 @@ class Auto(Solver):
             start += 1
             fruitless = 0 if self._progress(before, self._best) else fruitless + 1
         if self._has_local and self._progress(found, self._best):
-            self._begin_local(radius=POLISH_RADIUS, limit=math.inf)
+            assert self._best is not None
+            self._begin_local(self._best.point, radius=POLISH_RADIUS, limit=math.inf)
             yield
         if fruitless == PATIENCE:
             self._end(True, f"{PATIENCE} starts in a row found nothing better")
@@ -137,6 +146,41 @@ class Auto(Solver):
             self._begin_model()
             yield
         self._spent()
+
+    def _descent(self, start: Point) -> Iterator[None]:
+        """Search locally from a point; go on in another box while the best point lies at the border of its own."""
+        while self._left_but_polish() > 0:
+            self._begin_local(start, radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
+            yield
+            end = self._stage_best
+            if end is None:
+                return
+            u, moved = self.search.unit(end.point), np.abs(self.search.unit(end.point) - self.search.unit(start))
+            if not ((moved > 0.99 * LOCAL_RADIUS) & (u > 0.0) & (u < 1.0))[self._continuous].any():
+                return
+            start = end.point
+
+    def _other_basins(self) -> Iterator[None]:
+        """Search locally from the best points that lie outside of the basins known so far, while that pays."""
+        fruitless = 0
+        while fruitless < BASINS and self._left_but_polish() > self._local_limit:
+            start = self._outside()
+            if start is None:
+                return
+            before = self._best
+            self._begin_local(start, radius=BASIN_RADIUS, limit=math.inf, tolerance=BASIN_TOLERANCE)
+            yield
+            fruitless = 0 if self._progress(before, self._best) else fruitless + 1
+
+    def _outside(self) -> Point | None:
+        """Return the best point of the model that is far from the starts and ends of all local searches."""
+        assert self._best is not None
+        centres = [self.search.unit(point) for point in [*self._searched, self._best.point]]
+        for evaluation in sorted((e for e in self._before if e.counts), key=rank_key):
+            u = self.search.unit(evaluation.point)
+            if all(np.abs(u - centre).max() > LOCAL_RADIUS for centre in centres):
+                return evaluation.point
+        return None
 
     def _begin_model(self) -> None:
         """Begin the Gaussian process, or for many parameters a design."""
@@ -204,20 +248,23 @@ class Auto(Solver):
         reserve = min(self.search.budget // 10, self._local_limit) if self._has_local else 0
         return self._left - reserve
 
-    def _begin_local(self, *, radius: float, limit: float) -> None:
-        """Begin a local search at the best point, whose integers are held."""
-        assert self._best is not None
-        best, varied = self._best.point, self._continuous
-        u = self.search.unit(best)
+    def _begin_local(self, start: Point, *, radius: float, limit: float, tolerance: float | None = None) -> None:
+        """Begin a local search at a point, whose integers are held."""
+        varied = self._continuous
+        u = self.search.unit(start)
+        self._searched.append(start)
         lower = self.search.point(np.maximum(u - radius, 0.0))
         upper = self.search.point(np.minimum(u + radius, 1.0))
         box = tuple(_between(self.search.space[i], lower[i], upper[i]) for i in varied)
         # BOBYQA takes no constraints, and at least two parameters.
-        name = "LN_COBYLA" if self.search.constraints or len(varied) == 1 else "LN_BOBYQA"
+        name = "COBYQA" if self.search.constraints or len(varied) == 1 else "LN_BOBYQA"
         budget = int(max(1, min(limit, self._local_limit)))
-        search = replace(self.search, space=box, start=tuple(best[i] for i in varied), budget=budget)
-        self._begin(f"{name} around the best", Nlopt(search, name=name))
-        self._held = best
+        search = replace(self.search, space=box, start=tuple(start[i] for i in varied), budget=budget)
+        place = "around the best" if self._best is None or start == self._best.point else "in another basin"
+        options: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
+        make = Cobyqa if name == "COBYQA" else Nlopt
+        self._begin(f"{name} {place}", make(search, name=name, **options))
+        self._held = start
 
     # -- its steps
 
