@@ -14,14 +14,20 @@ SETTLED = 20
 JITTER = 3.0
 """Number of periods by which the first message of the window may come late, and the last one."""
 
+PAUSE = 4.0
+"""Number of periods: a longer time between two messages is a pause, and counts for no more."""
+
 
 class PaceMonitor:
     """Compares the times between the messages that begin a loop's cycles with the period of the DPS.
 
     Every cycle advances the DPS by one period. If the messages come at another pace, its time is not that of the
-    machine, and its controllers and filters compute with a wrong period. The pace differs if the median of the last
-    `WINDOW` times is further from the period than the tolerance, and their sum from as many periods to the same side,
-    by `JITTER` periods more. The sum alone would be changed by a pause, the median alone by messages in pairs.
+    machine, and its controllers and filters compute with a wrong period.
+
+    Of the last `WINDOW` times, none of which counts for more than `PAUSE` periods, the pace is too quick if half are
+    too short by more than the tolerance, and so is their sum, by `JITTER` periods more. The sum alone would be changed
+    by a late message, the half by messages in pairs. The pace is too slow if nine of ten are too long, and so is
+    their sum: on a busy computer, where a machine loses time, its times vary.
 
     Args:
         signal: Name of the sensor signal whose messages begin the cycles.
@@ -35,7 +41,7 @@ class PaceMonitor:
         self.tolerance = tolerance
         self._times: deque[float] = deque(maxlen=WINDOW)
         self._total = 0.0
-        self._quick = self._slow = 0  # number of times that are too short, and too long
+        self._short = self._long = 0  # number of times that are too short, and too long
         self._last: float | None = None
 
     def note(self, at: float) -> None:
@@ -51,8 +57,9 @@ class PaceMonitor:
             return
         if len(self._times) == WINDOW:
             self._count(self._times[0], -1)
-        self._times.append(at - last)
-        self._count(at - last, 1)
+        time = min(at - last, PAUSE * self.period)
+        self._times.append(time)
+        self._count(time, 1)
 
     @property
     def unknown(self) -> str | None:
@@ -66,17 +73,17 @@ class PaceMonitor:
         """How the pace differs from the period, as a sentence; None if it does not, or is not known yet."""
         count = len(self._times)
         excess, allowed = self._total - count * self.period, (count * self.tolerance + JITTER) * self.period
-        quick = 2 * self._quick > count and excess < -allowed
-        slow = 2 * self._slow > count and excess > allowed
+        quick = self._short > 0.5 * count and excess < -allowed
+        slow = self._long >= 0.9 * count and excess > allowed
         if count < SETTLED or not (quick or slow):
             return None
         return (
-            f"the messages of {self.signal} come every {1e3 * self._total / count:.4g} ms, but the period of the DPS "
-            f"is {1e3 * self.period:g} ms (a difference of {100.0 * self.tolerance:g} % is allowed): give the machine "
-            "and the deployment the same period"
+            f"the messages of {self.signal} come about every {1e3 * self._total / count:.4g} ms, but the period of the "
+            f"DPS is {1e3 * self.period:g} ms (a difference of {100.0 * self.tolerance:g} % is allowed): give the "
+            "machine and the deployment the same period"
         )
 
     def _count(self, time: float, number: int) -> None:
         self._total += number * time
-        self._quick += number * (time < (1.0 - self.tolerance) * self.period)
-        self._slow += number * (time > (1.0 + self.tolerance) * self.period)
+        self._short += number * (time < (1.0 - self.tolerance) * self.period)
+        self._long += number * (time > (1.0 + self.tolerance) * self.period)

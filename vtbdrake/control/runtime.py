@@ -49,7 +49,7 @@ class Runtime(Stepped):
     cycle is left out and counted, and never caught up with, so that no burst of old commands is sent.
 
     A loop that messages pace checks that they come once per period: by its clock, or by the machine's time stamps if
-    the signal has no ``max_age`` (in lock-step, where the machine waits). Another pace prevents a switch to real, and
+    no signal has a ``max_age`` (in lock-step, where the machine waits). Another pace prevents a switch to real, and
     is a fault afterwards; how much may differ is an option of the guards. The rates of commands are limited by the time
     that has passed since the last ones, so they hold even if the pace is wrong, or if cycles are run by hand.
 
@@ -361,7 +361,7 @@ class Runtime(Stepped):
     @property
     def _in_lock_step(self) -> bool:
         """Whether the machine's time may stand still, so that it is told by the stamps of the messages that pace."""
-        return self.pace is not None and self.guards.monitors[self.pace].max_age == inf
+        return self.pace is not None and all(monitor.max_age == inf for monitor in self.guards.monitors.values())
 
     def _check_pace(self) -> str | None:
         """Note the message that has begun this cycle; return how the pace differs from the period, or None."""
