@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box
+from pydrake.geometry import Box, Ellipsoid, Mesh, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, SpatialInertia
@@ -23,6 +23,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.stats import norm
 
 from vtbdrake.components.environment import Haze, Light, LightConfig
+from vtbdrake.components.meshes import surface_mesh, unit_sphere
 from vtbdrake.components.rendering import RenderingError
 from vtbdrake.components.sensors import ErrorModel, uniform_noise
 from vtbdrake.components.sensors.camera import Camera, connect_camera
@@ -414,6 +415,33 @@ def test_lone_box_is_not_in_its_own_shadow(angle_deg: float) -> None:
     shaded, flat = (scene.render(scene.context()) for scene in seen)
     assert flat.max() > 0
     np.testing.assert_array_equal(shaded, flat)
+
+
+@pytest.mark.parametrize(
+    ("shape", "deepest"),
+    [(Sphere(1.0), 2.3e-3), (Ellipsoid(1.0, 1.0, 1.0), 2.3e-3), (Mesh(surface_mesh(unit_sphere(5))), 3e-4)],
+)
+def test_facets_of_spheres_lie_as_far_below_as_the_docs_say(shape: Shape, deepest: float) -> None:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    plant.RegisterVisualGeometry(
+        plant.world_body(), RigidTransform([0.0, 0.0, 3.0]), shape, "ball", [0.5, 0.5, 0.5, 1.0]
+    )
+    plant.Finalize()
+    info = CameraInfo(200, 200, 0.7)
+    options = {"period": PERIOD, "info": info, "depth": True}
+    camera = builder.AddNamedSystem("camera", Camera(plant, plant.world_frame(), **options))
+    connect_camera(builder, camera, scene_graph)
+    simulator = Simulator(builder.Build())
+    simulator.Initialize()
+    context = camera.GetMyContextFromRoot(simulator.get_context())
+    depth = camera.GetOutputPort("depth_image").Eval(context).data[..., 0]
+    x, y = np.meshgrid(*[(np.arange(200) + 0.5 - info.center_x()) / info.focal_x()] * 2)
+    seen = np.isfinite(depth)
+    points = np.dstack((x, y, np.ones_like(x)))[seen] * depth[seen][:, np.newaxis] - [0.0, 0.0, 3.0]
+    below = 1.0 - np.linalg.norm(points, axis=1)
+    assert 0.7 * deepest < below.max() < deepest
+    assert below.min() > -1e-5
 
 
 def posts(count: int = 40) -> list[tuple[np.ndarray, np.ndarray]]:
