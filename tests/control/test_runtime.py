@@ -398,6 +398,26 @@ def test_measurement_of_the_opposite_sign_is_told():
     assert "it would fit with the opposite sign: the machine may measure with another sign" in refusal(runtime)
 
 
+@pytest.mark.parametrize("rate", [0.0, 2.0])
+@pytest.mark.parametrize("alone", [False, True])
+def test_first_command_that_does_not_continue_is_not_sent(alone, rate):
+    runtime, bridge, _ = make(alone=alone, rate=rate, continuity={"velocity": ("speed", 0.3)})
+    runtime.cycle()
+    runtime.switch("real")  # The DPS alone has no command before, and the testbed one for its simulated sensors.
+    runtime.run(cycles=3)
+    assert "velocity[0] is 0.75 away from speed[0]; 0.3 is allowed" in runtime.guards.latched[0].reason
+    assert bridge.sent == []
+    with pytest.raises(SwitchRefusedError, match=r"velocity\[0\] is 0.75 away from speed\[0\]"):
+        runtime.reset()
+    runtime.write({"u.target": [0.1, -0.05]})
+    runtime.run(cycles=3)
+    runtime.reset()
+    runtime.run(cycles=2)
+    assert runtime.guards.latched == ()
+    step = 2.0 * PERIOD if rate else 0.3
+    assert len(bridge.sent) == 2 and np.abs(sent(bridge)[0]).max() <= step * (1.0 + 1e-9)
+
+
 def test_rate_limit_without_continuity_is_refused():
     runtime, _, _ = make()
     runtime.cycle()

@@ -44,12 +44,18 @@ class Session:
 
 @contextmanager
 def session(
-    mode: str, *, offset: float = 0.0, record: Path | None = None, deployment: Deployment | None = None
+    mode: str,
+    *,
+    alone: bool = False,
+    offset: float = 0.0,
+    record: Path | None = None,
+    deployment: Deployment | None = None,
 ) -> Iterator[Session]:
     scenario = IiwaScenario(mode=mode)
+    target = vtb.DpsAlone(scenario) if alone else scenario.build()
     with (
         vtb.Hub(port=0, protect=["IIWA_COMMAND"]) as hub,
-        scenario.deploy(hub.url, target=scenario.build(), record=record, deployment=deployment) as runtime,
+        scenario.deploy(hub.url, target=target, record=record, deployment=deployment) as runtime,
         DrakeIiwa(hub.url, mode, offset=offset) as arm,
     ):
         yield Session(runtime, arm)
@@ -130,6 +136,43 @@ def test_a_wide_limit_lets_them_kick_the_arm() -> None:
         s.runtime.switch("real")
         s.run(2)
     assert s.largest_jump() == pytest.approx(60.8 - JUMP, abs=0.1)
+
+
+def test_dps_alone_takes_over_without_a_kick() -> None:
+    with session(TORQUE, alone=True, offset=0.004) as s:
+        s.run(2)
+        s.runtime.switch("real")
+        s.run(20)
+        assert s.runtime.guards.latched == ()
+    assert 0.0 < s.largest_jump() < JUMP
+
+
+def test_dps_alone_sends_nothing_if_its_first_command_is_discontinuous() -> None:
+    with session(TORQUE, alone=True, deployment=raw("joint_torque_added")) as s:
+        s.run(2)
+        s.runtime.switch("real")
+        s.run(20)
+        (fault,) = s.runtime.guards.latched
+        assert "joint_torque[1] is 60.8 away from joint_torque_added[1]; 2.5 is allowed" in fault.reason
+        with pytest.raises(SwitchRefusedError, match=r"joint_torque\[1\] is 60.8 away"):
+            s.runtime.reset()
+    assert s.runtime.bridge.sent["joint_torque"].count == 0  # type: ignore[attr-defined]
+    assert s.largest_jump() < 1e-9
+
+
+def test_dps_alone_takes_over_by_a_reset_when_it_continues() -> None:
+    with session(TORQUE, alone=True, offset=0.05) as s:
+        s.run(2)
+        s.runtime.switch("real")
+        s.run(10)
+        assert "is 15 away" in s.runtime.guards.latched[0].reason
+        s.runtime.write({"u.target": HOME + 0.05})
+        s.run(60)
+        s.runtime.reset()
+        s.run(20)
+        assert s.runtime.guards.latched == ()
+        assert s.runtime.bridge.sent["joint_torque"].count == 20  # type: ignore[attr-defined]
+    assert s.largest_jump() < JUMP
 
 
 class Ear:

@@ -142,6 +142,7 @@ class Guards:
         self._silent: frozenset[str] = frozenset()
         # Actuator signals of which no command has left since their start, or since the loop itself has paused.
         self._departing: frozenset[str] = frozenset()
+        self._withheld: frozenset[str] = frozenset()  # actuator signals of which nothing is sent until a reset
         # Whether `note_unsent` has not been called since the last verdict.
         self._unconfirmed = False
 
@@ -172,6 +173,11 @@ class Guards:
         """
         self.limiters[name].start_from(value)
         self._departing |= {name}
+
+    def withhold(self, name: str) -> None:
+        """Send nothing of an actuator signal until `reset`, not even a fallback's command."""
+        self.limiters[name].release()
+        self._withheld |= {name}
 
     def sensor_faults(self, name: str, now: float, received: ReceivedSignal) -> list[str]:
         """Return the reasons why a sensor signal cannot be relied on at the time ``now``."""
@@ -221,6 +227,8 @@ class Guards:
         wanted = []
         if error is None:
             for name in self._active:
+                if name in self._withheld:
+                    continue
                 limiter: Any = self.limiters[name]
                 try:
                     if name not in actuation:
@@ -301,7 +309,7 @@ class Guards:
             self._accept_steady()
             if self._latched:
                 _log.warning("the DPS commands again: the guards were reset")
-            self._latched = ()
+            self._latched, self._withheld = (), frozenset()
         return reasons
 
     def _activate(self, names: tuple[str, ...], now: float) -> None:
@@ -321,6 +329,7 @@ class Guards:
             if released or now >= end or not self.limiters[name].has_start:
                 self.limiters[name].release()
                 self._departing -= {name}
+                self._withheld -= {name}
                 del self._leaving[name]
 
     def _general_faults(
@@ -360,7 +369,7 @@ class Guards:
                 faults.append(Fault(now, name, "not sent", reason))
             limiter, sensor = self.limiters[name], self.measured_by.get(name)
             free = count > self._most_unsent or name in self._departing
-            if not free or sensor is None or not limiter.needs_start:
+            if not free or sensor is None or not limiter.needs_start or name in self._withheld:
                 continue
             measured = received.get(sensor) or others.get(sensor)
             if measured is not None and self.monitors[sensor].check(now, measured) is None:

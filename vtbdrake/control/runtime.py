@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
 from math import floor, inf, isnan, nan
 from typing import Any, Self
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
@@ -26,6 +27,7 @@ from vtbdrake.control.switching import (
     SwitchRefusedError,
     checked_continuity,
     discontinuities,
+    discontinuity,
     perform,
     prepare,
 )
@@ -78,6 +80,7 @@ class Runtime(Stepped):
             missed cycles.
         continuity: Actuator signal -> (sensor signal, largest difference): a switch to real is refused while they
             differ by more, in any entry. Commands depart from that sensor signal, also after a time in which none left.
+            The first command is compared again, and if it differs by more, the guards latch and nothing is sent.
             With the sensor signal alone, the largest difference is what the rate of the actuator signal allows in a
             period. None, as for a signal that is left out: its commands may jump.
         blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None.
@@ -92,6 +95,8 @@ class Runtime(Stepped):
     Attributes:
         cycles: Number of cycles so far.
         slow_parts: The slow parts of the DPS, with their statistics.
+        uncompared: The actuator signals whose first command since their switch to real is still to be compared with
+            what is measured.
 
     Raises:
         ValueError: An argument does not fit the target or the period, or a paced loop has a `SimulatedClock`.
@@ -151,6 +156,7 @@ class Runtime(Stepped):
         self._longest_gap = max(min(ages, default=inf), (MOST_UNSENT + 1) * period)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
+        self.uncompared: set[str] = set()
         self._foreign = bridge.foreign
         self._logged_foreign = -inf
         self.slow_parts = SlowParts(
@@ -284,6 +290,7 @@ class Runtime(Stepped):
         fed = self.clock.now()
         error, actuation = self.step()
         stepped = self.clock.now()
+        discontinuous = self._compare_first(actuation) if self.uncompared else None
         verdict = self.guards.check(
             stepped,  # After the step: a long one makes the samples, and with them the commands, stale.
             self.watched,
@@ -291,7 +298,7 @@ class Runtime(Stepped):
             active,
             error=error,
             missed=self.statistics.run + self._overrun(lateness, stepped - begin),
-            blocked=self.blocked_reason() if active else None,
+            blocked=discontinuous or (self.blocked_reason() if active else None),
             pace=pace,
             at=self._time_of_commands(due, stepped),
             released=bool(self.guards.leaving) and self._released,
@@ -315,6 +322,19 @@ class Runtime(Stepped):
                 _log.exception("a watcher of the loop raised, and is removed")
                 self._watchers.remove(watcher)
         return done
+
+    def _compare_first(self, actuation: Mapping[str, Any]) -> str | None:
+        """Withhold the first commands of a DPS that do not continue what is measured, and return why."""
+        reasons = []
+        for name in self.uncompared & actuation.keys():
+            command = np.asarray(actuation[name], dtype=float)
+            if not np.isfinite(command).all():
+                continue  # This is a fault of its own.
+            self.uncompared.remove(name)
+            if found := discontinuity(self, name, command):
+                reasons += found
+                self.guards.withhold(name)
+        return "; ".join(reasons) or None
 
     def _read_waiting(self) -> bool:
         """Receive all that has waited since the last run, and return whether it begins a cycle of a paced loop."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,9 +138,8 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
                     f"from: give continuity={{{name!r}: (sensor signal, largest difference)}}"
                 )
             continue
-        sensor, limit = runtime.continuity[name]
-        measured = runtime.bridge.sensed[sensor].value
-        if measured is None:
+        sensor, _ = runtime.continuity[name]
+        if runtime.bridge.sensed[sensor].value is None:
             found.append(f"the actuator command {name} departs from {sensor}, which has never been measured")
             continue
         try:
@@ -148,30 +147,28 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
         except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
             found.append(f"the actuator command {name} cannot be computed: {type(error).__name__}: {error}")
             continue
-        if command is None:
-            continue  # A DPS that has not started has no command.
-        gap = np.abs(command - measured)
-        if not (gap <= limit).all():
-            found.append(_discontinuity(name, sensor, command, measured, limit, runtime.hint))
+        if command is not None:  # A DPS that has not started has no command; its first one is compared in its cycle.
+            found += discontinuity(runtime, name, command)
     return found
 
 
-def _discontinuity(
-    name: str,
-    sensor: str,
-    command: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    hint: str,
-) -> str:
-    """Return why a command does not continue a measurement, at the entry that exceeds its limit most; and a remedy."""
+def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:
+    """Return why a command does not continue what is measured, and a remedy; empty if it does."""
+    if name not in runtime.continuity:
+        return []
+    sensor, limit = runtime.continuity[name]
+    measured = runtime.bridge.sensed[sensor].value
     gap = np.abs(command - measured)
+    if (gap <= limit).all():
+        return []
+    # The entry that exceeds its limit most; a NaN is one.
     k = int(np.argmax(np.where(gap <= limit, -np.inf, gap - limit)))
     entry = f"[{k}]" if len(gap) > 1 else ""
     reason = f"the actuator command {name}{entry} is {gap[k]:.3g} away from {sensor}{entry}; {limit[k]:g} is allowed"
+    hint = runtime.hint
     if (np.abs(command + measured) <= limit).all():
         hint = "it would fit with the opposite sign, so the machine may measure with another sign than it obeys"
-    return f"{reason}: {hint}"
+    return [f"{reason}: {hint}"]
 
 
 def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
@@ -180,6 +177,7 @@ def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]
         if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
             # The actuator commands start from the measured values; a signal that is commanded already goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
+            runtime.uncompared.add(name)
     runtime.note_change(
         SWITCH,
         {f"sense.{name}": position for name, position in senses.items()}
