@@ -195,8 +195,11 @@ class ManipulatorScenario(Scenario):
         T = self.period
         builder.add_sensor("joint_position", JointEncoders(plant, joints, period=T, errors=self.position_errors))
         builder.add_sensor("joint_velocity", JointTachometers(plant, joints, period=T, errors=self.velocity_errors))
+        weight = gravity_torque(ArmDynamics(arm))
+        # What the arm measures before its first cycle is what a controller has to continue.
         builder.add_sensor(
-            "joint_torque_measured", JointTorqueSensors(plant, joints, period=T, errors=self.torque_errors)
+            "joint_torque_measured",
+            JointTorqueSensors(plant, joints, period=T, initial=weight, errors=self.torque_errors),
         )
         builder.add_sensor("wrench", ForceTorqueSensor(plant, flange, period=T, errors=self.wrench_errors))
 
@@ -210,7 +213,7 @@ class ManipulatorScenario(Scenario):
             viscous=arm.viscous_friction,
             coulomb=arm.coulomb_friction,
             max_delay=LARGEST_DELAY,
-            initial=gravity_torque(ArmDynamics(arm)),
+            initial=weight,
         )
         builder.add("act", "drives", drives)
         builder.connect(plant.get_state_output_port(), drives.GetInputPort("state"))

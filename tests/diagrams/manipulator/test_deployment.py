@@ -20,6 +20,7 @@ from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineProcess
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
@@ -203,3 +204,17 @@ def test_first_command_after_hub_restart_continues_reported_torque() -> None:
     step = np.array(Arm().torque_rates) * scenario.period
     assert (np.abs(arm.commanded[0] - braked) <= step * (1 + 1e-9)).all()
     assert runtime.guards.latched
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_first_command_continues_what_the_resting_arm_measures(law: str) -> None:
+    scenario = ManipulatorScenario(law=law, compile=False)
+    deployment = Deployment.of(scenario).in_lock_step("wrench", wait=PATIENCE)
+    with (
+        Hub(port=0) as hub,
+        scenario.deploy(hub.url, deployment=deployment) as runtime,
+        MachineProcess(scenario, hub.url, lock_step=True, perturb=0.05, seed=1),
+    ):
+        runtime.take_over()
+        runtime.run(cycles=20)
+        assert runtime.guards.latched == ()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.systems.framework import Context, DiscreteValues
@@ -83,8 +83,8 @@ class JointTorqueSensors(SampledSensor):
         - joint_torque
 
     ``joint_torque`` (N m) holds for each of ``joints`` what its drive exerts on the child about the joint's axis: the
-    drive's torque, less what accelerates its rotor. Before the first sample it shows zeros. About restored
-    contexts, see `ForceTorqueSensor`.
+    drive's torque, less what accelerates its rotor. Before the first sample it shows ``initial``, a scalar or one
+    torque per joint. About restored contexts, see `ForceTorqueSensor`.
     """
 
     __slots__ = NO_DICT
@@ -95,6 +95,7 @@ class JointTorqueSensors(SampledSensor):
         joints: Sequence[RevoluteJoint],
         *,
         period: float,
+        initial: ArrayLike = 0.0,
         stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
@@ -110,7 +111,7 @@ class JointTorqueSensors(SampledSensor):
         self._turns = [SpatialVelocity(w=joint.revolute_axis(), v=np.zeros(3)) for joint in joints]
         super().__init__(
             "joint_torque",
-            default=np.zeros(len(joints)),
+            default=np.broadcast_to(np.asarray(initial, dtype=float), (len(joints),)),
             period=period,
             unit="N m",
             noise={"noise": (len(joints), "N m")},
