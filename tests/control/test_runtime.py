@@ -395,7 +395,7 @@ def test_measurement_of_the_opposite_sign_is_told():
     runtime.cycle()
     runtime.switch("shadow")
     runtime.run(cycles=3)
-    assert "it would fit with the opposite sign: the machine may measure with another sign" in refusal(runtime)
+    assert "it would fit with the opposite sign, so the machine may measure with another sign" in refusal(runtime)
 
 
 @pytest.mark.parametrize("rate", [0.0, 2.0])

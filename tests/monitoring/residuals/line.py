@@ -137,6 +137,8 @@ class Together:
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
-            self.driver.cycle()
-            if self.shadow is not None:
-                self.shadow.cycle()
+            for runtime in (self.driver, self.shadow):
+                if runtime is not None:
+                    # Commands are limited by the time that has passed.
+                    runtime.clock.wait_until(runtime.clock.now() + runtime.period)
+                    runtime.cycle()
