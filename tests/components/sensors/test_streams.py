@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import CameraInfo
 
 from vtbdrake.components.ray_casting import RayCaster
@@ -177,3 +177,31 @@ def test_a_noisy_sensor_without_a_name_is_refused() -> None:
     connect_to_plant(world.builder, sensor, world.plant)
     with pytest.raises(ValueError, match="JointEncoders has no name.*AddNamedSystem.*stream="):
         Simulator(world.builder.Build()).AdvanceTo(0.1)
+
+
+def test_a_noisy_sensor_in_a_diagram_without_a_name_is_refused() -> None:
+    class Noise(SampledSensor):
+        def __init__(self) -> None:
+            super().__init__("y", default=[0.0], period=PERIOD, unit="1", noise={"noise": (1, "1")}, errors=NOISE)
+
+        def _measure(self, context: Context, state: DiscreteValues) -> np.ndarray:
+            return np.zeros(1)
+
+    inner, outer = DiagramBuilder(), DiagramBuilder()
+    inner.AddNamedSystem("noise", Noise())
+    outer.AddSystem(inner.Build())
+    with pytest.raises(ValueError, match="noise is in a Diagram without a name"):
+        Simulator(outer.Build()).AdvanceTo(0.1)
+
+
+@pytest.mark.parametrize("stream", [-1, 2**64, 0.5])
+def test_impossible_streams_are_refused(stream: float) -> None:
+    with pytest.raises(ValueError, match="stream is a whole number"):
+        joint_encoders(World(), stream=stream)
+
+
+def test_exact_sensors_need_no_name() -> None:
+    world = World()
+    sensor = world.builder.AddSystem(JointEncoders(world.plant, world.joints, period=PERIOD))
+    connect_to_plant(world.builder, sensor, world.plant)
+    Simulator(world.builder.Build()).AdvanceTo(0.1)
