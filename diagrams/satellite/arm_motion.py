@@ -53,8 +53,8 @@ class ArmMotionScenario(Scenario):
 
     The plan is the command ``u.plan``; or, with ``onboard``, the decision of a reasoner that is a part of the DPS,
     ``dps.planner``. Until something else is decided, the plan is the straight path in joint space, which begins after
-    ``thinking_time``. The world is that of the capture, without the target. A mental copy has no forces: there, the
-    base moves as momentum demands.
+    ``thinking_time``; if that exceeds a limit, the arm stays. The world is that of the capture, without the target. A
+    mental copy has no forces: there, the base moves as momentum demands.
     """
 
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
@@ -106,6 +106,11 @@ class ArmMotionScenario(Scenario):
         """Return the plan of some knots, shape (n, 7): it begins after the thinking time."""
         return np.concatenate([[self.thinking_time], np.ravel(knots)])
 
+    def initial_plan(self) -> Array:
+        """Return the plan until another is decided: the straight path; or, if that exceeds a limit, to stay."""
+        move = self.move()
+        return self.plan(np.tile(move.start, (self.knots, 1)) if move.excess(move.straight) else move.straight)
+
     def mental(self) -> ArmMotionScenario:
         """Return the scenario of the mental copy: no forces, encoders without random errors."""
         errors = replace(self.joint_errors, noise=0.0, drift=0.0, dropout=0.0)
@@ -118,7 +123,7 @@ class ArmMotionScenario(Scenario):
         rate = np.concatenate((s.speeds, np.full(2, s.finger_speed)))
         idle = np.concatenate((self.start, fingers))
         size = 1 + self.knots * ARM_JOINTS
-        plan = Signal("plan", size=size, unit="s, rad", default=self.plan(self.move().straight))
+        plan = Signal("plan", size=size, unit="s, rad", default=self.initial_plan())
         return Interface(
             sense=[
                 Signal(
@@ -144,7 +149,7 @@ class ArmMotionScenario(Scenario):
             offset=_FIRST,
             period=2.0 * self.horizon,
             latency=self.thinking_time - _FIRST,
-            initial=self.plan(self.move().straight),
+            initial=self.initial_plan(),
             budget=Budget(rollouts=self.rollouts),
             mental=self.is_mental,
             decision=free_knots(self, CANDIDATE),

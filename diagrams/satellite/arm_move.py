@@ -49,6 +49,8 @@ REACHING = (0.0, 0.9, 0.0, 1.9, 0.0, 1.0, 0.0)
 # Instants per step of the integration at which solvers see the clearance; and by how much they keep more of it, in m,
 # because of what lies between.
 _INSTANTS_PER_STEP, _MARGIN = 2, 0.005
+# The share of the rate limits that solvers use: the servos of the full testbed add up to 6 % to the rates of a plan.
+_RATE_SHARE = 0.95
 # The accuracy of the least clearance of a plan, in m.
 _ACCURACY = 5e-4
 FEASIBILITY = 1e-5
@@ -172,8 +174,8 @@ class MoveSpace:
         """
         torques = len(self._instants[:: _STEPS_PER_PIECE // 2])
         counts = self.steps, ARM_JOINTS * torques, ARM_JOINTS * len(self.spline.bezier(1))
-        least = np.repeat([-inf, -1.0, -1.0], counts)
-        most = np.repeat([4.0 * np.sin(largest / 2.0) ** 2, 1.0, 1.0], counts)
+        least = np.repeat([-inf, -1.0, -_RATE_SHARE], counts)
+        most = np.repeat([4.0 * np.sin(largest / 2.0) ** 2, 1.0, _RATE_SHARE], counts)
         clear = np.tile(clear, len(self._watched))
         lower, upper = np.concatenate([least, clear]), np.concatenate([most, np.full(clear.size, inf)])
         return lower + 2.0 * FEASIBILITY, upper - 2.0 * FEASIBILITY * np.minimum(upper, 1.0)
@@ -300,11 +302,11 @@ class Move:
     def touched(self, knots: Array) -> list[str]:
         """Return the limits that a plan, shape (n, 7), uses to 99 %, by the names of `excess`, and ``reach``.
 
-        For the clearance that is the one which solvers keep, and ``reach`` is `REACH`.
+        For rates and clearance they are those that solvers keep, and ``reach`` is `REACH`.
         """
         servicer, motion = self.space.servicer, self.motion(knots)
         used = {
-            "rate": np.max(np.abs(self.space.spline.extremes(knots, 1)) / servicer.speeds),
+            "rate": np.max(np.abs(self.space.spline.extremes(knots, 1)) / servicer.speeds) / _RATE_SHARE,
             "torque": np.max(np.abs(motion.torque) / np.array(servicer.torques)),
             "deviation": motion.angle.max() / self.largest,
             "clearance": (CLEARANCE + _MARGIN) / self.space.clearance(knots),

@@ -84,6 +84,17 @@ def test_search_in_the_full_testbed_starts_from_the_straight_path():
     assert problem.objectives[0] is DEVIATION
 
 
+def test_an_arm_whose_straight_path_is_blocked_stays():
+    scenario = ArmMotionScenario(
+        start=(-1.6, -1.2, 0.4, 2.1, -0.8, 0.4, 1.5), goal=(1.6, -0.2, 0.7, 2.2, 1.5, -1.0, 1.9), thinking_time=0.2
+    )
+    assert "clearance" in scenario.move().excess(scenario.move().straight)
+    (plan,) = scenario.interface().commands
+    np.testing.assert_array_equal(np.reshape(plan.default[1:], (scenario.knots, 7)), [scenario.start] * scenario.knots)
+    clear = ArmMotionScenario(thinking_time=0.2)
+    np.testing.assert_array_equal(clear.initial_plan(), clear.plan(clear.move().straight))
+
+
 def test_random_motions_repeat_and_keep_the_limits():
     first, second = (random_scenarios(2, seed=5) for _ in range(2))
     assert first == second

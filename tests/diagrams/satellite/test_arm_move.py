@@ -73,7 +73,8 @@ def test_bounds_agree_with_the_limits(move):
         excess = {name for name in move.excess(knots) if name != "position"}
         if ((least <= g) & (g <= most)).all():
             assert not excess
-        elif np.max(np.maximum(least - g, g - most)) > 0.01 and excess != {"rate"}:
+        elif np.max(np.maximum(least - g, g - most)) > 0.06 and excess != {"rate"}:
+            # The solvers keep 5 % of the rates, for the servos.
             assert excess
 
 
