@@ -22,6 +22,7 @@ from vtbdrake.rollout import (
     worker_processes,
 )
 from vtbdrake.testbed import SignalError
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 THETA = "sim.sys.Pendulum.theta.position"
 
@@ -64,7 +65,7 @@ def test_command_is_named_where_the_steps_are_fixed(process, fields):
 
 @pytest.mark.parametrize("scheme", ["runge_kutta3", "implicit_euler", "cenic"])
 @pytest.mark.parametrize("bad", ["nan", "inf"])
-def test_world_that_is_not_finite_fails_at_its_first_sample(process, scheme, bad):
+def test_world_that_is_not_finite_from_the_beginning_fails(process, scheme, bad):
     failed = result(process, scheme, bad=bad, in_world=True, plant=scheme == "cenic")
     assert failed.end == "failed"
     assert "commands" not in failed.message
@@ -94,7 +95,9 @@ def guards(scenario):
 def test_guard_is_only_where_a_nan_would_never_end():
     adaptive, fixed = SimulatorConfig(integration_scheme="runge_kutta3"), SimulatorConfig(use_error_control=False)
     assert guards(NonfiniteScenario(adaptive)) == ["T_act.force.finite"]
+    assert guards(NonfiniteScenario(adaptive, plant=True)) == ["T_act.force.finite"]
     assert guards(NonfiniteScenario(fixed)) == []
+    assert guards(SpaceClimberScenario()) == []
     assert guards(NonfiniteScenario(adaptive, plant=True, time_step=0.01)) == []
     assert guards(NonfiniteScenario(SimulatorConfig(integration_scheme="cenic"), plant=True)) == []
 

@@ -270,6 +270,7 @@ class RolloutRunner:
             # Initialization events are part of a default s0; in a restored s0 they have happened already.
             params = InitializeParams(suppress_initialization_events=restored)
             self._initialized = self._simulator.Initialize(params)
+            self._refuse_nonfinite_derivatives()
         for address, value in before.items():
             after = self._variables[address].get(self._context)
             if not np.array_equal(after, value):
@@ -283,7 +284,6 @@ class RolloutRunner:
             return self._initialized  # A system may ask for the end there already.
         try:
             with _failures_as_outcomes:
-                self._refuse_nonfinite_derivatives()
                 status = self._simulator.AdvanceTo(instant)
             self._refuse_nonfinite(t)
         except SimulationError as failure:
@@ -295,9 +295,7 @@ class RolloutRunner:
         if self._controls_error:
             derivatives = self.testbed.diagram.EvalTimeDerivatives(self._context)
             if not np.isfinite(derivatives.CopyToVector()).all():
-                raise SimulationError(
-                    f"the time derivatives are not finite at t = {self._context.get_time() - self._t0:g} s"
-                )
+                raise SimulationError("the time derivatives are not finite at t = 0 s")
 
     def _with_command(self, failure: SimulationError) -> SimulationError:
         """Return the failure; if the DPS commands what is not finite, with the name of that signal."""

@@ -325,19 +325,23 @@ class VirtualTestbedBuilder:
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
 
-    def _guarded_commands(self, dps: System) -> tuple[str, ...]:
-        """Return the actuator signals whose commands are checked before they enter the simulated world.
+    def _guarded_commands(self, dps: System) -> dict[str, bool]:
+        """Return the actuator signals whose commands are checked -> whether they enter a plant, which refuses NaN.
 
         NaN and infinity make the time derivatives of a continuous world useless, and an integrator with error control
-        then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead. The check is in
-        Python. So it is there only for a DPS that computes in Python itself.
+        then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead. Before a plant,
+        systems of Drake turn infinity into NaN. Elsewhere the check is in Python, and only for a DPS that computes in
+        Python itself.
         """
-        own = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
-        if not controls_error(self.simulator_config) or not any(is_python(system) for _, system in own):
-            return ()
+        if not controls_error(self.simulator_config):
+            return {}
         if not any(system.num_continuous_states() for system in self.diagram_builder.GetSystems()):
-            return ()
-        return tuple(signal.name for signal in self.interface.act if signal.is_vector)
+            return {}
+        own = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
+        in_python = any(is_python(system) for _, system in own)
+        vectors = [signal.name for signal in self.interface.act if signal.is_vector]
+        into_plant = {name: is_plant(self.actuators[name].get_system()) for name in vectors}
+        return {name: plant for name, plant in into_plant.items() if plant or in_python}
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():
