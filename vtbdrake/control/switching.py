@@ -167,7 +167,7 @@ def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:
     reason = f"the actuator command {name}{entry} is {gap[k]:.3g} away from {sensor}{entry}; {limit[k]:g} is allowed"
     hint = runtime.hint
     if (np.abs(command + measured) <= limit).all():
-        hint = "it would fit with the opposite sign: the machine may measure with another sign than it obeys"
+        hint = "it would fit with the opposite sign, so the machine may measure with another sign than it obeys"
     return [f"{reason}: {hint}"]
 
 
