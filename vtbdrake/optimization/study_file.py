@@ -10,6 +10,7 @@ import json
 import os
 import sqlite3
 import threading
+import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -588,6 +589,9 @@ def _refuse_lost_writes(path: Path) -> None:
         return
     with _explained(path):
         lost = lost_writes(path)
+        if lost is not None:
+            time.sleep(0.05)  # A process that adds points may be about to complete a frame.
+            lost = lost_writes(path)
     if lost is not None:
         log = f"{path}-wal"
         raise StudyError(
