@@ -283,10 +283,10 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
 
 def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     """Yield the input ports that act on the plant beside its actuation, which is an argument."""
-    harmless = plant.get_actuation_input_port(), plant.get_geometry_query_input_port()
+    # By name: pydrake's getter of the actuation port would keep the plant alive for ever.
     for k in range(plant.num_input_ports()):
         port = plant.get_input_port(k)
-        if k not in [int(other.get_index()) for other in harmless] and port.HasValue(context):
+        if port.get_name() not in ("actuation", "geometry_query") and port.HasValue(context):
             yield f"the input port {port.get_name()} is connected or has a fixed value"
 
 
