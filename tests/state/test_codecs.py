@@ -116,3 +116,11 @@ def test_a_value_of_another_shape_is_refused(model, value, told):
     with pytest.raises(ValueError) as error:
         codec_of(model).encode(value)
     assert told in str(error.value)
+
+
+@pytest.mark.parametrize("value", [[1.0, 2.0], np.array([None]), 1.0])
+def test_array_of_varying_size_holds_numbers_only(value):
+    codec = codec_of(np.zeros(3), varying=True)
+    assert codec.encode(np.ones((2, 2)))[""].shape == (2, 2)
+    with pytest.raises(ValueError, match="an array of numbers is expected here"):
+        codec.encode(value)
