@@ -283,7 +283,7 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
 
 def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     """Yield the input ports that act on the plant beside its actuation, which is an argument."""
-    # By name: pydrake's getter of the actuation port would keep the plant alive for ever.
+    # By name: after calls of the getters of these ports, plants stayed alive (tests/testbed/test_memory.py).
     for k in range(plant.num_input_ports()):
         port = plant.get_input_port(k)
         if port.get_name() not in ("actuation", "geometry_query") and port.HasValue(context):
