@@ -1,0 +1,47 @@
+"""Ctrl-C in many lines of a decision: it ends, and the next decision is the one that it would have been."""
+
+import pytest
+
+from tests.interruptions import hanging_fails, interrupt, places
+from tests.reasoning.scenarios import MassScenario
+from tests.reasoning.test_reasoner import MISS, SWITCH
+from vtbdrake.optimization import evaluator
+from vtbdrake.reasoning import Belief, Budget, Reasoner, decision_run, reasoner
+from vtbdrake.rollout import SerialExecutor, ThreadExecutor, executor, runner
+
+MODULES = reasoner, decision_run, evaluator, executor, runner
+# Each place costs two decisions: so every so many of the lines are interrupted.
+EVERY = 6
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2)])
+@pytest.mark.parametrize("seconds", [None, 3600.0])
+def test_ctrl_c_in_many_lines_of_a_decision(make, seconds):
+    testbed = MassScenario().build()
+    belief = Belief.perfect(testbed, testbed.default_context())
+    with (
+        make() as rollouts,
+        Reasoner(
+            scenario=MassScenario(),
+            decision=[SWITCH],
+            quality=MISS,
+            horizon=3.0,
+            sample_period=0.5,
+            budget=Budget(rollouts=6, seconds=seconds),
+            executor=rollouts,
+        ) as deciding,
+    ):
+
+        def operation():
+            return deciding.decide(belief)
+
+        whole = operation()
+        interrupted = 0
+        for place in places(operation, *MODULES, lines=True)[::EVERY]:
+            interrupted += interrupt(operation, *MODULES, at=place) is not None
+            with hanging_fails(place):
+                again = operation()
+            assert again.values == whole.values and again.quality == whole.quality, place
+            assert [c.quality for c in again.candidates] == [c.quality for c in whole.candidates], place
+        assert interrupted > 10
