@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
 
-from vtbdrake.components.casadi_system import CasadiSystem
+from vtbdrake.components.casadi_system import CasadiSystem, clamp
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
@@ -182,7 +182,7 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
     r = reference(wanted, q, x, p, period=period)
     torque, remembered = chosen.torque(model, q, v, wrench, r, x, p, period)
     reach = period * p["torque_rate"]
-    torque = casadi.fmin(casadi.fmax(torque, x["torque"] - reach), x["torque"] + reach)
+    torque = clamp(torque, x["torque"] - reach, x["torque"] + reach)
     following = {"torque": torque, **r.state, **remembered}
     inputs = {"measured": z, "perceived": seen, "wanted": wanted}
     return _system(

@@ -222,3 +222,11 @@ def test_the_posture_stays_while_the_tip_goes_round_and_round() -> None:
         postures.append(np.array(bench.read("impl.reference")))
     np.testing.assert_allclose(postures[1], postures[0], atol=2e-3)
     np.testing.assert_allclose(postures[1], HOME, atol=0.1)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_measurement_without_value_makes_no_command_of_the_rate_limit(law: str) -> None:
+    bench = Bench(law)
+    bench.step(10)
+    bench.feed(joint_position=np.where(np.arange(7) == 3, np.nan, HOME))
+    assert np.isnan(bench.step(2)).any()
