@@ -22,7 +22,7 @@ from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.slow_worker import pack, unpack
 from vtbdrake.control.stepping import RESULT
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed import DpsAlone, SlowPart
@@ -223,7 +223,7 @@ def test_loop_begins_when_its_slow_parts_are_ready():
     protocol = Protocol(
         sense=[iiwa_status({"position": "joint_position_measured"})], act=[iiwa_command({"velocity": "joint_torque"})]
     )
-    deployment = Deployment(protocol=protocol, period=PERIOD, check_age=False)
+    deployment = Deployment(protocol=protocol, period=PERIOD, continuity={"velocity": None}, check_age=False)
     with SlowScenario().deploy("memq://", deployment=deployment, clock=SimulatedClock()) as runtime:
         assert runtime.slow_parts.wait(0.0)
 
