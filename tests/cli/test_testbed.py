@@ -93,8 +93,8 @@ def test_diagram_shows_the_signals(tmp_path: Path) -> None:
     program = run("diagram", ACROBOT, "--mode", "shadow")
     assert (program.exit_code, program.stderr) == (0, "")
     assert "joint_state" in program.stdout
-    assert run("diagram", ACROBOT, "--mode", "shadow", "-o", tmp_path / "d").stdout == ""
-    assert (tmp_path / "d").read_text() == program.stdout.removesuffix("\n")
+    assert run("diagram", ACROBOT, "--mode", "shadow", "-o", tmp_path / "d.svg").stdout == ""
+    assert (tmp_path / "d.svg").read_text() == program.stdout.removesuffix("\n")
 
 
 def test_animation_is_one_html_file(tmp_path: Path) -> None:

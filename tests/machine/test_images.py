@@ -90,11 +90,12 @@ def test_camera_of_a_machine_guides_as_in_a_simulation(tmp_path: Path) -> None:
     ):
         runtime.take_over()
         runtime.run(cycles=CYCLES - runtime.cycles)
-        assert runtime.bridge.sensed["image"].rejected == {}
+        # Until the first command, the machine repeats its state.
+        assert runtime.bridge.sensed["image"].rejected.keys() <= {"duplicate"}
     log = read_log(tmp_path / "look.lcm")
     commanded = log.actuation["force"][:, 0]
     # The first cycle receives; the second commands.
     np.testing.assert_array_equal(commanded[1:], forces[:-1])
-    assert sum(1 for _ in log.messages("CAMERA")) == CYCLES // 2
+    assert len({message.data for message in log.messages("CAMERA")}) == CYCLES // 2
     report = replay(log)
     assert report.identical and report.digests > 0, report
