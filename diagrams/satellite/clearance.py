@@ -1,4 +1,4 @@
-r"""How far the servicer's arm is from its own base, its panels and itself: for planners, and by Drake as the judge.
+r"""Distances of the servicer's arm from its own base, its panels and itself: for planners, and by Drake as the judge.
 
 For planners, the arm is covered by spheres: each tube (a cylinder of its link's radius), the joint housings, and the
 hand with its fingers lie within them. The signed distance of a sphere from a box with half edges h is

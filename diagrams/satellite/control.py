@@ -28,7 +28,7 @@ They give a fifth of it. With less the base turns less, and the capture takes lo
 ACCELERATION = 0.1
 """The acceleration of the gripper that goes with it, in m/s^2: the arm has about 20 N m s at 1 m/s."""
 UNLIMITED = 1e6
-"""What stands for no limit of both, since parameters are finite."""
+"""A value that stands for no limit of both, since parameters are finite."""
 # The share of the largest reaction by which a change of the rates may always add to it, so that the arm can stop.
 _LEAST = 0.1
 

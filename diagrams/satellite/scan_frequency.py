@@ -59,7 +59,7 @@ TOLERANCE = (Servicer().opening - Target().bar_radius) / 2.0
 FREQUENCIES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """The scan frequencies of the grid, in Hz."""
 RAW, DESKEWED = (1.0, 2.0, 4.0), (0.5, 1.0, 2.0, 16.0)
-"""Those of the short version, with scans as they come and with de-skewed ones."""
+"""Cells of the short version, with scans as they come and with de-skewed ones."""
 TUMBLES = (0.5, 1.0, 2.0, 4.0)
 """The tumble rates, in deg/s: up to the 3 deg/s at which captures must succeed, and one beyond. The short version takes
 every other one."""
@@ -72,7 +72,7 @@ FEW = 10
 QUANTILE = 0.9
 """The share of approaches in which a sufficient frequency keeps the error within the tolerance."""
 CONFIDENCE = 0.9
-"""Of the interval in which that quantile lies."""
+"""Confidence of the interval in which that quantile lies."""
 
 
 @dataclass

@@ -242,7 +242,7 @@ def compare(scenario: ArmMotionScenario) -> Comparison:
 
 @dataclass(frozen=True)
 class Survey:
-    """What plans make of many motions, in the full testbed."""
+    """The results of plans for many motions, in the full testbed."""
 
     comparisons: tuple[Comparison, ...]
 

@@ -405,7 +405,7 @@ def test_commands_at_any_times_keep_the_acceleration(acceleration: float, comman
 
 @given(st.integers(0, 2**32 - 1))
 def test_motion_comes_to_rest_in_the_range_at_any_times(seed: int) -> None:
-    """Where the limits contradict each other, the velocity changes by no more than it may in a whole period."""
+    """Limits that contradict each other change the velocity by no more than it may change in a whole period."""
     random = np.random.default_rng(seed)
     acceleration, upper = 10.0 ** random.uniform(1.0, 4.0), random.uniform(0.001, 0.1)
     one = limiter(acceleration=acceleration, upper=upper)

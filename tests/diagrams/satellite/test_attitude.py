@@ -1,4 +1,4 @@
-"""How the arm's motion turns the base, and how the wheels hold its attitude."""
+"""Tests of the attitude: the arm's motion turns the base, and the wheels hold it."""
 
 from __future__ import annotations
 
