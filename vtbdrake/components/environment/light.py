@@ -1,7 +1,8 @@
 """Light: sunlight, and sunlight that the Earth reflects.
 
-Brightness is relative: 1 is that of sunlight near the Earth, of the irradiance `SOLAR_CONSTANT`, on a white surface
-that faces it. A camera with exposure 1 and gain 1 shows such a surface at full scale.
+Brightness is relative: 1 is that of sunlight near the Earth, 1361 W/m^2 (Kopp and Lean, "A new, lower value of total
+solar irradiance", 2011), on a white surface that faces it. A camera with exposure 1 and gain 1 shows such a surface at
+full scale.
 """
 
 from __future__ import annotations
@@ -21,8 +22,6 @@ from vtbdrake.state.declarations import NO_DICT
 if TYPE_CHECKING:
     from pydrake.geometry import LightParameter
 
-# W/m^2 at one astronomical unit (Kopp and Lean, "A new, lower value of total solar irradiance", 2011).
-SOLAR_CONSTANT = 1361.0
 # Share of the sunlight that the Earth reflects (Stephens et al., "The albedo of Earth", 2015).
 EARTH_ALBEDO = 0.29
 # m, mean radius (IUGG).
