@@ -111,6 +111,19 @@ def test_fault_activates_fallback_in_same_cycle_and_latches(
 
 def test_allowed_missed_deadlines_are_no_fault() -> None:
     assert Loop(TORQUE).cycle({"torque": [0.0, 0.0]}, missed=10).ok
+    assert Loop(TORQUE, max_missed=0).cycle({"torque": [0.0, 0.0]}).ok
+    assert kinds(Loop(TORQUE, max_missed=0).cycle({"torque": [0.0, 0.0]}, missed=1)) == [(None, "missed")]
+
+
+def test_default_options_are_as_documented() -> None:
+    guards = Loop(TORQUE).guards
+    assert (guards.leave_time, guards.pace_tolerance, guards.log.maxlen) == (1.0, 0.1, 1000)
+
+
+def test_withheld_signal_is_not_sent_and_others_are() -> None:
+    loop = Loop(TORQUE, POSITION)
+    loop.guards.withhold("torque")
+    assert loop.cycle({"torque": [0.0, 0.0], "position": [0.0]}).actuation.keys() == {"position"}
 
 
 def test_stale_sensor_is_detected_within_max_age_and_a_cycle() -> None:
@@ -148,6 +161,22 @@ def test_steady_level_after_jump_is_accepted_by_reset_or_while_idle() -> None:
         assert found[-1] == ([("velocity", "jump")] if driven else [])
         assert loop.reset() == ()
         assert loop.cycle({"torque": [0.0, 0.0]}).ok
+
+
+def test_reset_is_refused_right_after_a_jump_and_by_a_stale_sensor_at_a_steady_level() -> None:
+    loop = Loop(TORQUE, sense=Signal("velocity", size=2, rate=1.0, max_age=0.02), jump_tolerance={"velocity": 0.01})
+    loop.cycle({"torque": [0.0, 0.0]})
+    loop.received["velocity"].value = np.array([0.0, 1.0])
+    loop.cycle({"torque": [0.0, 0.0]})
+    (reason,) = loop.reset()
+    assert "jump" in reason
+    for _ in range(200):
+        loop.cycle({"torque": [0.0, 0.0]})
+    loop.silent = True
+    for _ in range(40):
+        loop.cycle({"torque": [0.0, 0.0]})
+    (reason,) = loop.reset()
+    assert "stale" in reason
 
 
 def test_refused_reset_does_not_accept_level_after_jump() -> None:
@@ -412,6 +441,27 @@ def test_many_unsent_commands_are_a_fault() -> None:
     assert loop.reset() == ("the last 11 actuator commands torque could not be sent",)
     loop.cycle({"torque": [1.0, 1.0]})
     assert loop.reset() == ()
+
+
+@pytest.mark.parametrize(("max_missed", "allowed"), [(inf, 10), (3, 3), (0, 0)])
+def test_as_many_unsent_commands_as_missed_deadlines_are_allowed_but_never_more_than_ten(
+    max_missed: float, allowed: int
+) -> None:
+    loop = Loop(TORQUE, max_missed=max_missed)
+    for _ in range(allowed + 1):
+        assert loop.lose({"torque": [1.0, 1.0]}).ok
+    assert kinds(loop.cycle({"torque": [1.0, 1.0]})) == [("torque", "not sent")]
+
+
+@pytest.mark.parametrize(("periods", "departs"), [(10.5, False), (11.5, True)])
+def test_pause_begins_after_eleven_periods(periods: float, departs: bool) -> None:
+    loop = measured_loop(max_age=0.005, fallback={"torque": Hold()})
+    for _ in range(20):
+        loop.cycle({"torque": [2.0, 2.0]})
+    loop.now += (periods - 1.0) * T
+    loop.received["acting"].value = np.array([-5.0, 1.0])
+    start = [-5.0, 1.0] if departs else [2.0, 2.0]
+    assert abs(loop.cycle({"torque": [2.0, 2.0]}).actuation["torque"] - start).max() <= RATE * T + 1e-9
 
 
 @pytest.mark.parametrize("measures", [True, False])
