@@ -453,6 +453,20 @@ def test_as_many_unsent_commands_as_missed_deadlines_are_allowed_but_never_more_
     assert kinds(loop.cycle({"torque": [1.0, 1.0]})) == [("torque", "not sent")]
 
 
+@pytest.mark.parametrize(("lost", "departs"), [(10, False), (11, True)])
+def test_outage_begins_after_eleven_commands(lost: int, departs: bool) -> None:
+    loop = Loop(POSITION, TORQUE, sense=Signal("acting", size=2, unit="N m", max_age=0.02), fallback={"torque": Hold()})
+    loop.guards.measured_by = {"torque": "acting"}
+    for _ in range(20):
+        loop.cycle({"position": [0.0], "torque": [2.0, 2.0]})
+    for _ in range(lost):
+        loop.lose({"position": [0.0], "torque": [2.0, 2.0]})
+    loop.received["acting"].value = np.array([-5.0, 1.0])
+    start = [-5.0, 1.0] if departs else [2.0, 2.0]
+    sent = loop.cycle({"position": [0.0], "torque": [2.0, 2.0]}).actuation["torque"]
+    assert abs(sent - start).max() <= RATE * T + 1e-9
+
+
 @pytest.mark.parametrize(("periods", "departs"), [(10.5, False), (11.5, True)])
 def test_pause_begins_after_eleven_periods(periods: float, departs: bool) -> None:
     loop = measured_loop(max_age=0.005, fallback={"torque": Hold()})
@@ -590,13 +604,31 @@ def test_fallback_gets_elapsed_time() -> None:
     assert spans == pytest.approx([0.003, T, 0.006])
 
 
+class Counting(Hold):
+    """A fallback that counts how often it begins."""
+
+    times = 0
+
+    def begin(self) -> None:
+        self.times += 1
+
+
+@pytest.mark.parametrize("latched", [False, True])
+def test_fallback_begins_each_time_a_signal_leaves_real(latched: bool) -> None:
+    counting = Counting()
+    loop = Loop(TORQUE, fallback={"torque": counting})
+    loop.cycle({"torque": [0.0, 0.0]})
+    if latched:
+        loop.cycle({"torque": [nan, 0.0]})
+    times = []
+    for commands in ({}, {}, {"torque": [0.0, 0.0]}, {}):
+        loop.cycle(commands)
+        times.append(counting.times)
+    # A latched fallback has begun, and goes on.
+    assert times == ([1, 1, 1, 1] if latched else [1, 1, 1, 2])
+
+
 def test_fallback_begins_once_per_latch() -> None:
-    class Counting(Hold):
-        times = 0
-
-        def begin(self) -> None:
-            self.times += 1
-
     counting = Counting()
     loop = Loop(TORQUE, fallback={"torque": counting})
     told = []
