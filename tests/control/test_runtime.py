@@ -526,6 +526,24 @@ def test_paced_loop_steps_once_per_message():
     assert bridge.sensed["position"].count >= before + 30
 
 
+@pytest.mark.parametrize(
+    "switch", [{"mode": "shadow"}, {"sense": {"position": "real"}}, {"act": {"velocity": "real"}}, {"act": "twin"}]
+)
+def test_switch_without_connection_is_refused(switch):
+    runtime, bridge, _ = make(continuity={"velocity": ("speed", 5.0)})
+    runtime.cycle()
+    bridge.up = False
+    assert "the bridge is not connected" in runtime.prepare(**switch).reasons
+    assert runtime.prepare("sim").reasons == ()
+
+
+@pytest.mark.parametrize("switch", [{"sense": {"position": "sim"}, "act": "real"}, {"act": {"velocity": "twin"}}])
+def test_dps_alone_has_no_simulated_side(switch):
+    runtime, _, _ = make(alone=True, continuity={"velocity": ("speed", 5.0)})
+    with pytest.raises(ValueError, match="the DPS alone has no simulated world"):
+        runtime.prepare(**switch)
+
+
 def test_blocked_machine_is_not_commanded_until_reset():
     class Contended(ScriptedBridge):
         blocked_reason = None
