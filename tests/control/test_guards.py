@@ -316,6 +316,20 @@ def test_fallback_commands_a_signal_that_has_left_real(latched: bool) -> None:
     assert not loop.guards.limiters["torque"].has_start
 
 
+def test_late_cycles_bring_a_limited_command_as_far_as_punctual_ones() -> None:
+    loop = Loop(TORQUE, leave_time=0.0505)
+    for k in range(20):
+        loop.cycle({"torque": [RATE * T * (k + 1), 0.0]}, at=loop.now + T)
+    sent = []
+    while True:
+        loop.now += 4.0 * T
+        actuation = loop.cycle({}, at=loop.now + T).actuation
+        if not actuation:
+            break
+        sent.append(actuation["torque"][0])
+    assert len(sent) == 51 and sent[17] > 0.0 and sent[20:] == [0.0] * 31
+
+
 def test_released_machine_gets_no_fallback() -> None:
     loop = Loop(TORQUE)
     loop.cycle({"torque": [0.05, 0.0]})

@@ -544,6 +544,18 @@ def test_dps_alone_has_no_simulated_side(switch):
         runtime.prepare(**switch)
 
 
+@pytest.mark.parametrize("lateness", [(), [7 * PERIOD] * 1000])
+def test_loop_that_ends_brings_its_command_to_rest_however_late_it_is(lateness):
+    guards = Guards(ServoScenario().interface(), PERIOD, max_missed=np.inf, leave_time=0.2)
+    runtime, bridge, _ = switched(guards=guards, lateness=lateness)
+    runtime.run(cycles=50)
+    assert abs(sent(bridge)[-1]).max() > 0.05
+    before = len(bridge.sent)
+    runtime.leave("the test ends")
+    assert len(bridge.sent) - before == 201
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0]
+
+
 def test_blocked_machine_is_not_commanded_until_reset():
     class Contended(ScriptedBridge):
         blocked_reason = None

@@ -70,7 +70,8 @@ class Guards:
         pace_tolerance: For a loop that messages pace, the largest difference between their pace and the period,
             relative to the period (see `PaceMonitor`); more is a fault. The default covers clocks that differ by some
             per cent. Infinite: no pace is a fault.
-        leave_time: Seconds for which the fallbacks go on commanding signals that have left real.
+        leave_time: Seconds for which the fallbacks go on commanding signals that have left real, in cycles of a period:
+            longer if the loop misses deadlines, so that limited commands come as far.
         log_size: Number of faults that `log` keeps.
 
     Attributes:
@@ -134,7 +135,8 @@ class Guards:
         self._begun: set[Fallback] = set()
         self._failed: set[Fallback] = set()
         self._active: tuple[str, ...] = ()
-        self._leaving: dict[str, float] = {}  # Actuator signals that have left real, and when their fallback ends.
+        # Actuator signals that have left real, and for how many more cycles their fallbacks command.
+        self._leaving: dict[str, float] = {}
         self._last: float | None = None  # Time of the last cycle.
         # By actuator signal, for how many cycles nothing has left: it could not, or a fallback is silent.
         self._unsent: dict[str, int] = {}
@@ -220,8 +222,8 @@ class Guards:
         if self._unconfirmed:
             self.note_unsent(())
         self._unconfirmed = True
-        self._activate(tuple(active if active is not None else self._active if error else actuation), now)
-        self._end_leaving(now, released)
+        self._activate(tuple(active if active is not None else self._active if error else actuation))
+        self._end_leaving(released)
         causes = self._general_faults(now, error, missed, blocked, pace)
         causes += self._depart_anew(now, received, others)
         wanted = []
@@ -312,21 +314,23 @@ class Guards:
             self._latched, self._withheld = (), frozenset()
         return reasons
 
-    def _activate(self, names: tuple[str, ...], now: float) -> None:
+    def _activate(self, names: tuple[str, ...]) -> None:
         """Record which signals are on real; let the fallbacks command those that have left it."""
         if names != self._active:
             for name in set(self._active) - set(names):
-                self._leaving[name] = now + self.leave_time
+                self._leaving[name] = self.leave_time / self.period
                 if not self._latched:
                     self._begun -= set(self._fallbacks[name])
             for name in names:
                 self._leaving.pop(name, None)
             self._active = names
 
-    def _end_leaving(self, now: float, released: bool) -> None:
+    def _end_leaving(self, released: bool) -> None:
         """Reset the limiters of signals that have left real, and need no command any more."""
-        for name, end in tuple(self._leaving.items()):
-            if released or now >= end or not self.limiters[name].has_start:
+        for name, left in tuple(self._leaving.items()):
+            if not released and left > 0.0 and self.limiters[name].has_start:
+                self._leaving[name] = left - 1.0
+            else:
                 self.limiters[name].release()
                 self._departing -= {name}
                 self._withheld -= {name}

@@ -426,16 +426,17 @@ class Runtime(Stepped):
         if self._left == self.cycles:
             return
         self._left = self.cycles
-        deadline = now = self.clock.now()
-        end = now if self._in_lock_step else now + self.guards.leave_time
+        now = self.clock.now()
+        # In cycles: on a busy computer they take longer, and each changes a limited command by a period's worth.
+        left = 0.0 if self._in_lock_step else self.guards.leave_time / self.period
         verdict = self.guards.latch(reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now)
         commands = verdict.actuation
         while commands:
             self.guards.note_unsent(self.bridge.publish(commands))
-            deadline += self.period
-            if deadline > end or self._released:
+            left -= 1.0
+            if left < 0.0 or self._released:
                 return
-            now = self.clock.wait_until(deadline)
+            now = self.clock.wait_until(now + self.period)
             self.bridge.poll()
             commands = self.guards.fall_back(now, self.bridge.sensed, at=now)
 
