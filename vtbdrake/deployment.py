@@ -206,8 +206,6 @@ def deploy(
     if start is not None:
         target.restore(context, start)
     target.write(context, values or {})
-    from vtbdrake.recording.recorder import Recorder, RecordingError
-
     recorder = None
     with deployment.runtime(target, bridge, context=context, **options) as runtime, ExitStack() as stack:
         if runtime.slow_parts.statistics:
@@ -222,6 +220,8 @@ def deploy(
 
             stack.enter_context(LiveService(runtime, url))
         if record is not None:
+            from vtbdrake.recording.recorder import Recorder
+
             recorder = stack.enter_context(Recorder(runtime, record))
             recorder.wait_until_ready()
         try:
@@ -230,5 +230,7 @@ def deploy(
             runtime.leave("the deployment ended")
     if recorder is not None:
         if recorder.lost:
+            from vtbdrake.recording.recorder import RecordingError
+
             raise RecordingError(f"{recorder.lost} of {runtime.cycles} cycles of the loop are not in the log {record}")
         _log.info("recorded to %s, without a loss", record)

@@ -1,4 +1,4 @@
-"""What can be written while a machine runs has bounds in the DPS of every example, and the arm is stable at them."""
+"""Tests that what can be written while a machine runs has bounds, and that the arm is stable at them."""
 
 from __future__ import annotations
 

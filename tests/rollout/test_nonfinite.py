@@ -1,4 +1,4 @@
-"""What is not finite ends a rollout, and is named; Drake's integrators would shorten their step for ever."""
+"""Tests that what is not finite ends a rollout by its name; Drake's integrators would shorten their step for ever."""
 
 import itertools
 import re

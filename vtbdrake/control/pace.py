@@ -63,14 +63,14 @@ class PaceMonitor:
 
     @property
     def unknown(self) -> str | None:
-        """Why the pace is not known yet, as a sentence; None if it is."""
+        """Return why the pace is not known yet, as a sentence; None if it is."""
         if self.tolerance == inf or len(self._times) >= SETTLED:
             return None
         return f"the pace of {self.signal} is not known yet: {len(self._times)} of {SETTLED} times between messages"
 
     @property
     def problem(self) -> str | None:
-        """How the pace differs from the period, as a sentence; None if it does not, or is not known yet."""
+        """Return how the pace differs from the period, as a sentence; None if it does not, or is not known yet."""
         count = len(self._times)
         excess, allowed = self._total - count * self.period, (count * self.tolerance + JITTER) * self.period
         quick = self._short > 0.5 * count and excess < -allowed

@@ -153,6 +153,8 @@ class Runtime(Stepped):
         self._read_at = self.clock.now()  # when all that had arrived was read
         # Between two cycles; after a longer one, what has waited may be too old.
         ages = [monitor.max_age for monitor in self.guards.monitors.values()]
+        # The machine's time may stand still then, so the stamps of the messages that pace tell it.
+        self._in_lock_step = pace is not None and all(age == inf for age in ages)
         self._longest_gap = max(min(ages, default=inf), (MOST_UNSENT + 1) * period)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
@@ -378,11 +380,6 @@ class Runtime(Stepped):
             worked = 0.0
         return int((lateness + worked) / self.period)
 
-    @property
-    def _in_lock_step(self) -> bool:
-        """Whether the machine's time may stand still, so that it is told by the stamps of the messages that pace."""
-        return self.pace is not None and all(monitor.max_age == inf for monitor in self.guards.monitors.values())
-
     def _check_pace(self) -> str | None:
         """Note the message that has begun this cycle; return how the pace differs from the period, or None."""
         if self.pace is None or self._pace_monitor is None:
@@ -442,12 +439,12 @@ class Runtime(Stepped):
 
     @property
     def _released(self) -> bool:
-        """Whether the machine needs no fallback: it does without commands, or another publisher commands it."""
+        """Return whether the machine needs no fallback: it does without commands, or another publisher commands it."""
         return self.released_by() or self.bridge.competing_publisher is not None
 
     @property
     def pace_problem(self) -> str | None:
-        """Why the pace of the messages that begin cycles prevents a switch to real, or None.
+        """Return why the pace of the messages that begin cycles prevents a switch to real, or None.
 
         In lock-step it is known only after the switch, because the machine waits for commands.
         """

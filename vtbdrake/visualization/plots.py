@@ -68,7 +68,7 @@ def finish(axes: Axes) -> None:
 
 @dataclass(frozen=True)
 class _Words:
-    """How a quality, or a cost, is called in a plot."""
+    """Return the name of a quality, or of a cost, in a plot."""
 
     symbol: str  # of the trajectory
     noun: str
