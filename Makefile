@@ -45,9 +45,11 @@ demo-control: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.manipulator.demo
 
 # In the order of the folders: by default, files of few tests come last, and the longest of them keep one worker busy in the
-# end. One worker more than processors: some tests wait for other processes, for sockets and for the clock.
+# end. One worker more than processors: some tests wait for other processes, for sockets and for the clock. A worker that
+# crashes ends the run at once: another one in its place would leave tests out, and wait for ever at the end.
 test: $(STAMP)
-	$(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --max-worker-restart 0 \
+		--dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .

@@ -1,5 +1,6 @@
 """Scenario fields in a point: another testbed each, built once and kept, a few at a time."""
 
+import contextlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -110,6 +111,38 @@ def test_threads_that_want_the_same_new_testbed_build_it_once(built):
         found = list(pool.map(get, range(4)))
     assert built == [5.0]
     assert all(testbed is found[0] for testbed in found)
+
+
+@dataclass
+class WatchedScenario(PendulumScenario):
+    """A pendulum that notes whether two testbeds are built at once."""
+
+    building: ClassVar[threading.Lock] = threading.Lock()
+    overlap: ClassVar[threading.Event] = threading.Event()
+
+    def make_dps(self):
+        if not self.building.acquire(blocking=False):
+            self.overlap.set()
+            return super().make_dps()
+        with contextlib.ExitStack() as stack:
+            stack.callback(self.building.release)
+            self.overlap.wait(0.1)  # Another thread has this long to come.
+            return super().make_dps()
+
+
+def test_threads_build_their_testbeds_one_after_another():
+    WatchedScenario.overlap.clear()
+    with ThreadExecutor(4) as executor:
+        results = _results(executor, _task(WatchedScenario()), [{STIFFNESS: float(k)} for k in range(4)])
+    assert not any(result.failed for result in results)
+    assert not WatchedScenario.overlap.is_set()
+
+
+def test_more_threads_than_testbeds_are_kept_take_them_from_each_other():
+    points = [{STIFFNESS: float(k), THETA: 0.5} for k in range(60)]
+    with ThreadExecutor(4, kept=1) as threads, SerialExecutor(kept=1) as serial:
+        results, expected = (_results(executor, _task(), points) for executor in (threads, serial))
+    assert all(ours.identical(theirs) for ours, theirs in zip(results, expected, strict=True))
 
 
 def test_a_testbed_whose_build_failed_is_tried_again(built):

@@ -506,16 +506,11 @@ def failed(point: Mapping[str, Any], message: str) -> RolloutResult:
     return RolloutResult(parameters=dict(point), end=FAILED, message=message, times=np.array([]), quality=np.array([]))
 
 
-class _Building:
-    """A testbed, once it has been built by the thread that holds the lock."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.testbed: VirtualTestbed | None = None
-
-
 class Testbeds:
     """The testbeds last used, built once per distinct scenario and shared by threads.
+
+    One testbed is built at a time: CasADi's expressions, of which a scenario may make its DPS, count their references
+    without atomics, and its Python package gives up the interpreter lock.
 
     Args:
         known: A testbed that exists already and is never dropped.
@@ -527,39 +522,42 @@ class Testbeds:
             raise ValueError(f"at least one testbed must be kept, not {kept}")
         self.kept = kept
         self._known = known if known is not None and known.scenario is not None else None
-        self._built: OrderedDict[Hashable, _Building] = OrderedDict()
+        self._built: OrderedDict[Hashable, VirtualTestbed] = OrderedDict()
         self._lock = threading.Lock()
+        self._building = threading.Lock()
 
     def get(self, scenario: Scenario) -> VirtualTestbed:
-        """Return the testbed of ``scenario``; wait if another thread is building it."""
+        """Return the testbed of ``scenario``; build it if it is not there, when other threads have built theirs."""
         key = _key(scenario.record())
         if self._known is not None and self._known.scenario is not None and key == _key(self._known.scenario.record()):
             return self._known
+        if (testbed := self._used(key)) is not None:
+            return testbed
+        with self._building:
+            if (testbed := self._used(key)) is not None:
+                return testbed
+            testbed = scenario.build()
+            with self._lock:
+                self._built[key] = testbed
+                dropped = self._built.popitem(last=False) if len(self._built) > self.kept else None
+            del dropped  # Here, so that it is taken apart while nothing is built, and without the lock.
+            return testbed
+
+    def _used(self, key: Hashable) -> VirtualTestbed | None:
         with self._lock:
-            building = self._built.setdefault(key, _Building())
-            self._built.move_to_end(key)
-            if len(self._built) > self.kept:
-                self._built.popitem(last=False)
-        with building.lock:
-            if building.testbed is None:
-                try:
-                    building.testbed = scenario.build()
-                except BaseException:  # The next thread that waits tries again.
-                    with self._lock:
-                        if self._built.get(key) is building:
-                            del self._built[key]
-                    raise
-            return building.testbed
+            if key in self._built:
+                self._built.move_to_end(key)
+            return self._built.get(key)
 
     def touch(self, testbed: VirtualTestbed) -> None:
         """Mark ``testbed`` as just used."""
         with self._lock:
-            for key in [key for key, building in self._built.items() if building.testbed is testbed]:
+            for key in [key for key, built in self._built.items() if built is testbed]:
                 self._built.move_to_end(key)
 
     def __contains__(self, testbed: object) -> bool:
         with self._lock:
-            return testbed is self._known or any(building.testbed is testbed for building in self._built.values())
+            return testbed is self._known or any(built is testbed for built in self._built.values())
 
     def __len__(self) -> int:
         return len(self._built)
@@ -590,7 +588,8 @@ class Runners:
         key = (id(task), _key(fields))
         if key not in mine:
             mine[key] = (task, self._make(task, fields))
-            for old in [k for k, (_, runner) in mine.items() if runner.testbed not in self._testbeds]:
+            # Other threads may have dropped the new one's testbed already: it is used all the same.
+            for old in [k for k, (_, runner) in mine.items() if k != key and runner.testbed not in self._testbeds]:
                 del mine[old]
             if len(mine) > _RUNNERS:
                 mine.popitem(last=False)

@@ -1,7 +1,9 @@
 """A casadi.Function as a system: its values, its derivatives, what it depends on, and what it refuses."""
 
+import gc
 import pickle
 import threading
+import weakref
 
 import casadi
 import numpy as np
@@ -383,3 +385,18 @@ def test_arguments_are_dense_and_nothing_is_empty():
         CasadiSystem(casadi.Function("f", [X, nothing], [X], ["x", "nothing"], ["y"]))
     with pytest.raises(ValueError, match="f: the result 'y' is empty"):
         CasadiSystem(casadi.Function("f", [X], [casadi.SX(0, 1)], ["x"], ["y"]))
+
+
+def test_expressions_are_not_freed_by_whichever_thread_collects_garbage():
+    system = CasadiSystem(_law(), parameters={"gain": [2.0, 0.5]})
+    cycle = [system]
+    cycle.append(cycle)
+    expressions = [weakref.ref(each) for each in gc.get_objects() if isinstance(each, casadi.SX) and each.numel() == 2]
+    others = {id(each()) for each in expressions}
+    del system, cycle
+    collector = threading.Thread(target=gc.collect)
+    collector.start()
+    collector.join()
+    assert {id(each()) for each in expressions} == others
+    CasadiSystem(_law(), parameters={"gain": [2.0, 0.5]})
+    assert any(each() is None for each in expressions)

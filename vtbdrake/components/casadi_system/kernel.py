@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -24,6 +25,10 @@ TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = 
     False: lambda function: function,
 }
 _GENERATING = threading.Lock()
+# The expressions and functions of kernels that are gone, until the next kernel is made. CasADi's expressions share
+# nodes, and count the references to them without atomics; its Python package gives up the interpreter lock even where
+# an object is freed. The garbage collector would do that in any thread, while another one makes expressions.
+_SET_ASIDE: list[object] = []
 
 
 def clamp(value: Expression, lower: Expression, upper: Expression) -> Expression:
@@ -46,9 +51,11 @@ class Kernel:
 
         ``compile`` is that of a `CasadiSystem`.
         """
+        _SET_ASIDE.clear()
         self._name = casadi.Function.fix_name(name)
         self._arguments = list(arguments)
         self._y = y
+        self._set_aside_at_end(self._arguments, y)
         self._translate = TRANSLATIONS[compile]
         self._jacobian: Buffers | None = None
         self.value = evaluator(self._buffers(self._name, y))
@@ -76,7 +83,12 @@ class Kernel:
         function = casadi.Function(name, self._arguments, [expression])
         # A function of scalar operations cannot fail; others (a root finder, a solver) report it.
         may_fail = not function.is_a("SXFunction")
-        return Buffers(self._translate(function), may_fail)
+        translated = self._translate(function)
+        self._set_aside_at_end(function, translated)
+        return Buffers(translated, may_fail)
+
+    def _set_aside_at_end(self, *of_casadi: object) -> None:
+        weakref.finalize(self, _SET_ASIDE.append, of_casadi).atexit = False
 
 
 class Buffers(threading.local):
