@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.measure import LOWER, Benchmark, interleaved, ratio
 from vtbdrake.optimization import Study
-from vtbdrake.optimization.study_file import Trial
+from vtbdrake.optimization.records import Trial
 from vtbdrake_diagrams.satellite.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.arm_move import RESTING
 from vtbdrake_diagrams.satellite.arm_planning import Plan, plan_by_casadi, plan_by_drake

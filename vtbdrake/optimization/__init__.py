@@ -3,9 +3,10 @@
 from vtbdrake.optimization.boundary import Boundary
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.problem import Motion, Problem, ProblemRollout
+from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
 from vtbdrake.optimization.study import Study
-from vtbdrake.optimization.study_file import Outcome, StudyError, Trial
+from vtbdrake.optimization.study_file import StudyError
 from vtbdrake.optimization.sweep import Sweep
 
 __all__ = [

@@ -12,7 +12,7 @@ import numpy as np
 
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.parameter import Parameter
-from vtbdrake.optimization.study_file import RolloutKey
+from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.sweep import Sweep, borrowed, make_sweep, numeric, roll_out
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask
 from vtbdrake.rollout.task import TERMINATED, catches

@@ -12,8 +12,8 @@ import numpy as np
 
 from vtbdrake.argument_checks import as_number
 from vtbdrake.optimization.evaluator import Evaluator, Gradients
+from vtbdrake.optimization.records import Outcome, RolloutKey
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import Outcome, RolloutKey
 from vtbdrake.rollout import Executor, make_executor
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from math import ceil, inf, nan
 import numpy as np
 
 from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.records import Outcome, RolloutKey
 from vtbdrake.optimization.risk import aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
-from vtbdrake.optimization.study_file import Outcome, RolloutKey
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.derivative import DerivativeRunner
 from vtbdrake.rollout.pruning import PRUNED

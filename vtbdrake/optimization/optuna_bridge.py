@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from vtbdrake.optimization.identity import differences
 from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import Outcome, StudyError, Trial, encode
+from vtbdrake.optimization.study_file import StudyError, encode
 
 if TYPE_CHECKING:
     import optuna

@@ -13,7 +13,7 @@ import numpy as np
 from vtbdrake.argument_checks import as_number
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization.study_file import Outcome
+    from vtbdrake.optimization.records import Outcome
     from vtbdrake.rollout import RolloutResult
 
 

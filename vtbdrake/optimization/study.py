@@ -17,8 +17,9 @@ from vtbdrake.error_text import safe_text
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
 from vtbdrake.optimization.parameter import Dimension, checked_point, point_text
+from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers import Solver, make_solver
-from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyError, StudyFile, Trial
+from vtbdrake.optimization.study_file import StudyError, StudyFile
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.rollout import Executor, make_executor
 from vtbdrake.rollout.task import catches

@@ -13,8 +13,9 @@ from tqdm.auto import tqdm
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.evaluator import ROUND, Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
-from vtbdrake.optimization.study_file import Outcome, RolloutKey, StudyFile, Trial
+from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.executor import watched
 from vtbdrake.rollout.task import quality_warning

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from vtbdrake.argument_checks import all_of, as_whole, check_plain
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.parameter import Parameter, point_text
+from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
-from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.state.archive import read_archive, write_archive

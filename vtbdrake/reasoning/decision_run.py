@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vtbdrake.optimization.evaluator import Evaluator
+from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.risk import Worst
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
-from vtbdrake.optimization.study_file import RolloutKey
 from vtbdrake.reasoning.budget import Budget
 from vtbdrake.reasoning.decision import CUT_OFF, ELIGIBLE, FAILED, UNFINISHED, VIOLATES, Candidate, Decision, Health
 from vtbdrake.reasoning.space import same_values

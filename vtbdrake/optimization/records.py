@@ -1,0 +1,69 @@
+"""What is known of a finished rollout, and of a point with all its rollouts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from vtbdrake.error_text import safe_text
+from vtbdrake.optimization.solvers.solver import Point, PointValues
+from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout.task import FAILED
+
+# (point, number of the condition)
+RolloutKey = tuple[Point, int]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The record of one finished rollout in a study; its fields are those of `RolloutResult`."""
+
+    h: float
+    value: float
+    measures: tuple[float, ...]
+    t_star: float
+    end: str
+    message: str
+    wall_time: float
+
+    @property
+    def failed(self) -> bool:
+        """Return whether the rollout failed."""
+        return self.end == FAILED
+
+    @classmethod
+    def of(cls, result: RolloutResult) -> Outcome:
+        """Return the part of a result that is stored: everything but its trajectories."""
+        values = {field.name: getattr(result, field.name) for field in fields(cls)}
+        return cls(**{**values, "message": safe_text(result.message)})
+
+
+@dataclass(frozen=True)
+class Trial(PointValues):
+    """A point s^0 of a study with its values."""
+
+    parameters: Mapping[str, Any]  # the point, address -> value
+    # one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a simulation
+    # failed.
+    values: tuple[float, ...]
+    violations: tuple[float, ...]  # one per constraint, the worst over the conditions: at most 0 where it holds
+    # False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is known but
+    # that the point violates a constraint
+    exact: bool
+    origin: str  # ``solver`` or ``user``, whichever asked for the point
+    method: str  # the solver's method at that time
+    batch: int  # the number of the batch of points that were evaluated together
+    number: int = 0  # number in the order of the study; counted by the study file
+    # the user's notes on the point, see `Study.set_attribute`
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def point(self) -> Point:
+        """Return the values of the parameters, in their order."""
+        return tuple(self.parameters.values())
+
+    @property
+    def value(self) -> float:
+        """Return the value of the first quality."""
+        return self.values[0]
