@@ -11,8 +11,9 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, ZeroOrderHold
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal
+from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
 from vtbdrake.control.guards import Guards, Verdict
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.testbed import Interface, Signal
 
 T = 1e-3

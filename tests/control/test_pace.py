@@ -13,10 +13,10 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.servo_machine import COMMAND, ServoMachineScenario
 from tests.control.test_loop import Ear
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.pace import SETTLED, WINDOW, PaceMonitor
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment

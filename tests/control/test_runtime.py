@@ -8,11 +8,11 @@ import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from vtbdrake.child_process import ending_signals
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import FallbackController, Silence, Zero
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.pace import SETTLED
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.switching import SwitchRefusedError

@@ -20,7 +20,8 @@ from drake import lcmt_iiwa_status, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, bridge, command, interface, status
 from tests.lcm.bus import PATIENCE, Peer, free_port, in_step, wait
-from vtbdrake.control.bridge import BridgeError, ReceivedSignal
+from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.arm_messages import iiwa_status
 from vtbdrake.lcm.bridge import ChannelReader, ForeignCommands, LcmBridge
 from vtbdrake.lcm.hub import STATUS_CHANNEL, ChannelStatistics, Hub, HubStatistics

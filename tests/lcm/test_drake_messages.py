@@ -29,7 +29,7 @@ from pydrake.systems.sensors import (
     ImageToLcmImageArrayT,
 )
 
-from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.drake_messages import image_array_map, image_map, point_cloud_map, scan_map
 from vtbdrake.lcm.maps import LcmMap

@@ -19,7 +19,7 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
-from vtbdrake.control.bridge import ReceivedSignal
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.arm_messages import iiwa_status
 from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.hub import Hub

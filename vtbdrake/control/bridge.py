@@ -9,13 +9,11 @@ from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.control.staleness import ReceivedSignal
+from vtbdrake.control.received_signal import ReceivedSignal
 
 if TYPE_CHECKING:
     # So that a process that only listens on a bus need not load Drake.
     from vtbdrake.testbed import Interface, Signal
-
-__all__ = ["Bridge", "BridgeError", "ReceivedSignal", "reported_signals"]
 
 
 class BridgeError(RuntimeError):

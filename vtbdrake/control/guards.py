@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
 from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
 from vtbdrake.control.staleness import check_all
 from vtbdrake.error_text import error_text

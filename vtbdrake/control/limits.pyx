@@ -9,7 +9,7 @@ from libc.stdint cimport int64_t
 
 cimport numpy as cnp
 
-from vtbdrake.control.staleness cimport entries_of
+from vtbdrake.control.array_entries cimport entries_of
 
 cnp.import_array()
 

@@ -8,8 +8,8 @@ from math import inf, isfinite, isnan, nan
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.limits import Bounds, JumpBounds
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.staleness import StalenessMonitor
 from vtbdrake.testbed import Signal
 

@@ -1,29 +1,9 @@
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from vtbdrake.control.limits import Bounds
-    from vtbdrake.control.sensor_monitor import Fault
-
-class ReceivedSignal:
-    value: Any
-    arrived: float
-    sent: float
-    count: int
-    rejected: dict[str, int]
-    bounds: Bounds | None
-    def __init__(
-        self,
-        value: Any = None,
-        *,
-        arrived: float = ...,
-        sent: float = ...,
-        count: int = 0,
-        bounds: Bounds | None = None,
-    ) -> None: ...
-    def age(self, now: float) -> float: ...
-    def reject(self, reason: str) -> None: ...
-    def accept(self, value: Any, arrived: float, sent: float) -> None: ...
+from vtbdrake.control.limits import Bounds
+from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.control.sensor_monitor import Fault
 
 class StalenessMonitor:
     trusted: Bounds | None

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal
+from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guards import Verdict
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.state.systems import leaves
 from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
+from vtbdrake.control.bridge import Bridge, reported_signals
 from vtbdrake.control.limits import Bounds
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.connections import Handler, LcmLink
 from vtbdrake.lcm.hub import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap

@@ -1,7 +1,7 @@
 """Compiled decoder and encoder of LCM messages whose signals are numbers."""
 
 from cpython.bytes cimport PyBytes_AS_STRING, PyBytes_FromStringAndSize, PyBytes_GET_SIZE
-from cpython.mem cimport PyMem_Free
+from cpython.mem cimport PyMem_Calloc, PyMem_Free
 from libc.math cimport NAN, isfinite, rint
 from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint16_t, uint32_t, uint64_t
 from libc.string cimport memcmp
@@ -10,7 +10,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.control.staleness cimport entries_of, zeros
+from vtbdrake.control.array_entries cimport entries_of
 from vtbdrake.lcm.byte_order cimport (
     get_double,
     get_float,
@@ -50,6 +50,13 @@ cdef struct Field:
     # In the message that was located last:
     Py_ssize_t offset  # of the first number
     Py_ssize_t count  # of numbers
+
+
+cdef void* zeros(Py_ssize_t count, size_t size) except NULL:
+    cdef void* memory = PyMem_Calloc(max(count, 1), size)
+    if memory is NULL:
+        raise MemoryError
+    return memory
 
 
 cdef class MessageLayout:

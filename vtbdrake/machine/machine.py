@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.bridge import ReceivedSignal, reported_signals
+from vtbdrake.control.bridge import reported_signals
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.sensor_monitor import LatencyMonitor
 from vtbdrake.lcm.bridge import ChannelReader
 from vtbdrake.lcm.protocol import Protocol, protocol_of

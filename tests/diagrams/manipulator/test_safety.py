@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vtbdrake.control.bridge import ReceivedSignal
 from vtbdrake.control.fallback import NO_COMMAND, NoCommand, Sample
 from vtbdrake.control.guards import Guards, Verdict
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.testbed import Interface, Signal, WorldAlone
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.safety import CARRY, DISAGREEMENT, SLIP, FloatInPlace

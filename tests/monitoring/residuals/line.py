@@ -7,9 +7,10 @@ from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, ReceivedSignal, reported_signals
+from vtbdrake.control.bridge import Bridge, reported_signals
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guards import Guards
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.lcm.protocol import protocol_of

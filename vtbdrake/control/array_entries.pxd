@@ -1,4 +1,4 @@
-from libc.stdint cimport int64_t
+"""Access to the numbers in an array, without a copy."""
 
 cimport numpy as cnp
 
@@ -16,17 +16,3 @@ cdef inline double* entries_of(object value, Py_ssize_t size) noexcept:
     ):
         return NULL
     return <double*>cnp.PyArray_DATA(array)
-
-
-cdef void* zeros(Py_ssize_t count, size_t size) except NULL
-
-
-cdef class ReceivedSignal:
-    cdef public object value
-    cdef public double arrived
-    cdef public double sent
-    cdef public int64_t count
-    cdef public dict rejected
-    cdef public object bounds
-
-    cpdef accept(self, value, double arrived, double sent)

@@ -1,0 +1,12 @@
+from libc.stdint cimport int64_t
+
+
+cdef class ReceivedSignal:
+    cdef public object value
+    cdef public double arrived
+    cdef public double sent
+    cdef public int64_t count
+    cdef public dict rejected
+    cdef public object bounds
+
+    cpdef accept(self, value, double arrived, double sent)
