@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.state.archive import whole_file
 
 # Name of a row -> the function that produces it: itself, or as "package.module:function", imported when it is its turn.
@@ -28,7 +29,7 @@ class Crash:
     error: BaseException
 
     def __str__(self) -> str:
-        return f"{type(self.error).__name__}: {' '.join(str(self.error).split())}"
+        return error_text(self.error)
 
 
 def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
@@ -47,7 +48,7 @@ def run(registry: Registry, name: str, *arguments: Any) -> Any:
     """Return the result of the function ``name``, or a `Crash` whose traceback goes to stderr: the others still run."""
     try:
         return _function(registry[name])(*arguments)
-    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+    except FAILURES as error:
         traceback.print_exc(file=sys.stderr)
         return Crash(name, error)
 

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.cli import BadInputError, one_line
+from vtbdrake.cli import BadInputError
 from vtbdrake.cli.options import option, scenario_argument, timeout_option, url_option
 from vtbdrake.components.localization.planar import transform
 from vtbdrake.components.localization.unit import DOUBTFUL, LOST, SEARCHING, TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.failures import one_line
 from vtbdrake.monitoring.live.client import watch
 from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model

@@ -10,7 +10,9 @@ from typing import Any
 
 import click
 
-__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "FailedError", "main", "one_line"]
+from vtbdrake.failures import one_line
+
+__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "FailedError", "main"]
 
 BAD_INPUT = 2
 FAILED = 1
@@ -82,13 +84,6 @@ class _Commands(click.Group):
             if ctx.params["traceback"] or not isinstance(error, WorkerError):
                 raise
             raise FailedError(one_line(error)) from error
-
-
-def one_line(error: object) -> str:
-    """Return the text of an error without line breaks."""
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:

@@ -10,10 +10,11 @@ from itertools import islice
 import click
 import numpy as np
 
-from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import Setting, converted, option, parse_setting, settings, timeout_option, url_option
 from vtbdrake.cli.output import finite
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.failures import one_line
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
 from vtbdrake.monitoring.live.client import watch as watch_live
 

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
-from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
 from vtbdrake.cli.output import RECORDINGS, save_recording
+from vtbdrake.failures import one_line
 from vtbdrake.recording.export import EXPORTS
 from vtbdrake.recording.export import export as export_log
 from vtbdrake.recording.log_reader import read_log

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
     option,
@@ -20,6 +20,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.output import number
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.failures import one_line
 from vtbdrake.machine import Machine, MachineConfig, MachineLoop
 from vtbdrake.machine.loop import epoch, serve
 from vtbdrake.machine.machine import BRAKES

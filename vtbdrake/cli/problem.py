@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import click
 import numpy as np
 
-from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
     horizon_option,
@@ -32,6 +32,7 @@ from vtbdrake.cli.options import (
     start_option,
 )
 from vtbdrake.cli.output import number, table, write_csv
+from vtbdrake.failures import one_line
 from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
 from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension, point_text

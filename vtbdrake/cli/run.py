@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from vtbdrake.child_process import ProcessStartError, ending_signals, logging_in_thread
-from vtbdrake.cli import FailedError, one_line
+from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
     option,
@@ -29,6 +29,7 @@ from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
+from vtbdrake.failures import one_line
 from vtbdrake.recording.recorder import RecordingError
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario

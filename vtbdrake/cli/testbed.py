@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.argument_checks import suggestion
-from vtbdrake.cli import BadInputError, FailedError, one_line
+from vtbdrake.cli import BadInputError, FailedError
 from vtbdrake.cli.options import (
     Setting,
     horizon_option,
@@ -25,6 +25,7 @@ from vtbdrake.cli.options import (
     start_option,
 )
 from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
+from vtbdrake.failures import one_line
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.state import Snapshot, Variable, Variables
 from vtbdrake.testbed import Scenario

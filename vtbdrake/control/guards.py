@@ -16,7 +16,7 @@ from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
 from vtbdrake.control.staleness import check_all
-from vtbdrake.error_text import error_text
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import Interface, Signal
 
 _log = logging.getLogger(__name__)
@@ -441,10 +441,10 @@ class Guards:
                     fallback.begin()
                 command = fallback.command(last_sent, sensed, known, dt)
                 return command if command is NO_COMMAND else limiter.limit(command, at)
-            except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            except FAILURES as error:
                 if fallback not in self._failed:
                     self._failed.add(fallback)
-                    reason = f"{type(fallback).__name__} cannot command {name}: {type(error).__name__}: {error}"
+                    reason = f"{type(fallback).__name__} cannot command {name}: {error_text(error)}"
                     self.log.append(Fault(now, name, "fallback", reason))
         return limiter.limit(last_sent, at)
 

@@ -31,6 +31,7 @@ from vtbdrake.control.switching import (
     perform,
     prepare,
 )
+from vtbdrake.failures import FAILURES
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
 from vtbdrake.testbed.interrupt import Interruptible
 from vtbdrake.testbed.testbed import Positions
@@ -320,7 +321,7 @@ class Runtime(Stepped):
         for watcher in self._watchers[:]:
             try:
                 watcher(done)
-            except (Exception, SystemExit):  # A failed assertion inside Drake arrives as SystemExit.
+            except FAILURES:
                 _log.exception("a watcher of the loop raised, and is removed")
                 self._watchers.remove(watcher)
         return done
@@ -540,7 +541,7 @@ class Runtime(Stepped):
                 continue
             try:
                 future.set_result(action())
-            except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+            except FAILURES as error:
                 future.set_exception(error)
         self.read_switches()
 

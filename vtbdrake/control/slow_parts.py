@@ -17,6 +17,7 @@ from vtbdrake.control.clock import Clock
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, pack, supervise, unpack
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import RESULT as CHANGE
+from vtbdrake.failures import error_text
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
 
@@ -79,8 +80,8 @@ class SlowParts:
                 functions[path] = dumps(part.function_beside(period))
             except Exception as error:
                 raise ValueError(
-                    f"the function of the slow part {path} cannot be sent to another process ({type(error).__name__}: "
-                    f"{error}): keep what cannot be pickled out of it"
+                    f"the function of the slow part {path} cannot be sent to another process ({error_text(error)}): "
+                    "keep what cannot be pickled out of it"
                 ) from error
         self._context = context
         self._step = period * (1.0 + _ROUNDING)

@@ -13,6 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.guards import Verdict
 from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.failures import FAILURES
 from vtbdrake.state.systems import leaves
 from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -189,7 +190,7 @@ class Stepped:
             self.time = end
             self.steps += 1
             return None, self._ports.actuation(self.active)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             # The time stays where it was: the next cycle tries the step again.
             return error, {}
 

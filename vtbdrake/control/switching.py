@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.stepping import SWITCH
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
 from vtbdrake.testbed.switch import REAL, SIM
 from vtbdrake.testbed.testbed import Positions, wanted_positions
@@ -144,8 +145,8 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
             continue
         try:
             command = runtime.actuator_command(name)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            found.append(f"the actuator command {name} cannot be computed: {type(error).__name__}: {error}")
+        except FAILURES as error:
+            found.append(f"the actuator command {name} cannot be computed: {error_text(error)}")
             continue
         if command is not None:  # A DPS that has not started has no command; its first one is compared in its cycle.
             found += discontinuity(runtime, name, command)

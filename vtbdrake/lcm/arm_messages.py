@@ -32,6 +32,7 @@ from drake import (
 )
 from numpy.typing import NDArray
 
+from vtbdrake.failures import FAILURES
 from vtbdrake.lcm.maps import Decoder, Encoder, LcmMap, vector_map
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Signal
@@ -262,7 +263,7 @@ class OnTopOfGravityMap(LcmMap):
             raise ValueError(f"signals {', '.join(self.on_top)} on channel {self.channel} are vectors of one size")
         try:
             shape = np.shape(self.gravity(np.zeros(size)))
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             raise ValueError(f"the gravity of channel {self.channel} cannot take {size} positions: {error}") from error
         if shape != (size,):
             raise ValueError(f"the gravity of channel {self.channel} has the shape {shape}, not ({size},)")

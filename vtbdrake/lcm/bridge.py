@@ -13,6 +13,7 @@ from typing import Any
 from vtbdrake.control.bridge import Bridge, reported_signals
 from vtbdrake.control.limits import Bounds
 from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.failures import FAILURES
 from vtbdrake.lcm.connections import Handler, LcmLink
 from vtbdrake.lcm.hub import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
@@ -299,7 +300,7 @@ class ChannelReader:
             reason = "" if fits else self._order(sent, now)
         except MalformedError as error:
             reason = error.reason
-        except (Exception, SystemExit):  # a failed assertion in Drake's C++ is a SystemExit
+        except FAILURES:
             reason = "decode"
         if reason:
             for _, received, _ in self._signals:
@@ -388,7 +389,7 @@ class ChannelWriter:
                 return list(values), self._encode(values, utime)
             except LookupError:
                 faults = dict.fromkeys(values, "incomplete")
-            except (Exception, SystemExit):
+            except FAILURES:
                 faults = dict.fromkeys(values, "encode")
         for name in values:
             self._sent[name].record(faults.get(name, "same message"))

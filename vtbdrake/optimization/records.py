@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from vtbdrake.error_text import safe_text
+from vtbdrake.failures import safe_text
 from vtbdrake.optimization.solvers.solver import Point, PointValues
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.task import FAILED

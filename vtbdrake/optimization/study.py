@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from vtbdrake.argument_checks import as_whole
-from vtbdrake.error_text import safe_text
+from vtbdrake.failures import safe_text
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
 from vtbdrake.optimization.parameter import Dimension, checked_point, point_text

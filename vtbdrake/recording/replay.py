@@ -27,6 +27,7 @@ from vtbdrake.control.stepping import (
     times_after,
 )
 from vtbdrake.control.switching import throw
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.lcm.maps import Decoder
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log_format import DPS, TESTBED, LogError, installed_versions, target_kind
@@ -254,9 +255,9 @@ class _Replay:
                 if values is not None:
                     values[i] = value
                 commanded[i] = True
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             # The loop may have had the same exception and gone on without actuator commands: the comparison shows.
-            self.errors[int(self._log.numbers[i])] = f"{type(error).__name__}: {error}"
+            self.errors[int(self._log.numbers[i])] = error_text(error)
             for _, values, commanded in self._outputs:
                 commanded[i] = False
                 if values is not None:
@@ -447,7 +448,7 @@ def _replay_in_batches(log: ControlLog) -> _Replay | None:
         run.run()
     except LogError:
         raise
-    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+    except FAILURES as error:
         _log.info("replayed cycle by cycle: %s", error)
         return None
     if found := run.differences():

@@ -15,6 +15,7 @@ from functools import partial
 from math import inf
 from typing import Any
 
+from vtbdrake.failures import error_text
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
 from vtbdrake.rollout.pruning import Cutoff
@@ -148,7 +149,7 @@ class DaskExecutor(Executor):
                 if self._client.status != "running":
                     raise _given_up(error) from error
                 raise WorkerError(
-                    f"the Dask workers cannot read the problem ({type(error).__name__}: {error}): they need the same "
+                    f"the Dask workers cannot read the problem ({error_text(error)}): they need the same "
                     "vtbdrake as this process"
                 ) from error
             self._sent[task.digest] = name

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
 
+from vtbdrake.failures import error_text
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.pickled_task import (
     KEPT_TASKS,
@@ -96,7 +97,7 @@ class FuturesExecutor(Executor):
                     if self._replaceable():
                         lost.append(index)
                         continue
-                    reason = f"the pool broke while it had this rollout ({type(error).__name__}: {error})"
+                    reason = f"the pool broke while it had this rollout ({error_text(error)})"
                     result = failed(points[index], reason)
                 yield index, result
         finally:

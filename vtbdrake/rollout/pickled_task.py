@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
@@ -56,7 +57,7 @@ def _pickle(task: RolloutTask) -> PickledTask:
         content = dumps(task)
     except Exception as error:
         raise WorkerError(
-            f"the problem cannot be sent to another process ({type(error).__name__}: {error}): use executor='threads' "
+            f"the problem cannot be sent to another process ({error_text(error)}): use executor='threads' "
             "or 'serial', keep what cannot be pickled out of its quality function and scenario, or move the class or "
             "function that holds it from the notebook or script into a module"
         ) from error
@@ -77,7 +78,7 @@ def pack(point: Mapping[str, Any]) -> bytes:
                 dumps(value)
             except Exception as error:
                 raise WorkerError(
-                    f"{address} = {value!r} cannot be sent to another process ({type(error).__name__}: {error}): vary "
+                    f"{address} = {value!r} cannot be sent to another process ({error_text(error)}): vary "
                     "a value that pickles, or use executor='threads' or 'serial'"
                 ) from error
         raise
@@ -112,7 +113,7 @@ def unpack(content: bytes) -> Any:
         return pickle.loads(content)
     except Exception as error:
         raise WorkerError(
-            f"a worker process cannot read what it was sent ({type(error).__name__}: {error}): it needs the same "
+            f"a worker process cannot read what it was sent ({error_text(error)}): it needs the same "
             "modules as the main process, in the same versions"
         ) from error
 
@@ -125,7 +126,7 @@ def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
     outcome: RolloutResult | BaseException
     try:
         outcome = rollout()
-    except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+    except FAILURES as error:
         outcome = error
     try:
         reply = _dumps((index, outcome))
@@ -138,7 +139,7 @@ def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
             remedy = "record vectors, or use executor='serial'"
             outcome = TypeError(f"a result cannot be sent from a worker process ({error}): {remedy}")
             return pickle.dumps((index, outcome))
-    return pickle.dumps((index, RuntimeError(f"{type(outcome).__name__}: {outcome}")))
+    return pickle.dumps((index, RuntimeError(error_text(outcome))))
 
 
 def _dumps(reply: tuple[int, Any]) -> bytes:

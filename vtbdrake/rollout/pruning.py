@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import inf, isnan, nan
 
 from vtbdrake.argument_checks import as_addresses, as_number
-from vtbdrake.error_text import safe_text
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 
 # How a rollout ends: it cannot win any more; its quality has not improved for too long.
@@ -158,8 +158,8 @@ class Prospect:
         assert self._pruning.bound is not None
         try:
             bound = float(self._pruning.bound(left, *values))
-        except (Exception, SystemExit) as error:
-            raise QualityError(f"the bound of a pruning raises {type(error).__name__}: {safe_text(error)}") from error
+        except FAILURES as error:
+            raise QualityError(f"the bound of a pruning raises {error_text(error)}") from error
         if isnan(bound):
             raise QualityError(f"the bound of a pruning is NaN with {left:g} s left, for {values}")
         return bound

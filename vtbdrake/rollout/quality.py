@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vtbdrake.argument_checks import as_addresses, as_flag, as_number
-from vtbdrake.error_text import safe_text
+from vtbdrake.failures import FAILURES, error_text, safe_text
 
 # (times, samples, True if larger samples are better) -> (time, number)
 Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[float, float]]
@@ -110,8 +110,8 @@ class Measure:
         """
         try:
             sample = float(self.f(*values))
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            raise QualityError(f"{self._at(values, time)} raises {type(error).__name__}: {safe_text(error)}") from error
+        except FAILURES as error:
+            raise QualityError(f"{self._at(values, time)} raises {error_text(error)}") from error
         self._check(sample, lambda: self._at(values, time))
         return sample
 

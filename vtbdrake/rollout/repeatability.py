@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import ContextBase
 
+from vtbdrake.failures import error_text
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.quality import QualityError
@@ -215,7 +216,7 @@ def _unsendable(task: RolloutTask) -> Iterator[str]:
             dumps(value)
         except Exception as error:
             yield (
-                f"{what} cannot be sent to workers ({type(error).__name__}: {error}): use executor='threads' or "
+                f"{what} cannot be sent to workers ({error_text(error)}): use executor='threads' or "
                 "'serial', or make it where it is used, from plain data"
             )
             return

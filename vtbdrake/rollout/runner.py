@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from vtbdrake.error_text import error_text
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
@@ -301,7 +301,7 @@ class RolloutRunner:
         """Return the failure; if the DPS commands what is not finite, with the name of that signal."""
         own = self.testbed.dps.GetMyContextFromRoot(self._context)
         for signal in self.testbed.interface.act:
-            with suppress(Exception, SystemExit):
+            with suppress(*FAILURES):
                 command = self.testbed.dps.GetOutputPort(signal.name).Eval(own) if signal.is_vector else np.zeros(0)
                 if not np.isfinite(command).all() and signal.name not in str(failure):
                     return SimulationError(f"the DPS commands {signal.name} = {command}; {failure}")
@@ -342,16 +342,13 @@ def _terminated(status: SimulatorStatus) -> bool:
 
 
 class _FailuresAsOutcomes:
-    """A context manager that turns the exceptions of a failing simulation into SimulationError.
-
-    A failed assertion inside Drake arrives as SystemExit.
-    """
+    """A context manager that turns the exceptions of a failing simulation into SimulationError."""
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception | SystemExit) and not isinstance(error, SimulationError):
+        if isinstance(error, FAILURES) and not isinstance(error, SimulationError):
             raise SimulationError(error_text(error)) from error
 
 
@@ -606,7 +603,7 @@ class Runners:
             testbed = self._testbeds.get(changed.scenario)
         except ScenarioError:
             raise
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             chosen = ", ".join(f"{FIELD}{name} = {value!r}" for name, value in fields.items())
             raise BuildError(f"no testbed can be built with {chosen}: {error_text(error)}") from error
         return RolloutRunner(changed, testbed)

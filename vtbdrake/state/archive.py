@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from vtbdrake.failures import one_line
+
 _HEADER = "header.json"
 _ARRAY = ".npy"
 # Every file may unpack to this many bytes.
@@ -97,7 +99,7 @@ def read_archive(
     except (FileNotFoundError, ArchiveError):
         raise
     except Exception as error:  # A damaged file can cause any.
-        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        reason = f"it has no {error}" if isinstance(error, KeyError) else one_line(error)
         raise ArchiveError(f"{path} is not a {kind}, or it is damaged: {reason}") from error
 
 

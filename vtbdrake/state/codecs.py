@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeDelay
 
+from vtbdrake.failures import error_text
 from vtbdrake.state.declarations import Codec
 from vtbdrake.state.systems import class_name, is_camera, is_plant, is_scene_graph
 
@@ -248,7 +249,7 @@ class AbstractState:
         except Exception as error:  # Codec and arrays may come from anywhere.
             raise SnapshotError(
                 f"abstract state {index} of {self._path} cannot be made of the arrays {', '.join(parts) or 'none'}: "
-                f"{type(error).__name__}: {error}"
+                f"{error_text(error)}"
             ) from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -193,4 +194,4 @@ def test_failed_prediction_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     together.run(110)
     np.testing.assert_allclose(residuals(monitor), 0.0, atol=1e-12)
     assert (monitor.failed, len(monitor.history)) == (1, 9)
-    assert monitor.error == "RuntimeError: the step size is too small"
+    assert re.fullmatch(r"RuntimeError: the step size is too small \(test_comparison\.py, line \d+\)", monitor.error)

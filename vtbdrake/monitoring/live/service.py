@@ -16,6 +16,7 @@ from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.failures import FAILURES
 from vtbdrake.monitoring.live.messages import ReadRequest, Request, SetRequest
 from vtbdrake.monitoring.live.server import VALUES, outcome_frame, serve, values_record
 
@@ -124,7 +125,7 @@ class LiveService:
                 return {"unknown": address}
         try:
             self._runtime.write(values)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             # Any error belongs to the client, not to the loop.
             return {"error": str(error)}
         return {"ok": True}
@@ -223,7 +224,7 @@ class _Reading:
         self._next = (k + 1) % len(self._readers)
         try:
             value = np.asarray(self._readers[k](context), dtype=float)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             self.error = f"{self._addresses[k]} cannot be read: {error}"
             return True
         if not self.described:

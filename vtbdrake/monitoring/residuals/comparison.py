@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import Interface, Scenario
 from vtbdrake.testbed.prediction import Predictor
 
@@ -226,10 +227,10 @@ class Comparison:
     def _window(self, s: int) -> Window | None:
         try:
             differences, whole = self._compare(s)
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
+        except FAILURES as error:
             _log.warning("a prediction failed and restarts: %s", error)
             self.failed += 1
-            self.error = f"{type(error).__name__}: {error}"
+            self.error = error_text(error)
             self._predictor.reset()
             self._started = False
             self._settled = -self._config.settle

@@ -15,6 +15,7 @@ import numpy as np
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import SWITCH, Cycle
+from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, CalibrationError, calibrate
 from vtbdrake.monitoring.residuals.comparison import (
     INDEX,
@@ -373,8 +374,8 @@ class Sampler:
         raised = next((fault.reason for fault in cycle.verdict.faults if fault.kind == "raised"), "")
         try:
             self._fill_answer(rows[len(groups) - 1], max(groups), cycle, raised=bool(raised))
-        except (Exception, SystemExit) as error:  # A failed assertion inside Drake arrives as SystemExit.
-            raised = f"the DPS raised {type(error).__name__} when its estimates were read: {error}"
+        except FAILURES as error:
+            raised = f"the DPS raised {error_text(error)} when its estimates were read"
         # Its window will lack these values. An error that repeats itself in every cycle is logged once.
         if raised and raised != self.error:
             self.error = raised

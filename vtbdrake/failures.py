@@ -1,4 +1,4 @@
-"""The text of an error that is kept or logged instead of being raised."""
+"""Failures that are kept or logged instead of being raised: what counts as one, and its text."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from pathlib import Path
 from traceback import walk_tb
 from typing import Any
 
+# What a simulation or a function of the user can raise: a failed assertion inside Drake arrives as SystemExit.
+FAILURES = (Exception, SystemExit)
+
 # Code that is not the user's: this package, the installed ones, and Python's own.
-_NOT_THE_USERS = (Path(__file__).parent, *(Path(sysconfig.get_path(name)) for name in ("purelib", "platlib", "stdlib")))
+_NOT_THE_USERS = tuple(
+    f"{folder}/" for folder in (Path(__file__).parent, *map(sysconfig.get_path, ("purelib", "platlib", "stdlib")))
+)
 
 
 def safe_text(value: Any) -> str:
@@ -21,11 +26,18 @@ def safe_text(value: Any) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
+def one_line(error: object) -> str:
+    """Return the message of an error, or any text, on one line; of an error without a message its class."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(safe_text(error).split()) or type(error).__name__
+
+
 def error_text(error: BaseException) -> str:
     """Return class and message of an error on one line, with the last line of the user's code that led to it."""
-    text = f"{type(error).__name__}: {' '.join(safe_text(error).split()) or type(error).__name__}"
+    text = f"{type(error).__name__}: {one_line(error)}"
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
-        file = Path(frame.f_code.co_filename)
-        if not any(file.is_relative_to(folder) for folder in _NOT_THE_USERS):
-            return f"{text} ({file.name}, line {line})"
+        file = frame.f_code.co_filename
+        if not file.startswith(_NOT_THE_USERS):
+            return f"{text} ({Path(file).name}, line {line})"
     return text
