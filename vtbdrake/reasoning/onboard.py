@@ -17,7 +17,8 @@ from pydrake.systems.framework import BasicVector, Context, State
 from vtbdrake.reasoning.belief import Belief, BeliefError
 from vtbdrake.reasoning.budget import Budget
 from vtbdrake.reasoning.reasoner import Reasoner
-from vtbdrake.state import NO_DICT, parameter
+from vtbdrake.state import parameter
+from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.slow_part import SlowFunction

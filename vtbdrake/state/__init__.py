@@ -2,17 +2,28 @@
 
 from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.codecs import SnapshotError
-from vtbdrake.state.declarations import NO_DICT, Codec, Element, continuous_state, discrete_state, parameter, weakly
+from vtbdrake.state.declarations import (
+    AddressedSystem,
+    Codec,
+    Element,
+    NamedVector,
+    Quantity,
+    continuous_state,
+    discrete_state,
+    parameter,
+)
 from vtbdrake.state.snapshot import Snapshot
 from vtbdrake.state.systems import collect
 from vtbdrake.state.variables import AddressError, Variable, VariableError, Variables
 
 __all__ = [
-    "NO_DICT",
     "AddressError",
+    "AddressedSystem",
     "ArchiveError",
     "Codec",
     "Element",
+    "NamedVector",
+    "Quantity",
     "Snapshot",
     "SnapshotError",
     "Variable",
@@ -22,5 +33,4 @@ __all__ = [
     "continuous_state",
     "discrete_state",
     "parameter",
-    "weakly",
 ]

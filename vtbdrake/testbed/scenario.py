@@ -53,8 +53,8 @@ class Scenario(ABC):
     processes.
 
     When a study varies a field, a testbed is built for each value. Python's garbage collector frees unused ones if
-    every system in Python has ``__slots__ = NO_DICT`` and computes its output ports by ``weakly(self, Class._calc)``;
-    see `vtbdrake.state`. Others stay until their process ends; `ProcessExecutor` replaces workers that have grown.
+    every system in Python is a `vtbdrake.state.AddressedSystem`. Others stay until their process ends;
+    `ProcessExecutor` replaces workers that have grown.
 
     Attributes:
         simulator_config: The integrator. ``target_realtime_rate`` and ``publish_every_time_step`` hold for
