@@ -18,7 +18,7 @@ from vtbdrake.state.systems import leaves
 from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.signal import Feed
-from vtbdrake.testbed.switch import COMMAND, REAL, T_ACT, T_SENSE
+from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE, Position
 
 _log = logging.getLogger(__name__)
 
@@ -210,7 +210,7 @@ class Stepped:
             self.watched = {} if self.idle else sensed
         else:
             positions = self.target.positions(self._context)["sense"]
-            self.watched = {name: sensed[name] for name, position in positions.items() if position == REAL}
+            self.watched = {name: sensed[name] for name, position in positions.items() if position == Position.REAL}
 
     def feed(self) -> None:
         """Feed the samples that are new to the real ports."""

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.control.stepping import SWITCH
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
-from vtbdrake.testbed.switch import REAL, SIM
+from vtbdrake.testbed.switch import Position
 from vtbdrake.testbed.testbed import Positions, wanted_positions
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ class SwitchRefusedError(RuntimeError):
 class Preparation:
     """The first phase of a switch: the planned changes, and the reasons against them."""
 
-    sense: Mapping[str, str]  # new positions by sensor signal
-    act: Mapping[str, str]  # new positions by actuator signal
+    sense: Mapping[str, Position]  # new positions by sensor signal
+    act: Mapping[str, Position]  # new positions by actuator signal
     reasons: tuple[str, ...]  # the reasons against the switch; empty if there are none
     cycle: int  # number of the runtime's cycles when they were collected
 
@@ -59,17 +59,19 @@ def prepare(
     """
     target = runtime.target
     senses, acts = wanted_positions(target.interface, mode, sense, act)
-    if isinstance(target, DpsAlone) and any(position != REAL for position in [*senses.values(), *acts.values()]):
+    if isinstance(target, DpsAlone) and any(
+        position != Position.REAL for position in [*senses.values(), *acts.values()]
+    ):
         raise ValueError("the DPS alone has no simulated world: it can be switched to real only")
     now = runtime.clock.now()
     reasons = []
-    commanding = [name for name, position in acts.items() if position != SIM]
+    commanding = [name for name, position in acts.items() if position != Position.SIM]
     becoming = [name for name in commanding if name not in runtime.guards.driven]
-    if (commanding or REAL in senses.values()) and not runtime.bridge.connected:
+    if (commanding or Position.REAL in senses.values()) and not runtime.bridge.connected:
         reasons.append("the bridge is not connected")
-    heard = [name for name, position in senses.items() if position == REAL]
+    heard = [name for name, position in senses.items() if position == Position.REAL]
     if commanding:
-        heard += [name for name in runtime.watched if senses.get(name) != SIM]
+        heard += [name for name in runtime.watched if senses.get(name) != Position.SIM]
         heard += [runtime.continuity[name][0] for name in becoming if name in runtime.continuity]
     for name in dict.fromkeys(heard):
         reasons += runtime.guards.sensor_faults(name, now, runtime.bridge.sensed[name])
@@ -172,17 +174,17 @@ def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:
     return [f"{reason}: {hint}"]
 
 
-def perform(runtime: Runtime, senses: Mapping[str, str], acts: Mapping[str, str]) -> None:
+def perform(runtime: Runtime, senses: Mapping[str, Position], acts: Mapping[str, Position]) -> None:
     """Throw the switches of a preparation without reasons against it; `Runtime.perform` calls this."""
     for name, position in acts.items():
-        if position != SIM and name in runtime.continuity and name not in runtime.guards.driven:
+        if position != Position.SIM and name in runtime.continuity and name not in runtime.guards.driven:
             # The actuator commands start from the measured values; a signal that is commanded already goes on.
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
             runtime.uncompared.add(name)
     runtime.note_change(
         SWITCH,
-        {f"sense.{name}": position for name, position in senses.items()}
-        | {f"act.{name}": position for name, position in acts.items()},
+        {f"sense.{name}": position.value for name, position in senses.items()}
+        | {f"act.{name}": position.value for name, position in acts.items()},
     )
     if isinstance(runtime.target, DpsAlone):
         runtime.start_dps()
@@ -200,7 +202,7 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)
     back = any(
-        position == SIM != before[side][name]
+        position == Position.SIM != before[side][name]
         for side, positions in (("sense", senses), ("act", acts))
         for name, position in positions.items()
     )

@@ -37,7 +37,7 @@ from vtbdrake.state import Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.interrupt import Interruptible
-from vtbdrake.testbed.switch import COMMAND, REAL
+from vtbdrake.testbed.switch import COMMAND, Position
 
 _log = logging.getLogger(__name__)
 
@@ -393,7 +393,9 @@ def _check_fed_by_machine(log: ControlLog) -> None:
     positions = {f"sense.{name}": position for name, position in log.header.positions["sense"].items()}
     switched = [change.values for _, change in log.changes if change.kind == SWITCH]
     for values in (positions, *switched):
-        simulated = [name for name, position in values.items() if name.startswith("sense.") and position != REAL]
+        simulated = [
+            name for name, position in values.items() if name.startswith("sense.") and position != Position.REAL
+        ]
         if simulated:
             raise LogError(
                 f"{', '.join(simulated)} came from the simulated world in {log.path}, which the DPS alone does not "

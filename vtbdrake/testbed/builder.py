@@ -255,7 +255,7 @@ class VirtualTestbedBuilder:
             self.diagram_builder, self.interface, sense_position, act_position, self._dps, u, guarded=guarded
         )
         self._connect_switches(switches, self._dps)
-        commands = tuple(switches.command_variables(self.interface.commands))
+        commands = tuple(switches.commands.variables(self.interface.commands))
         for command in commands:
             command.check(u[command.address.removeprefix(COMMAND)].reshape(command.shape))
         if meshcat is not None:
@@ -353,7 +353,7 @@ class VirtualTestbedBuilder:
             self.diagram_builder.ExportOutput(switches.real_act[name], f"real.act.{name}")
         if self.actuators:
             self.diagram_builder.ExportOutput(switches.active, "real.act.active")
-        for name, port in {**switches.commands, **self._commands}.items():
+        for name, port in {**switches.commands.ports, **self._commands}.items():
             self.connect(port, dps.GetInputPort(name))
 
     def plant_roles(self) -> dict[str, str]:

@@ -18,8 +18,8 @@ from vtbdrake.state.variables import html_table
 from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.scenario import Scenario, check_is_scenario
-from vtbdrake.testbed.signal import Feed, Interface, SignalError
-from vtbdrake.testbed.switch import COMMAND, REAL, Switches
+from vtbdrake.testbed.signal import Feed, SignalError
+from vtbdrake.testbed.switch import COMMAND, CommandBoard
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.testbed import VirtualTestbed
@@ -43,8 +43,8 @@ class DpsAlone(AddressedDiagram):
         dps = parts.set_dps(scenario.make_dps())
         builder = parts.diagram_builder
         u = {s.name: s.default_vector() for s in interface.commands}
-        board = Switches(builder, Interface((), ()), REAL, REAL, dps, u)
-        for name, port in board.commands.items():
+        commands = CommandBoard(builder, u)
+        for name, port in commands.ports.items():
             builder.Connect(port, dps.GetInputPort(name))
         for signal in interface.sense:
             builder.ExportInput(dps.GetInputPort(signal.name), f"real.sense.{signal.name}")
@@ -59,7 +59,7 @@ class DpsAlone(AddressedDiagram):
             interface=interface,
             simulator_config=_unpaced(scenario.simulator_config, has_plant=False),
             scenario=scenario,
-            extra=board.command_variables(interface.commands),
+            extra=commands.variables(interface.commands),
         )
         self.dps = dps
         self._copiers: dict[int, StateCopier] = {}

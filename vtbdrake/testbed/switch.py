@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,9 +30,27 @@ from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variables import Variable, VariableError, X
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 
-SIM, REAL, TWIN = "sim", "real", "twin"
-SENSE_POSITIONS = (SIM, REAL)
-ACT_POSITIONS = (SIM, REAL, TWIN)
+
+class Position(StrEnum):
+    """A position of a switch: its name is what users write and what files hold, its number is what s holds."""
+
+    SIM = "sim"
+    REAL = "real"
+    TWIN = "twin"
+
+    @property
+    def number(self) -> int:
+        """Return the position as an element of s: 0 is sim, 1 is real, 2 is twin."""
+        return ACT_POSITIONS.index(self)
+
+    @property
+    def port(self) -> InputPortIndex:
+        """Return the input port of a PortSwitch that the position selects; port 0 is its selector port."""
+        return InputPortIndex(1 + self.number)
+
+
+SENSE_POSITIONS = (Position.SIM, Position.REAL)
+ACT_POSITIONS = tuple(Position)
 
 T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
 
@@ -131,56 +151,92 @@ FiniteCommand = FiniteCommand_[None]
 
 
 class Selector:
-    """The position of one switch: abstract state ``index`` of the switch board, port 1 being the first position.
+    """The position of one switch: abstract state ``index`` of the switch board.
 
     ``flag`` is its entry in the board's ``active``; None for a sensor signal.
     """
 
-    def __init__(self, board: System, name: str, positions: tuple[str, ...], index: int, flag: int | None) -> None:
+    def __init__(self, board: System, name: str, positions: Sequence[Position], index: int, flag: int | None) -> None:
         self.name = name
-        self.positions = positions
+        self._positions = positions
         self._board = board
         self._index = index
         self._flag = flag
 
-    def get(self, context: Context) -> str:
+    def get(self, context: Context) -> Position:
         """Return the position in a context of the testbed."""
-        state = self._board.GetMyContextFromRoot(context).get_abstract_state(self._index).get_value()
-        return self.positions[int(state) - 1]
+        port = self._board.GetMyContextFromRoot(context).get_abstract_state(self._index).get_value()
+        return self._positions[int(port) - 1]
 
-    def set(self, context: Context, position: str) -> None:
-        """Set the position in a context of the testbed to one of `positions`."""
+    def set(self, context: Context, position: Position) -> None:
+        """Set the position in a context of the testbed."""
         board = self._board.GetMyMutableContextFromRoot(context)
-        board.SetAbstractState(self._index, _port(self.positions, position))
+        board.SetAbstractState(self._index, position.port)
         if self._flag is not None:
             group = board.num_discrete_state_groups() - 1
             active = np.array(board.get_discrete_state(group).value())
-            active[self._flag] = float(position != SIM)
+            active[self._flag] = float(position != Position.SIM)
             board.SetDiscreteState(group, active)
 
     def variable(self) -> Variable:
-        """Return the position as an element of s: 0 is sim, 1 is real, 2 is twin."""
+        """Return the position as an element of s, see `Position.number`."""
 
         def refuse(value: np.ndarray) -> None:
             if not float(value).is_integer():
-                known = ", ".join(f"{i} ({p})" for i, p in enumerate(self.positions))
-                raise VariableError(f"{self.name} is one of {known}, not {float(value):g}")
+                numbers = ", ".join(f"{position.number} ({position})" for position in self._positions)
+                raise VariableError(f"{self.name} is one of {numbers}, not {float(value):g}")
 
         return Variable(
             self.name,
             X,
             (),
             "1",
-            lambda context: float(self.positions.index(self.get(context))),
-            lambda context, value: self.set(context, self.positions[int(value)]),
-            bounds=(0.0, len(self.positions) - 1.0),
+            lambda context: float(self.get(context).number),
+            lambda context, value: self.set(context, self._positions[int(value)]),
+            bounds=(0.0, len(self._positions) - 1.0),
             refuse=refuse,
         )
 
 
-def _port(positions: tuple[str, ...], position: str) -> InputPortIndex:
-    # Port 0 of a PortSwitch is its selector port.
-    return InputPortIndex(1 + positions.index(position))
+class CommandBoard:
+    """The system that holds the constant commands u and, in a testbed, the state of all switches.
+
+    Args:
+        builder: The builder of the Diagram.
+        u: Default values of the commands, by signal.
+        switches: Initial port of each switch, by its name.
+        constants: Further constants, by the name of their port.
+        active: Flags of the actuator signals whose switch lets the DPS command.
+
+    Attributes:
+        system: The `SwitchBoard`.
+        ports: Output ports of the commands, by signal.
+    """
+
+    def __init__(
+        self,
+        builder: DiagramBuilder,
+        u: Mapping[str, np.ndarray],
+        *,
+        switches: Mapping[str, int] = MappingProxyType({}),
+        constants: Mapping[str, np.ndarray] = MappingProxyType({}),
+        active: Sequence[float] = (),
+    ) -> None:
+        commands = {f"{COMMAND}{name}": value for name, value in u.items()}
+        board = SwitchBoard(switches, {**commands, **constants}, np.array(active, dtype=float))
+        self.system = builder.AddNamedSystem(BOARD, board)
+        self.ports: dict[str, OutputPort] = {name: self.system.GetOutputPort(f"{COMMAND}{name}") for name in u}
+
+    def variables(self, signals: Sequence[Signal]) -> Iterator[Variable]:
+        """Yield the commands as variables ``u.<signal>``, with the units and bounds of ``signals``."""
+        by_name = {signal.name: signal for signal in signals}
+        for index, name in enumerate(self.ports):
+            signal = by_name[name]
+            size = signal.vector(0.0).size
+            shape = () if size == 1 else (size,)
+            bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
+            element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
+            yield from leaf_variables(f"{COMMAND}{name}", self.system, declared=[element])
 
 
 class Switches:
@@ -195,7 +251,7 @@ class Switches:
         dps_sense: Output ports for the sensor inputs of the DPS, by signal.
         sim_act, real_act: Output ports for the simulated and the real actuators, by signal.
         active: Output port of the flags of all actuator signals.
-        commands: Output ports of the constant commands u, by signal.
+        commands: The board of the constant commands u.
 
     Args:
         u: Default values of the constant commands, by signal.
@@ -207,8 +263,8 @@ class Switches:
         self,
         builder: DiagramBuilder,
         interface: Interface,
-        sense_position: str,
-        act_position: str,
+        sense_position: Position,
+        act_position: Position,
         dps: System,
         u: Mapping[str, np.ndarray],
         *,
@@ -217,15 +273,15 @@ class Switches:
         self._builder = builder
         sense = {f"{T_SENSE}{signal.name}": signal for signal in interface.sense}
         act = {f"{T_ACT}{signal.name}": signal for signal in interface.act}
-        ports = {name: int(_port(SENSE_POSITIONS, sense_position)) for name in sense}
-        ports |= {name: int(_port(ACT_POSITIONS, act_position)) for name in act}
-        constants = {f"{COMMAND}{name}": value for name, value in u.items()}
+        ports = {**dict.fromkeys(sense, int(sense_position.port)), **dict.fromkeys(act, int(act_position.port))}
+        constants: dict[str, np.ndarray] = {}
         for name, signal in act.items():
             if signal.is_vector:
                 constants[f"{name}.idle"] = signal.vector(signal.idle)
                 constants[f"{name}.none"] = signal.vector(np.nan)
-        active = np.full(len(act), float(act_position != SIM))
-        self._board = builder.AddNamedSystem(BOARD, SwitchBoard(ports, constants, active))
+        active = [float(act_position != Position.SIM)] * len(act)
+        self.commands = CommandBoard(builder, u, switches=ports, constants=constants, active=active)
+        self._board = self.commands.system
         self.sense = {
             s.name: Selector(self._board, n, SENSE_POSITIONS, i, None) for i, (n, s) in enumerate(sense.items())
         }
@@ -254,17 +310,6 @@ class Switches:
             else:
                 self.real_act[signal.name] = self._gate(name, signal, command)
         self.active = self._board.GetOutputPort("active")
-        self.commands = {name: self._board.GetOutputPort(f"{COMMAND}{name}") for name in u}
-
-    def command_variables(self, signals: Sequence[Signal]) -> Iterator[Variable]:
-        """Yield the constant commands as variables ``u.<signal>``."""
-        for index, name in enumerate(self.commands):
-            signal = next(signal for signal in signals if signal.name == name)
-            size = signal.vector(0.0).size
-            shape = () if size == 1 else (size,)
-            bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
-            element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
-            yield from leaf_variables(f"{COMMAND}{name}", self._board, declared=[element])
 
     def _idle(self, name: str, signal: Signal) -> OutputPort:
         if signal.is_vector:
@@ -292,13 +337,13 @@ class Switches:
         return output
 
     def _gate(self, switch: str, signal: Signal, command: OutputPort) -> OutputPort:
-        gate = self._builder.AddNamedSystem(f"{switch}.real", ActuatorGate(signal, _port(ACT_POSITIONS, SIM)))
+        gate = self._builder.AddNamedSystem(f"{switch}.real", ActuatorGate(signal, closed=Position.SIM.port))
         self._builder.Connect(self._board.GetOutputPort(switch), gate.GetInputPort("port_selector"))
         self._builder.Connect(command, gate.GetInputPort("command"))
         return gate.get_output_port()
 
     def _add_switch(
-        self, switch: str, name: str, signal: Signal, positions: tuple[str, ...]
+        self, switch: str, name: str, signal: Signal, positions: Sequence[Position]
     ) -> tuple[list[InputPort], OutputPort]:
         system: System
         if signal.is_vector:
@@ -370,7 +415,7 @@ class ActuatorGate(LeafSystem):
 
     __slots__ = NO_DICT
 
-    def __init__(self, signal: Signal, closed: InputPortIndex) -> None:
+    def __init__(self, signal: Signal, *, closed: InputPortIndex) -> None:
         super().__init__()
         self._closed = closed
         self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))

@@ -15,7 +15,7 @@ from vtbdrake.argument_checks import as_number
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.testbed.switch import ACT_POSITIONS, REAL, SENSE_POSITIONS, SIM, TWIN
+from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.builder import VirtualTestbedBuilder
@@ -110,8 +110,12 @@ class BeliefRule:
 
 
 # Mode -> positions of (T_sense, T_act).
-MODES = {"sim": (SIM, SIM), "shadow": (REAL, SIM), "real": (REAL, REAL), "twin": (REAL, TWIN)}
-
+MODES = {
+    "sim": (Position.SIM, Position.SIM),
+    "shadow": (Position.REAL, Position.SIM),
+    "real": (Position.REAL, Position.REAL),
+    "twin": (Position.REAL, Position.TWIN),
+}
 
 Positions = str | Mapping[str, str] | None
 """Wanted positions of one side's switches: of all signals, or by signal; None changes nothing."""
@@ -125,7 +129,7 @@ def check_mode(mode: str) -> None:
 
 def wanted_positions(
     interface: Interface, mode: str | None, sense: Positions, act: Positions
-) -> tuple[dict[str, str], dict[str, str]]:
+) -> tuple[dict[str, Position], dict[str, Position]]:
     """Return the wanted positions of the sensor and of the actuator signals, by signal.
 
     Raises:
@@ -136,22 +140,22 @@ def wanted_positions(
         if sense is not None or act is not None:
             raise ValueError(f"give either the mode ({mode}) or the positions of a side, not both")
         sense, act = MODES[mode]
-    wanted: list[dict[str, str]] = []
-    for side, given, signals, positions in (
+    sides: list[dict[str, Position]] = []
+    for side, requested, signals, positions in (
         ("T_sense", sense, interface.sense, SENSE_POSITIONS),
         ("T_act", act, interface.act, ACT_POSITIONS),
     ):
         names = [signal.name for signal in signals]
-        if not isinstance(given, str | Mapping | None):
-            raise ValueError(f"{side} takes one position for all signals, or {{signal: position}}, not {given!r}")
-        by_signal = dict.fromkeys(names, given) if isinstance(given, str) else dict(given or {})
+        if not isinstance(requested, str | Mapping | None):
+            raise ValueError(f"{side} takes one position for all signals, or {{signal: position}}, not {requested!r}")
+        by_signal = dict.fromkeys(names, requested) if isinstance(requested, str) else dict(requested or {})
         for name, position in by_signal.items():
             if name not in names:
                 raise ValueError(f"{side} has no signal {name!r}; it has: {', '.join(names)}")
             if position not in positions:
                 raise ValueError(f"{side}.{name} goes to one of {', '.join(positions)}, not to {position!r}")
-        wanted.append(by_signal)
-    return wanted[0], wanted[1]
+        sides.append({name: Position(position) for name, position in by_signal.items()})
+    return sides[0], sides[1]
 
 
 class VirtualTestbed(AddressedDiagram):
@@ -215,7 +219,7 @@ class VirtualTestbed(AddressedDiagram):
         """Return the positions of all switches: ``{"sense": {signal: position}, "act": {signal: position}}``."""
         self.check_context(context)
         sides = {"sense": self._sense, "act": self._act}
-        return {side: {name: s.get(context) for name, s in switches.items()} for side, switches in sides.items()}
+        return {side: {name: s.get(context).value for name, s in switches.items()} for side, switches in sides.items()}
 
     def switch(
         self,
@@ -239,17 +243,17 @@ class VirtualTestbed(AddressedDiagram):
             ValueError: A mode, position or signal is unknown, or a sensor signal that would become real has no value,
                 or its value is NaN or does not fit. Then no switch has been thrown.
         """
-        own = self._own_context(context)
+        diagram_context = self._own_context(context)
         senses, acts = wanted_positions(self.interface, mode, sense, act)
         for name, position in senses.items():
-            if position == REAL:
+            if position == Position.REAL:
                 port = self.diagram.GetInputPort(f"real.sense.{name}")
-                if not port.HasValue(own):
+                if not port.HasValue(diagram_context):
                     raise ValueError(
                         f"nothing feeds real.sense.{name}: fix a value on that input port, or start a bridge, before "
                         "its switch is thrown to real"
                     )
-                self._signals[name].check_value(port.Eval(own))
+                self._signals[name].check_value(port.Eval(diagram_context))
         for selectors, positions in ((self._sense, senses), (self._act, acts)):
             for name, position in positions.items():
                 selectors[name].set(context, position)

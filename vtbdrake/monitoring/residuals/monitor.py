@@ -31,7 +31,7 @@ from vtbdrake.monitoring.residuals.comparison import (
 )
 from vtbdrake.testbed import Interface, Scenario, VirtualTestbed
 from vtbdrake.testbed.prediction import Predictor
-from vtbdrake.testbed.switch import REAL
+from vtbdrake.testbed.switch import Position
 
 _log = logging.getLogger(__name__)
 
@@ -355,7 +355,7 @@ class Sampler:
         target = self._runtime.target
         if not isinstance(target, VirtualTestbed):
             return not self._runtime.idle
-        return set(target.positions(self._runtime.context)["sense"].values()) == {REAL}
+        return set(target.positions(self._runtime.context)["sense"].values()) == {Position.REAL}
 
     def fill(self, rows: Array, cycle: Cycle) -> int:
         """Fill empty rows with the new values of a cycle.
