@@ -415,6 +415,21 @@ def test_fallback_gets_last_accepted_samples_with_age() -> None:
     assert known["velocity"].age == pytest.approx(30 * T)
 
 
+@pytest.mark.parametrize(("arrived", "ages"), [(-inf, {}), (0.0, {"velocity": T})])
+def test_fallback_gets_no_sample_of_a_sensor_that_has_never_arrived(arrived: float, ages: dict[str, float]) -> None:
+    samples: list[dict[str, Sample]] = []
+
+    def look(last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+        samples.append(dict(known))
+        return last_sent
+
+    loop = Loop(TORQUE, fallback={"torque": FallbackController(look, otherwise=Zero())})
+    loop.silent = True
+    loop.received["velocity"].arrived = arrived
+    loop.cycle({"torque": [nan, nan]})
+    assert [{name: sample.age for name, sample in known.items()} for known in samples] == [ages]
+
+
 def test_fallback_gets_real_sensors_while_dps_uses_sim() -> None:
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
     sensed = {"velocity": ReceivedSignal(value=np.array([2.0, -2.0]), arrived=T, count=1)}

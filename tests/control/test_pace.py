@@ -75,6 +75,41 @@ def test_pace_is_unknown_at_first() -> None:
     assert monitor(*[0.2] * WINDOW, tolerance=inf).problem is None
 
 
+# Times whose sums and products with the tolerance of an eighth have no rounding. Allowed is a difference of the sum by
+# 100 / 8 + 3 = 15.5 periods.
+@pytest.mark.parametrize(
+    ("times", "wrong"),
+    [
+        ([0.875] * 51 + [0.0] * 49, False),  # shorter by the tolerance is not too short
+        ([0.75] * 51 + [0.0] * 49, True),
+        ([0.5] * 51 + [1.0] * 39 + [2.0] * 10, False),  # the sum is 84.5 periods
+        ([0.5] * 51 + [1.0] * 39 + [2.0] * 9 + [1.75], True),
+        ([1.125] * 11 + [4.0] * 89, False),  # longer by the tolerance is not too long
+        ([1.0] * 10 + [4.0] * 90, True),  # nine of ten
+        ([1.0] * 11 + [4.0] * 89, False),
+        ([1.25] * 90 + [0.5] * 6 + [0.0] * 4, False),  # the sum is 115.5 periods
+        ([1.25] * 89 + [1.5] + [0.5] * 6 + [0.0] * 4, True),
+    ],
+)
+def test_differences_that_are_just_allowed_are_not_wrong(times: list[float], wrong: bool) -> None:
+    pace = PaceMonitor("position", 2.0**-10, tolerance=0.125)
+    for at in np.cumsum([0.0, *times]):
+        pace.note(float(at) * 2.0**-10)
+    assert (pace.problem is not None) == wrong
+
+
+@pytest.mark.parametrize(
+    ("times", "mean"),
+    [
+        ([1.0] * 100 + [0.2] * 51, 0.592),  # 51 of the last 100
+        ([4.0] + [1.0] * 99 + [0.2] * 100, 0.2),  # the oldest time is the first to be forgotten
+        ([40.0] * 100, 4.0),  # pauses count for four periods each
+    ],
+)
+def test_reported_pace_is_the_mean_of_the_last_hundred_times(times: list[float], mean: float) -> None:
+    assert f"come about every {mean:g} ms" in str(monitor(*times).problem)
+
+
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, nan])
 def test_tolerance_of_the_pace_must_be_positive(tolerance: float) -> None:
     with pytest.raises(ValueError, match="pace_tolerance is a positive share"):

@@ -6,14 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantValueSource, LinearSystem, PassThrough
+from pydrake.systems.primitives import ConstantValueSource, Integrator, LinearSystem, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state.snapshot import numeric_groups
 from vtbdrake.state.systems import leaves, read_group
-from vtbdrake.testbed import ActuatorCommand, Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.state.variables import VariableError
+from vtbdrake.testbed import ActuatorCommand, Interface, Signal, SignalError, VirtualTestbedBuilder
 
 PERIOD = 0.01
 
@@ -436,6 +438,38 @@ def test_an_abstract_command_that_is_not_selected_is_not_evaluated():
     assert testbed.read(context, "real.act.look") == ActuatorCommand(None)
     with pytest.raises(AssertionError, match="it was evaluated"):
         testbed.read(context, "sim.act.look.y")
+
+
+def test_only_vector_commands_are_checked_before_a_continuous_world():
+    act = [Signal("look", model_value=RigidTransform(), idle=IDLE), Signal("speed", size=3, idle=[7.0, 8.0, 9.0])]
+    interface = Interface([Signal("pose", model_value=RigidTransform())], act)
+    builder = VirtualTestbedBuilder(interface, simulator_config=SimulatorConfig(integration_scheme="runge_kutta3"))
+    builder.set_dps(Pilot())
+    camera = builder.add("sense", "pose", Source(SEEN))
+    builder.sim_sensor("pose", camera.get_output_port())
+    builder.sim_actuator("look", builder.add("act", "look", PassThrough(Value(RigidTransform()))).get_input_port())
+    builder.sim_actuator("speed", builder.add("sys", "place", Integrator(3)).get_input_port())
+    testbed = builder.build()
+    context = testbed.default_context()
+    assert _matrix(testbed.read(context, "sim.act.look.y")) == _matrix(SEEN)
+    camera.show(context, RigidTransform([np.nan, 0.0, 0.0]))
+    assert np.isnan(testbed.read(context, "sim.act.look.y").translation()[0])
+    with pytest.raises(SignalError, match=r"the DPS commands speed = \[nan +0. +0.\] at t = 0 s"):
+        testbed.diagram.EvalTimeDerivatives(context)
+
+
+@pytest.mark.parametrize(("address", "last"), [("T_sense.joint_state", 1.0), ("T_act.torque", 2.0)])
+def test_a_position_after_the_last_is_refused(address, last):
+    testbed = AcrobotScenario().build()
+    context = testbed.default_context()
+    testbed.diagram.GetInputPort("real.sense.joint_state").FixValue(context, np.zeros(4))
+    for position in (0.0, last):
+        testbed.write(context, {address: position})
+        assert testbed.read(context, address) == position
+    for bad in (-1.0, last + 1.0, 0.5):
+        with pytest.raises(VariableError, match=address):
+            testbed.write(context, {address: bad})
+    assert testbed.read(context, address) == last
 
 
 class PlacedScenario(AcrobotScenario):
