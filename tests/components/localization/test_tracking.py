@@ -10,7 +10,8 @@ from scipy.stats import chi2
 from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
-from vtbdrake.components.localization.tracking import Tracker, TrackState
+from vtbdrake.components.localization.track_state import TrackState
+from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.detections import Odometry
 from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE

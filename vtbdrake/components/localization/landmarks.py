@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import inf
 
 import numpy as np
@@ -77,6 +77,11 @@ class Landmarks:
         """Return the landmarks with these indices, or those for which a mask (n,) is true."""
         chosen = np.asarray(rows)
         return Landmarks(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def widened(self, deviation: float) -> Landmarks:
+        """Return the landmarks with a deviation (m) added to those of positions, per axis, and of diameters."""
+        covariances = self.covariances + deviation**2 * np.eye(2)
+        return replace(self, covariances=covariances, diameter_deviations=np.hypot(self.diameter_deviations, deviation))
 
     def seen_from(self, X_AB: ArrayLike) -> Landmarks:
         """Return the landmarks in frame A, if these are in frame B; the pose X_AB (3,) is taken as exact."""

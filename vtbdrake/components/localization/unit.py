@@ -19,7 +19,8 @@ from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.submap import Submap
-from vtbdrake.components.localization.tracking import Matches, Tracker, TrackState
+from vtbdrake.components.localization.track_state import TrackState
+from vtbdrake.components.localization.tracking import Matches, Tracker
 from vtbdrake.state import Codec
 from vtbdrake.state.codecs import codec_of
 

@@ -1,0 +1,138 @@
+"""The health of a track: whether the estimate of a `Tracker` may be used, or is lost.
+
+*Failures.* A scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
+last fused scan showed. The track is lost after ``patience`` failures in succession, or when position or heading are too
+uncertain.
+
+*Evidence.* The d² of a right first match is chi-square distributed, that of a match by chance is uniform within the
+gate γ of first matches. So the log-likelihood ratio of a match with d², of which the share ε = 0.2 is by chance
+although the pose is right, is ln(ε + (1 - ε) γ / 2 exp(-d² / 2)). Its sum is kept up to at most ``credit``; below 0,
+the track is lost (the cumulative sum of Page, Biometrika 41, 1954).
+
+*Drift.* Dead reckoning may be worse than the model of its noise says, by wheels that slip or a steering angle that is
+measured badly. The change d of the pose by a scan has the covariance D, the pose's before the scan less that after it.
+So s = dᵀ D⁻¹ d / 3 is 1 on average; the variance of the next motion is multiplied by a factor that follows s (by a
+tenth of its difference from 1 per scan), and that grows fourfold with a scan that fails. It is at least 1.
+
+*Distortion.* A map that is bent, sheared or scaled fits everywhere nearly, and leads astray all the same. It shows in
+the corrections c of the landmarks in the state, their estimates less their positions on the map: on a right map they
+have the covariance M of the map's errors (less what is not known yet), on a distorted one they change with the
+position. With the functions B = [1, x, y], the statistic T = Σ |(Bᵀ M⁻¹ B)^(-1/2) Bᵀ M⁻¹ c|² over both axes is at most
+chi-square distributed with 6 degrees of freedom on a right map. Beyond ``distortion_gate``, the pose is doubtful, and
+far beyond, lost: so large are corrections by wrong matches. Between its 95 % quantile and that, the covariance of the
+pose is multiplied by the ratio of T to the quantile (the ratio of Birge, Physical Review 40, 1932).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from vtbdrake.components.estimation import chi_square_quantile
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.track_state import TrackState
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# A scan fails if it matches a smaller share of its detections, or of the landmarks that should be seen again.
+_LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
+
+# The least number of detections, or of landmarks that should be seen again, for this test.
+_JUDGED_FROM = 6
+
+# With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
+_LARGEST_TURN = 0.2
+
+# The factor of the variance of dead reckoning: by which share it follows the ratio of a scan, the largest ratio that
+# counts, the factor of a scan that fails, and the largest value.
+_FOLLOWS, _LARGEST_RATIO, _FAILED, _LARGEST_DRIFT = 0.1, 25.0, 4.0, 1e3
+
+# Units in which errors of x, y (m) and heading (rad) are of the same size, as a landmark at 10 m shows them.
+_SCALES = np.array([1.0, 1.0, 0.1])
+
+# Degrees of freedom of the distortions: displacement, rotation, scale and shear, which are affine.
+_DISTORTIONS = 6
+
+# Beyond this multiple of the gate of distortions, matches are wrong, and the track is lost.
+_TANGLED = 10.0
+
+# The share of first matches that are assumed to be by chance although the pose is right.
+_CHANCE = 0.2
+
+
+def fails(state: TrackState, detections: Landmarks, pairs: Indices) -> bool:
+    """Return whether a scan with these pairs of detection and landmark, (k, 2), fails."""
+    matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
+    recent = state.landmark_positions[state.is_recent]
+    # Near the largest distance of detections, landmarks are not seen reliably.
+    reach = 0.7 * np.hypot(*detections.positions.T).max()
+    expected = int((np.hypot(*(recent - state.mean[:2]).T) < reach).sum())
+    few = len(detections) >= _JUDGED_FROM and matched < _LEAST_SHARE * len(detections)
+    return few or (expected >= _JUDGED_FROM and again < _LEAST_AGAIN * expected)
+
+
+def evidence(squares: Array, first_gate: float) -> float:
+    """Return the log-likelihood ratio of first matches, right against by chance, from their d² (k,)."""
+    ratio = 0.5 * chi_square_quantile(first_gate, 2) * np.exp(-0.5 * squares)
+    return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
+
+
+def drift_after_failure(state: TrackState) -> float:
+    """Return the factor of the variance of dead reckoning after a scan that failed."""
+    return min(_FAILED * state.drift, _LARGEST_DRIFT)
+
+
+def drift_after(before: TrackState, after: TrackState) -> float:
+    """Return the factor of the variance of dead reckoning after a scan that was fused."""
+    change = after.pose - before.pose
+    D = before.pose_covariance - after.pose_covariance
+    # Directions of which the scan says nothing have no variance, and no change.
+    values, directions = np.linalg.eigh(D / np.outer(_SCALES, _SCALES))
+    along = directions.T @ (change / _SCALES)
+    says = values > 1e-3 * values.max()
+    if not says.any() or values.max() <= 0.0:
+        return before.drift
+    ratio = float((along[says] ** 2 / values[says]).mean())
+    return min(max(1.0, before.drift * (1.0 + _FOLLOWS * (min(ratio, _LARGEST_RATIO) - 1.0))), _LARGEST_DRIFT)
+
+
+def distortion(places: Array, corrections: Array, M: Array) -> float:
+    """Return the statistic T of a distorted map.
+
+    Args:
+        places: The positions of landmarks on the map in m, (n, 2).
+        corrections: Their estimates less these positions in m, (n, 2).
+        M: The covariance of the map's errors per axis in m², (n, n), or its diagonal (n,) if they are independent.
+    """
+    around = places - places.mean(axis=0)
+    B = np.column_stack([np.ones(len(places)), around / max(1.0, float(np.abs(around).max()))])
+    if M.ndim == 1:
+        deviations = np.sqrt(M)[:, None]
+        B, corrections = B / deviations, corrections / deviations
+    else:
+        root = np.linalg.cholesky(M)
+        B, corrections = (solve_triangular(root, columns, lower=True) for columns in (B, corrections))
+    Q, R = np.linalg.qr(B)
+    # Landmarks on one line, or fewer than three, show fewer distortions.
+    is_shown = np.abs(np.diagonal(R)) > 1e-6 * np.abs(R).max()
+    return float(((Q.T @ corrections)[is_shown] ** 2).sum())
+
+
+def is_lost(state: TrackState, *, patience: int, largest_deviation: float, distortion_gate: float) -> bool:
+    """Return whether the track is lost, with the settings of a `Tracker`."""
+    limits = np.array([largest_deviation, largest_deviation, _LARGEST_TURN])
+    is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
+    is_tangled = state.distortion > _TANGLED * chi_square_quantile(distortion_gate, _DISTORTIONS)
+    return state.failures >= patience or state.evidence < 0.0 or is_vague or is_tangled
+
+
+def is_doubtful(state: TrackState, *, distortion_gate: float) -> bool:
+    """Return whether the last scan failed or the map seems distorted."""
+    return state.failures > 0 or state.distortion > chi_square_quantile(distortion_gate, _DISTORTIONS)
+
+
+def widening(state: TrackState) -> float:
+    """Return the factor of the covariance of the pose, at least 1, that is larger if the map seems distorted."""
+    return max(1.0, state.distortion / chi_square_quantile(0.95, _DISTORTIONS))

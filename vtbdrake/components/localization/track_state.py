@@ -1,0 +1,106 @@
+"""The memory of a `Tracker`: the state x of its filter with its covariance, and the health of the track.
+
+x = [X_WH; b; e; g; l_1; ...; l_n], see `vtbdrake.components.localization.tracking`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+BIAS, ODOMETRY, RATE = 3, 4, 5
+"""The places of b, e and g in x."""
+FIXED = 6
+"""The place of the first landmark in x."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackState:
+    """The memory of a `Tracker`: an immutable value with read-only arrays.
+
+    Attributes:
+        mean: The estimate of x (m, rad, s), shape (6 + 2 n,); empty if nothing is tracked.
+        covariance: The covariance of x, shape (6 + 2 n, 6 + 2 n).
+        indices: Indices on the map of the landmarks in x, shape (n,).
+        is_recent: Whether each of them was seen in the last scan that was fused, shape (n,).
+        evidence: Cumulative log-likelihood ratio of first matches.
+        failures: The number of scans in succession that failed.
+        distortion: The test statistic of a distorted map after the last scan that was fused.
+        drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
+
+    The last four are the health of the track, see `vtbdrake.components.localization.health`.
+    """
+
+    mean: Array
+    covariance: Array
+    indices: Indices
+    is_recent: NDArray[np.bool_]
+    evidence: float = 0.0
+    failures: int = 0
+    distortion: float = 0.0
+    drift: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "covariance", "indices", "is_recent"):
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.flags.writeable:
+                array = np.array(array)
+                array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def none(cls) -> TrackState:
+        """Return the state in which nothing is tracked."""
+        return cls(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool))
+
+    def __deepcopy__(self, memo: object) -> TrackState:
+        return self
+
+    def with_arrays(self, **arrays: Any) -> TrackState:
+        """Return the state with other arrays, which are not copied and are read-only from now on."""
+        for array in arrays.values():
+            array.flags.writeable = False
+        return replace(self, **arrays)
+
+    @property
+    def is_tracking(self) -> bool:
+        """Whether there is a pose."""
+        return bool(self.mean.size)
+
+    @property
+    def pose(self) -> Array:
+        """X_WH, shape (3,)."""
+        return self.mean[:3]
+
+    @property
+    def pose_covariance(self) -> Array:
+        """The covariance of X_WH, shape (3, 3)."""
+        return self.covariance[:3, :3]
+
+    @property
+    def range_bias(self) -> float:
+        """The estimated range bias b of the detector in m."""
+        return float(self.mean[BIAS])
+
+    @property
+    def landmark_positions(self) -> Array:
+        """The estimated positions l_i of the landmarks in x, in W in m, shape (n, 2)."""
+        return self.mean[FIXED:].reshape(-1, 2)
+
+    def without(self, mask: NDArray[np.bool_]) -> TrackState:
+        """Return the state without the landmarks for which the mask (n,) is true."""
+        if not mask.any():
+            return self
+        remains = np.concatenate([np.ones(FIXED, dtype=bool), np.repeat(~mask, 2)])
+        return self.with_arrays(
+            mean=self.mean[remains],
+            covariance=self.covariance[np.ix_(remains, remains)],
+            indices=self.indices[~mask],
+            is_recent=self.is_recent[~mask],
+        )
