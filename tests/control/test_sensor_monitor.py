@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vtbdrake.control.fault import Fault
 from vtbdrake.control.limits import Bounds
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
+from vtbdrake.control.sensor_monitor import SensorMonitor
 from vtbdrake.control.staleness import check_all
 from vtbdrake.testbed import Signal
 

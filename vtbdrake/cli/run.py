@@ -24,6 +24,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.output import number, write_whole
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.control.runtime import Runtime
@@ -132,12 +133,12 @@ def run(
 
 def _report_faults(guards: Guards, begin: float) -> None:
     """Print the faults of the loop."""
-    faults = [fault for fault in guards.log if fault.kind != "told"]
+    faults = [fault for fault in guards.log if fault.kind != FaultKind.TOLD]
     for fault in faults[:MOST_FAULTS]:
         click.echo(f"fault after {number(fault.time - begin)} s: {fault.reason}")
     if len(faults) > MOST_FAULTS:
         click.echo(f"and {len(faults) - MOST_FAULTS} more faults")
-    causes = [fault.reason for fault in guards.latched if fault.kind != "told"]
+    causes = [fault.reason for fault in guards.latched if fault.kind != FaultKind.TOLD]
     if causes:
         raise FailedError(f"the fallbacks took over: {'; '.join(causes)}")
 

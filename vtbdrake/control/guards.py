@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 from numpy.typing import ArrayLike
 
 from vtbdrake.control.fallback import NO_COMMAND, Fallback, Sample, chain, default_fallback
+from vtbdrake.control.fault import Fault, FaultKind
 from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.control.sensor_monitor import Fault, SensorMonitor
+from vtbdrake.control.sensor_monitor import SensorMonitor
 from vtbdrake.control.staleness import check_all
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import Interface, Signal
@@ -234,9 +235,11 @@ class Guards:
                 limiter: Any = self.limiters[name]
                 try:
                     if name not in actuation:
-                        raise ActuationError("missing", "is missing")
+                        raise ActuationError(FaultKind.MISSING, "is missing")
                     if limiter.needs_start and not limiter.has_start:
-                        raise ActuationError("not started", "is limited in rate or acceleration, but has no start")
+                        raise ActuationError(
+                            FaultKind.NOT_STARTED, "is limited in rate or acceleration, but has no start"
+                        )
                     wanted.append((name, limiter, limiter.checked(actuation[name])))
                 except ActuationError as problem:
                     causes.append(Fault(now, name, problem.kind, f"the actuator command {name} {problem}"))
@@ -279,7 +282,7 @@ class Guards:
         ``at`` is as in `check`.
         """
         self._depart_anew(now, received, _NONE)
-        told = Fault(now, None, "told", reason)
+        told = Fault(now, None, FaultKind.TOLD, reason)
         self.log.append(told)
         if not self._latched:
             self._latch((told,))
@@ -304,7 +307,7 @@ class Guards:
         lasting = [
             fault
             for fault in check_all(now, self.monitors, received)
-            if not (fault.kind == "jump" and fault.signal is not None and self.monitors[fault.signal].steady)
+            if not (fault.kind == FaultKind.JUMP and fault.signal is not None and self.monitors[fault.signal].steady)
         ]
         reasons = (*(fault.reason for fault in (*self._causes, *lasting)), *against)
         if not reasons:
@@ -341,14 +344,14 @@ class Guards:
     ) -> list[Fault]:
         faults = []
         if error is not None:
-            faults.append(Fault(now, None, "raised", f"the DPS raised {error_text(error)}"))
+            faults.append(Fault(now, None, FaultKind.RAISED, f"the DPS raised {error_text(error)}"))
         if missed > self._max_missed:
             reason = f"{missed} deadlines were missed in a row, {self._max_missed:g} are allowed"
-            faults.append(Fault(now, None, "missed", reason))
+            faults.append(Fault(now, None, FaultKind.MISSED, reason))
         if blocked is not None:
-            faults.append(Fault(now, None, "blocked", f"the machine must not be commanded: {blocked}"))
+            faults.append(Fault(now, None, FaultKind.BLOCKED, f"the machine must not be commanded: {blocked}"))
         if pace is not None:
-            faults.append(Fault(now, None, "pace", pace))
+            faults.append(Fault(now, None, FaultKind.PACE, pace))
         return faults
 
     def _depart_anew(
@@ -370,7 +373,7 @@ class Guards:
             count = self._unsent.get(name, 0)
             if count > self._most_unsent and name in self._held_back and name in self._active:
                 reason = f"the last {count} actuator commands {name} could not be sent"
-                faults.append(Fault(now, name, "not sent", reason))
+                faults.append(Fault(now, name, FaultKind.NOT_SENT, reason))
             limiter, sensor = self.limiters[name], self.measured_by.get(name)
             free = count > self._most_unsent or name in self._departing
             if not free or sensor is None or not limiter.needs_start or name in self._withheld:
@@ -445,7 +448,7 @@ class Guards:
                 if fallback not in self._failed:
                     self._failed.add(fallback)
                     reason = f"{type(fallback).__name__} cannot command {name}: {error_text(error)}"
-                    self.log.append(Fault(now, name, "fallback", reason))
+                    self.log.append(Fault(now, name, FaultKind.FALLBACK, reason))
         return limiter.limit(last_sent, at)
 
 

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.control.fault import FaultKind
 from vtbdrake.testbed import Signal
 
 class Bounds:
@@ -15,8 +16,8 @@ class JumpBounds:
     def contains(self, before: Any, value: Any, seconds: float) -> bool: ...
 
 class ActuationError(ValueError):
-    kind: str
-    def __init__(self, kind: str, reason: str) -> None: ...
+    kind: FaultKind
+    def __init__(self, kind: FaultKind, reason: str) -> None: ...
 
 class LimitCount(NamedTuple):
     changed: int

@@ -10,6 +10,7 @@ from libc.stdint cimport int64_t
 cimport numpy as cnp
 
 from vtbdrake.control.array_entries cimport entries_of
+from vtbdrake.control.fault import FaultKind
 
 cnp.import_array()
 
@@ -20,8 +21,9 @@ cdef double FAR = 1e150
 cdef double ROUNDING = 1e-12
 # Of a period. Times are rounded: one that is shorter by no more is a whole period. Much shorter ones do not count yet.
 cdef double SAME_TIME = 1e-6, SHORTEST = 1e-3
-LIMITS = ("range", "rate", "acceleration")
-cdef enum: NONE = -1, RANGE, RATE, ACCELERATION  # positions in LIMITS
+
+# Limits, as indices of their counts.
+cdef enum: NONE = -1, RANGE, RATE, ACCELERATION
 
 
 cdef class Bounds:
@@ -109,7 +111,7 @@ class ActuationError(ValueError):
     """An actuator command that cannot be sent under any limits.
 
     Attributes:
-        kind: ``size``, ``not finite`` or ``not started``.
+        kind: The `FaultKind`.
     """
 
     def __init__(self, kind, reason):
@@ -189,7 +191,11 @@ cdef class RateLimiter:
 
         An entry that is changed by several limits counts for the last of rate, acceleration and range.
         """
-        return {name: LimitCount(self.numbers[i], self.largest[i]) for i, name in enumerate(LIMITS)}
+        return {
+            "range": LimitCount(self.numbers[RANGE], self.largest[RANGE]),
+            "rate": LimitCount(self.numbers[RATE], self.largest[RATE]),
+            "acceleration": LimitCount(self.numbers[ACCELERATION], self.largest[ACCELERATION]),
+        }
 
     @property
     def last_sent(self):
@@ -245,13 +251,13 @@ cdef class RateLimiter:
             try:
                 command = np.array(command, dtype=float)
             except (TypeError, ValueError) as error:
-                raise ActuationError("size", f"is not a vector of {self.size} numbers: {error}") from error
+                raise ActuationError(FaultKind.SIZE, f"is not a vector of {self.size} numbers: {error}") from error
             if command.shape != (self.size,):
-                raise ActuationError("size", f"has the shape {command.shape} instead of ({self.size},)")
+                raise ActuationError(FaultKind.SIZE, f"has the shape {command.shape} instead of ({self.size},)")
             entries = entries_of(command, self.size)
         for i in range(self.size):
             if not isfinite(entries[i]):
-                raise ActuationError("not finite", f"is not finite: {command.tolist()}")
+                raise ActuationError(FaultKind.NOT_FINITE, f"is not finite: {command.tolist()}")
         return command
 
     def send(self, command, double at=NAN):
@@ -274,7 +280,7 @@ cdef class RateLimiter:
         self.had_start = self.has_start
         if not self.has_start:
             if self.needs_start:
-                raise ActuationError("not started", "has a limit of its rate or acceleration, and nothing to depart from")
+                raise ActuationError(FaultKind.NOT_STARTED, "has a limit of its rate or acceleration, and nothing to depart from")
             self.start_from(command)
         r = self._share(at)
         self.at_before = self.at
@@ -373,7 +379,7 @@ class PassThrough:
             ActuationError: The command is None.
         """
         if command is None:
-            raise ActuationError("size", "is None")
+            raise ActuationError(FaultKind.SIZE, "is None")
         return command
 
     def send(self, command, at=NAN):

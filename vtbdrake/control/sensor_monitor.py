@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.control.fault import Fault, FaultKind
 from vtbdrake.control.limits import Bounds, JumpBounds
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.staleness import StalenessMonitor
@@ -17,22 +17,6 @@ _DRIFT = 500e-6  # Largest drift between the clocks of two computers, in s per s
 
 SETTLING = 0.1
 """Seconds for which samples have to agree before the level that a signal has jumped to can be accepted."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A detected reason why the machine must not get the DPS's commands."""
-
-    time: float  # time of detection on the loop's clock, in seconds
-    signal: str | None  # name of the faulty signal; None if the fault concerns all
-    # of a sensor signal ``stale``, ``implausible`` or ``jump``; of an actuator signal ``missing``, ``size``, ``not
-    # finite``, ``not started``, ``not sent`` or ``fallback``; of all ``raised``, ``missed``, ``pace``, ``blocked`` or
-    # ``told``
-    kind: str
-    reason: str  # description in one sentence
-
-    def __str__(self) -> str:
-        return self.reason
 
 
 class LatencyMonitor:
@@ -114,7 +98,7 @@ class SensorMonitor(StalenessMonitor):
         if received.rejected:
             rejected = ", ".join(f"{count} {why}" for why, count in received.rejected.items())
             reason += f"; messages rejected so far: {rejected}"
-        return Fault(now, name, "stale", reason)
+        return Fault(now, name, FaultKind.STALE, reason)
 
     def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
         """Return the fault of a new sample, or None."""
@@ -151,7 +135,7 @@ class SensorMonitor(StalenessMonitor):
             reason = f"sensor signal {name} has the shape {np.shape(value)} instead of ({self.signal.size},)"
         else:
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
-        return Fault(now, name, "implausible", reason)
+        return Fault(now, name, FaultKind.IMPLAUSIBLE, reason)
 
     def _late(self, now: float, received: ReceivedSignal) -> Fault | None:
         if self._latency is None or not (excess := self._latency.excess(received)) > self._latency.limit:
@@ -160,7 +144,7 @@ class SensorMonitor(StalenessMonitor):
             f"sensor signal {self.signal.name} is stale: it took {1e3 * excess:.1f} ms longer than the quickest "
             f"sample, {1e3 * self._latency.limit:g} allowed"
         )
-        return Fault(now, self.signal.name, "stale", reason)
+        return Fault(now, self.signal.name, FaultKind.STALE, reason)
 
     def _jump(self, now: float, received: ReceivedSignal) -> Fault | None:
         bounds = self._jump_bounds
@@ -180,7 +164,7 @@ class SensorMonitor(StalenessMonitor):
             f"sensor signal {self.signal.name} jumps within {1e3 * gap:.1f} ms from {accepted.tolist()} to "
             f"{value.tolist()}"
         )
-        return Fault(now, self.signal.name, "jump", reason)
+        return Fault(now, self.signal.name, FaultKind.JUMP, reason)
 
 
 def _jump_bounds(signal: Signal, jump_tolerance: ArrayLike) -> JumpBounds:

@@ -1,9 +1,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from vtbdrake.control.fault import Fault
 from vtbdrake.control.limits import Bounds
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.control.sensor_monitor import Fault
 
 class StalenessMonitor:
     trusted: Bounds | None

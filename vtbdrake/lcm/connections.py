@@ -24,8 +24,8 @@ from vtbdrake.lcm.hub.tcpq import (
     MAGIC_REJECTION,
     MAGIC_SERVER,
     MAX_REJECTION,
-    SUBSCRIBE,
     VERSION,
+    RecordType,
     TcpqError,
     address_name,
     connect_shortcut,
@@ -158,7 +158,7 @@ class TcpqConnection(Connection):
             self._greet()
             for channel in handlers:
                 name = _literally(channel).encode()
-                self._socket.sendall(_WORDS.pack(SUBSCRIBE, len(name)) + name)
+                self._socket.sendall(_WORDS.pack(RecordType.SUBSCRIBE, len(name)) + name)
             if stamped:
                 self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
             self._socket.setblocking(False)

@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
+from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
@@ -111,7 +112,7 @@ class Recorder:
         self._cycle = CycleWriter(CycleLayout(header.sense, header.act), runtime)
         self._events: list[bytes] = []
         self._count = 0
-        self._faults: set[tuple[str | None, str]] = set()
+        self._faults: set[tuple[str | None, FaultKind]] = set()
         self._unwritten = 0
         self._missing: int | None = None
         self._recorded = 0

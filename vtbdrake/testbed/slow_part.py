@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from math import ceil, inf
 from typing import Any, TypeVar
 
@@ -135,7 +136,12 @@ def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
     return memory, {name: array for name, array in arrays.items() if name not in memory}
 
 
-WAITING, DONE, MISSING = range(3)
+class WorkStatus(IntEnum):
+    """The status of one sample."""
+
+    WAITING = 0
+    DONE = 1
+    MISSING = 2
 
 
 @dataclass(frozen=True)
@@ -144,12 +150,12 @@ class Work:
 
     Attributes:
         tick: Number of the sample.
-        status: Waiting, done or missing.
+        status: Whether its result is there.
         arrays: Arrays of the inputs while the sample waits, of the outputs when it is done.
     """
 
     tick: int
-    status: int
+    status: WorkStatus
     arrays: Arrays
 
 
@@ -181,8 +187,8 @@ class Progress:
         missing.
         """
         memory, outputs = split_memory(arrays)
-        result = Work(tick, DONE if outputs else MISSING, outputs)
-        awaited = (work.tick == tick and work.status == WAITING for work in self.under_way)
+        result = Work(tick, WorkStatus.DONE if outputs else WorkStatus.MISSING, outputs)
+        awaited = (work.tick == tick and work.status == WorkStatus.WAITING for work in self.under_way)
         under_way = tuple(result if found else work for work, found in zip(self.under_way, awaited, strict=True))
         return replace(self, memory=memory or self.memory, under_way=under_way)
 
@@ -200,7 +206,7 @@ def _encode(progress: Progress) -> dict[str, np.ndarray]:
 
 
 def _decode(arrays: Arrays) -> Progress:
-    under_way = [Work(int(t), int(status), parts_of(arrays, f"under_way.{t}")) for t, status in arrays["ticks"]]
+    under_way = [Work(int(t), WorkStatus(status), parts_of(arrays, f"under_way.{t}")) for t, status in arrays["ticks"]]
     return Progress(parts_of(arrays, "shown"), parts_of(arrays, MEMORY), tuple(under_way))
 
 
@@ -374,7 +380,7 @@ class SlowPart(LeafSystem):
                 sample[_DPS] = self._read_dps(self._root_of(context))
             if self._request is not None:
                 self._take_request(context, state)
-            work = Work(tick, WAITING, encode(sample, self.function.inputs))
+            work = Work(tick, WorkStatus.WAITING, encode(sample, self.function.inputs))
             value.set_value(replace(progress, under_way=(*progress.under_way, work)))
 
     def _is_wanted(self, context: Context, progress: Progress) -> bool:
@@ -399,11 +405,11 @@ class SlowPart(LeafSystem):
         work = progress.find(tick)
         if work is None:
             return
-        if work.status == WAITING:
+        if work.status == WorkStatus.WAITING:
             progress = progress.having(tick, self.function({**work.arrays, **progress.memory}))
             work = progress.find(tick)
             assert work is not None
-        if work.status == DONE:
+        if work.status == WorkStatus.DONE:
             outputs = dict(work.arrays)
             self._show_vectors(state, tick, {name: outputs.pop(name) for name in self._vectors})
             progress = progress.after(work, shown=outputs)
@@ -456,7 +462,7 @@ class SlowPart(LeafSystem):
             context: A root context of the whole Diagram.
         """
         progress = self._read(self.GetMyContextFromRoot(context))
-        return {work.tick: work.arrays for work in progress.under_way if work.status == WAITING}
+        return {work.tick: work.arrays for work in progress.under_way if work.status == WorkStatus.WAITING}
 
     def memory(self, context: Context) -> Arrays:
         """Return the memory that the next call begins with; empty for a part without."""

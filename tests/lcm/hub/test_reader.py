@@ -13,25 +13,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.lcm.hub.reader import TcpqReader, publish_record
-from vtbdrake.lcm.hub.tcpq import GREET, PUBLISH, SUBSCRIBE, UNSUBSCRIBE, Record, TcpqError
+from vtbdrake.lcm.hub.tcpq import Record, RecordType, TcpqError
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)
 LARGEST = 1000
 
 CHANNELS = st.binary(min_size=1, max_size=255)
 PUBLICATIONS = st.builds(
-    lambda channel, data: (PUBLISH, channel, published(channel, data)), CHANNELS, st.binary(max_size=LARGEST)
+    lambda channel, data: (RecordType.PUBLISH, channel, published(channel, data)), CHANNELS, st.binary(max_size=LARGEST)
 )
 SUBSCRIPTIONS = st.builds(
     lambda kind, pattern: (kind, pattern, struct.pack(">II", kind, len(pattern)) + pattern),
-    st.sampled_from([SUBSCRIBE, UNSUBSCRIBE]),
+    st.sampled_from([RecordType.SUBSCRIBE, RecordType.UNSUBSCRIBE]),
     CHANNELS,
 )
 RECORDS = st.lists(PUBLICATIONS | SUBSCRIPTIONS, max_size=8)
 
 
 def published(channel: bytes, data: bytes) -> bytes:
-    return struct.pack(">II", PUBLISH, len(channel)) + channel + struct.pack(">I", len(data)) + data
+    return struct.pack(">II", RecordType.PUBLISH, len(channel)) + channel + struct.pack(">I", len(data)) + data
 
 
 def split(reader: TcpqReader) -> Iterator[Record]:
@@ -52,7 +52,7 @@ def test_records_arrive_in_pieces(records: list[Record], ends: list[int]) -> Non
     for piece in in_pieces(GREETING + b"".join(record for *_, record in records), ends):
         reader.append(piece)
         found += split(reader)
-    assert found == [(GREET, b"", GREETING), *records]
+    assert found == [(RecordType.GREETING, b"", GREETING), *records]
     assert reader.greeted and not reader.partial
 
 
@@ -64,7 +64,7 @@ def test_publications_skip_other_records(records: list[Record], ends: list[int])
         while (publication := reader.next_publication()) is not None:
             found.append(publication)
     assert [published(*publication) for publication in found] == [
-        record for kind, _, record in records if kind == PUBLISH
+        record for kind, _, record in records if kind == RecordType.PUBLISH
     ]
 
 
@@ -87,8 +87,8 @@ def test_large_records_arrive_in_pieces(greeted: bool) -> None:
                 taken.append(publication)
         while (publication := publications.next_publication()) is not None:
             taken.append(publication)
-        expected = [(PUBLISH, message[0], published(*message)) for message in sent]
-        assert found == [(GREET, b"", GREETING)] * (not greeted) + expected
+        expected = [(RecordType.PUBLISH, message[0], published(*message)) for message in sent]
+        assert found == [(RecordType.GREETING, b"", GREETING)] * (not greeted) + expected
         assert taken == sent and not records.partial and not publications.partial
 
 
@@ -124,17 +124,17 @@ def test_publication_is_written_as_in_liblcm(channel: bytes, data: bytes) -> Non
     [
         (struct.pack(">II", 4, 1), "malformed"),
         (struct.pack(">II", 0, 1), "malformed"),
-        (struct.pack(">II", PUBLISH, 0), "malformed"),
-        (struct.pack(">II", SUBSCRIBE, 256), "malformed"),
-        (struct.pack(">II", SUBSCRIBE, 2**32 - 1), "malformed"),
-        (struct.pack(">II", PUBLISH, 1) + b"A" + struct.pack(">I", LARGEST + 1), "too large"),
-        (struct.pack(">II", PUBLISH, 1) + b"A" + struct.pack(">I", 2**32 - 1), "too large"),
+        (struct.pack(">II", RecordType.PUBLISH, 0), "malformed"),
+        (struct.pack(">II", RecordType.SUBSCRIBE, 256), "malformed"),
+        (struct.pack(">II", RecordType.SUBSCRIBE, 2**32 - 1), "malformed"),
+        (struct.pack(">II", RecordType.PUBLISH, 1) + b"A" + struct.pack(">I", LARGEST + 1), "too large"),
+        (struct.pack(">II", RecordType.PUBLISH, 1) + b"A" + struct.pack(">I", 2**32 - 1), "too large"),
     ],
 )
 def test_invalid_record_is_an_error_after_valid_ones(bytes_: bytes, reason: str) -> None:
     reader = TcpqReader(max_message=LARGEST, greeted=True)
     reader.append(published(b"A", b"1") + bytes_)
-    assert reader.next_record() == (PUBLISH, b"A", published(b"A", b"1"))
+    assert reader.next_record() == (RecordType.PUBLISH, b"A", published(b"A", b"1"))
     for _ in range(2):
         with pytest.raises(TcpqError) as caught:
             reader.next_record()

@@ -6,12 +6,13 @@ from libc.stdint cimport UINT32_MAX, uint32_t
 from libc.string cimport memcpy
 
 from vtbdrake.lcm.byte_order cimport get_uint32, put_uint32
-from vtbdrake.lcm.hub.tcpq import GREET, MAGIC_CLIENT, MAX_CHANNEL, PUBLISH, UNSUBSCRIBE, VERSION, TcpqError
+from vtbdrake.lcm.hub.tcpq import MAGIC_CLIENT, MAX_CHANNEL, VERSION, RecordType, TcpqError
 from vtbdrake.control.streams cimport Stream
 
 cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
-cdef uint32_t _PUBLISH = PUBLISH
-cdef uint32_t _UNSUBSCRIBE = UNSUBSCRIBE
+cdef uint32_t _GREETING = RecordType.GREETING
+cdef uint32_t _PUBLISH = RecordType.PUBLISH
+cdef uint32_t _UNSUBSCRIBE = RecordType.UNSUBSCRIBE
 
 # Larger records are received in place: copying them when they are complete would take long.
 cdef Py_ssize_t _LARGE = 1 << 18
@@ -89,8 +90,8 @@ cdef class TcpqReader(Stream):
             at = self.buffer + self.begin
             self.begin += self.size
             whole = PyBytes_FromStringAndSize(at, self.size)
-        if self.kind == 0:
-            return GREET, b"", whole
+        if self.kind == _GREETING:
+            return _GREETING, b"", whole
         return self.kind, PyBytes_FromStringAndSize(at + 8, self.length), whole
 
     def next_publication(self):
@@ -133,7 +134,7 @@ cdef class TcpqReader(Stream):
             if self.length != VERSION:
                 raise TcpqError("greeting", f"version of tcpq must be {VERSION:#06x}, not {self.length:#06x}")
             self.greeted = True
-            self.kind, self.length, self.size = 0, 0, 8
+            self.kind, self.length, self.size = _GREETING, 0, 8
             return True
         if not _PUBLISH <= self.kind <= _UNSUBSCRIBE:
             raise TcpqError("malformed", f"record type must be 1, 2 or 3, not {self.kind}")

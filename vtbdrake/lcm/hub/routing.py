@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from vtbdrake.lcm.hub import tcpq
 from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.reader import publish_record
+from vtbdrake.lcm.hub.tcpq import RecordType
 
 _log = logging.getLogger(__package__)
 
@@ -196,11 +197,11 @@ class Router:
             TcpqError: The client violates the protocol.
         """
         kind, channel, content = record
-        if kind == tcpq.PUBLISH:
+        if kind == RecordType.PUBLISH:
             return self._publish(client, channel, content, now)
-        if kind == tcpq.SUBSCRIBE:
+        if kind == RecordType.SUBSCRIBE:
             self._forget_routes(client.subscriptions.add(_decode(channel)))
-        elif kind == tcpq.UNSUBSCRIBE:
+        elif kind == RecordType.UNSUBSCRIBE:
             self._forget_routes(client.subscriptions.remove(_decode(channel)))
         else:
             self.outgoing.setdefault(client, []).append(tcpq.GREETING)

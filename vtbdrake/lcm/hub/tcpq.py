@@ -24,6 +24,7 @@ import logging
 import os
 import socket
 import struct
+from enum import IntEnum
 
 _log = logging.getLogger(__name__)
 
@@ -34,8 +35,15 @@ VERSION = 0x0100
 MAX_REJECTION = 500  # bytes of the text
 MAX_CHANNEL = 255  # bytes; liblcm allows 63 on other transports and sets no limit here
 
-GREET = 0  # not on the wire: how `TcpqReader` reports a client's greeting
-PUBLISH, SUBSCRIBE, UNSUBSCRIBE = 1, 2, 3
+
+class RecordType(IntEnum):
+    """The type of a record."""
+
+    GREETING = 0  # not on the wire: how `TcpqReader` reports a client's greeting
+    PUBLISH = 1
+    SUBSCRIBE = 2
+    UNSUBSCRIBE = 3
+
 
 STATUS_CHANNEL = "VTB_HUB"
 TAKE_PREFIX = "VTB_HUB_TAKE/"

@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
+from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import SWITCH, Cycle
 from vtbdrake.failures import FAILURES, error_text
@@ -371,7 +372,7 @@ class Sampler:
             for name in groups[index]:
                 row[self._layout.sense[name]] = cycle.fed[name]
         # The state of a DPS that raised stands still, while the machine moves on: it tells nothing.
-        raised = next((fault.reason for fault in cycle.verdict.faults if fault.kind == "raised"), "")
+        raised = next((fault.reason for fault in cycle.verdict.faults if fault.kind == FaultKind.RAISED), "")
         try:
             self._fill_answer(rows[len(groups) - 1], max(groups), cycle, raised=bool(raised))
         except FAILURES as error:
