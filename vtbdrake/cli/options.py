@@ -51,6 +51,27 @@ def option(
     return click.option(*names, *([name] if name else []), metavar=metavar, help=text, **settings)
 
 
+def grouped(name: str, *options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a decorator that gives a command several options, whose values it gets as one dictionary ``name``.
+
+    Groups of the same name become one dictionary.
+    """
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def with_group(**arguments: Any) -> Any:
+            group = arguments.pop(name, {}) | {member: arguments.pop(member) for member in members}
+            return command(**arguments, **{name: group})
+
+        inherited = len(getattr(with_group, "__click_params__", ()))
+        for add_option in reversed(options):
+            add_option(with_group)
+        members = [parameter.name for parameter in with_group.__click_params__[inherited:]]  # type: ignore[attr-defined]
+        return with_group
+
+    return decorate
+
+
 def _assignment(text: str, form: str) -> tuple[str, str]:
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):

@@ -8,10 +8,9 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 from math import inf
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 import numpy as np
@@ -19,6 +18,7 @@ import numpy as np
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
+    grouped,
     horizon_option,
     option,
     output,
@@ -36,26 +36,22 @@ from vtbdrake.failures import one_line
 from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
 from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension, point_text
-from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.executor import NAMES
-from vtbdrake.state import Snapshot
 from vtbdrake.state.variables import with_unit
 from vtbdrake.testbed import Scenario
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 _FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _CALL = re.compile(rf"({_FUNCTION.pattern})\((.*)\)")
 
 
-def _all(*options: Callable[[F], F]) -> Callable[[F], F]:
-    """Combine several options to one decorator."""
-    return lambda command: reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
+def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command a scenario, and what else states a problem as ``problem``, for `make_problem`."""
+    return scenario_argument(_problem_options(command))
 
 
-problem_options: Callable[[F], F] = _all(
-    scenario_argument,
+_problem_options = grouped(
+    "problem",
     option(
         "--quality ADDRESS|MODULE:FUNCTION",
         "f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
@@ -75,18 +71,23 @@ problem_options: Callable[[F], F] = _all(
     sample_period_option,
     start_option,
 )
-executor_options: Callable[[F], F] = _all(
+# For `Problem.sweep`, `Problem.boundary` and `Study.run`.
+executor_options = grouped(
+    "running",
     option("--executor", "Where rollouts run.", type=click.Choice(NAMES), default=NAMES[0]),
     option("--workers N", "The number of threads or processes.  [default: one per core]", type=click.IntRange(min=1)),
 )
-on_error_option: Callable[[F], F] = option(
-    "--on-error",
-    "If the quality function raises: record the rollout as failed, or end the run.",
-    type=click.Choice(["record", "raise"]),
-    default="record",
+on_error_option = grouped(
+    "running",
+    option(
+        "--on-error",
+        "If the quality function raises: record the rollout as failed, or end the run.",
+        type=click.Choice(["record", "raise"]),
+        default="record",
+    ),
 )
-_FILES = ("save", "csv", "plot")
-_file_options: Callable[[F], F] = _all(
+_file_options = grouped(
+    "files",
     option("--save FILE", "Write the sweep for vtbdrake.optimization.Sweep.load.", parse=output()),
     option("--csv FILE", "Write the table.", parse=output(".csv")),
     option("--plot FILE", "Draw h and the qualities.", parse=output(".png", ".svg", ".pdf")),
@@ -114,29 +115,30 @@ def make_problem(
     *,
     quality: str,
     of: Sequence[str],
-    horizon: float,
     values: Sequence[Setting],
     conditions: Sequence[dict[str, Any]],
-    threshold: float | None = None,
-    sample_period: float,
-    start: Snapshot | None,
     minimize: bool = False,
-    risk: str | Risk = "worst",
-    constraints: Sequence[Constraint] = (),
+    **others: Any,
 ) -> Problem:
-    """Return the problem that the options state; ``values`` hold under every condition."""
+    """Return the problem that the options state.
+
+    Args:
+        scenario: The scenario.
+        parameters: What is varied.
+        quality: The address of a variable, or a function as ``module:function``.
+        of: The arguments of the function.
+        values: Settings that hold under every condition.
+        conditions: The conditions.
+        minimize: Whether the quality is a cost.
+        others: Other arguments of `Problem`.
+    """
     common = list(settings(values).items())
     return Problem(
         scenario=scenario,
         parameters=parameters,
         quality=replace(_quality(quality, of), minimize=minimize),
-        horizon=horizon,
-        threshold=threshold,
-        sample_period=sample_period,
         conditions=[settings([*common, *condition.items()]) for condition in conditions or ({},)],
-        start=start,
-        risk=risk,
-        constraints=constraints,
+        **others,
     )
 
 
@@ -193,17 +195,16 @@ def _function(text: str) -> Callable[..., Any]:
     multiple=True,
     required=True,
 )
-@option("--threshold F", "f_m: a rollout whose f exceeds it ends there.", default=inf)
+@grouped("problem", option("--threshold F", "f_m: a rollout whose f exceeds it ends there.", default=inf))
 @executor_options
 @on_error_option
 @_file_options
 def sweep(
     scenario: Scenario,
     vary: tuple[tuple[Parameter, int], ...],
-    executor: str,
-    workers: int | None,
-    on_error: str,
-    **problem: Any,
+    problem: dict[str, Any],
+    running: dict[str, Any],
+    files: dict[str, Any],
 ) -> None:
     """Simulate every point of a grid: which one is best?
 
@@ -215,14 +216,13 @@ def sweep(
       vtbdrake sweep vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
     """
-    files = {name: problem.pop(name) for name in _FILES}
-    stated = make_problem(scenario, [parameter for parameter, _ in vary], **problem)
-    found = stated.sweep([points for _, points in vary], executor=executor, workers=workers, on_error=on_error)
-    click.echo(_points_table(found))
-    _write_files(found, **files)
-    _reject_failures(found)
-    click.echo("\n" + _conclusion(found))
-    if not found.complete:
+    parameters, points = zip(*vary, strict=True)
+    swept = make_problem(scenario, parameters, **problem).sweep(points, **running)
+    click.echo(_points_table(swept))
+    _write_files(swept, **files)
+    _reject_failures(swept)
+    click.echo("\n" + _conclusion(swept))
+    if not swept.complete:
         raise FailedError("the sweep was interrupted: the table shows the finished rollouts")
 
 
@@ -234,30 +234,31 @@ def sweep(
     parse=parse_range,
     required=True,
 )
-@option("--threshold F", "f_m: a rollout whose f exceeds it is bad.", type=float, required=True)
-@option("--resolution R", "The width of the interval to find.", type=float, required=True)
-@option("--coarse C", "The step of the first grid.", type=float, required=True)
-@option(
-    "--repeats N",
-    "Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one.  "
-    "[default: 5]",
-    type=click.IntRange(min=0),
+@grouped("problem", option("--threshold F", "f_m: a rollout whose f exceeds it is bad.", type=float, required=True))
+@grouped(
+    "search",
+    option("--resolution R", "The width of the interval to find.", type=float, required=True),
+    option("--coarse C", "The step of the first grid.", type=float, required=True),
+    option(
+        "--repeats N",
+        "Repeat values close to the boundary N times with jitter, down to a safe one and up to an unsafe one.  "
+        "[default: 5]",
+        type=click.IntRange(min=0),
+    ),
+    option(
+        "--jitter J", "The largest change of the parameter in a repetition, as a fraction of its range.", default=1e-06
+    ),
 )
-@option("--jitter J", "The largest change of the parameter in a repetition, as a fraction of its range.", default=1e-06)
 @executor_options
 @on_error_option
 @_file_options
 def boundary(
     scenario: Scenario,
     vary: Parameter,
-    resolution: float,
-    coarse: float,
-    repeats: int | None,
-    jitter: float,
-    executor: str,
-    workers: int | None,
-    on_error: str,
-    **problem: Any,
+    problem: dict[str, Any],
+    search: dict[str, Any],
+    running: dict[str, Any],
+    files: dict[str, Any],
 ) -> None:
     """Find how far a parameter may go before f exceeds the threshold.
 
@@ -269,17 +270,7 @@ def boundary(
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
-    files = {name: problem.pop(name) for name in _FILES}
-    stated = make_problem(scenario, [vary], **problem)
-    found = stated.boundary(
-        resolution=resolution,
-        coarse=coarse,
-        repeats=repeats,
-        jitter=jitter,
-        executor=executor,
-        workers=workers,
-        on_error=on_error,
-    )
+    found = make_problem(scenario, [vary], **problem).boundary(**search, **running)
     assert found.sweep is not None
     _write_files(found.sweep, boundary=found, **files)
     _reject_failures(found.sweep)

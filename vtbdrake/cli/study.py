@@ -11,7 +11,16 @@ from typing import Any
 import click
 
 from vtbdrake.cli import FailedError
-from vtbdrake.cli.options import converted, option, output, parse_choice, parse_field, parse_scaled_range, settings
+from vtbdrake.cli.options import (
+    converted,
+    grouped,
+    option,
+    output,
+    parse_choice,
+    parse_field,
+    parse_scaled_range,
+    settings,
+)
 from vtbdrake.cli.output import table, write_csv
 from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, on_error_option, problem_options
 from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
@@ -19,8 +28,6 @@ from vtbdrake.optimization.risk import Risk
 from vtbdrake.rollout import Constraint
 from vtbdrake.testbed import Scenario
 
-# The options of `Study.run`.
-_RUNNING = ("rollouts", "seconds", "target", "executor", "workers", "time_limit", "racing", "on_error")
 _LEVELS = {"quantile": Quantile, "cvar": CVaR}
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 _point = click.argument(
@@ -81,35 +88,54 @@ def study() -> None:
     parse=partial(make_constraint, limit="at_least"),
     multiple=True,
 )
-@option("--minimize", "The quality is a cost: smaller is better.", is_flag=True)
-@option(
-    "--risk",
-    "How the qualities under several conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
-    parse=_risk,
-    default="worst",
+@grouped(
+    "problem",
+    option("--minimize", "The quality is a cost: smaller is better.", is_flag=True),
+    option(
+        "--risk",
+        "How the qualities under several conditions become one: worst, mean, quantile:LEVEL or cvar:LEVEL.",
+        parse=_risk,
+        default="worst",
+    ),
 )
-@option("--solver NAME", "The solver.  [default: auto, or that of FILE]")
-@option(
-    "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
+@grouped(
+    "solving",
+    option("--solver NAME", "The solver.  [default: auto, or that of FILE]"),
+    option(
+        "--option NAME=VALUE",
+        "An option of the solver. May be repeated.",
+        name="options",
+        parse=parse_field,
+        multiple=True,
+    ),
+    option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int),
+    option(
+        "--parallel N",
+        "Ask for enough points at a time for N rollouts side by side.  [default: the solver's own, or that of FILE]",
+        type=click.IntRange(min=1),
+    ),
 )
-@option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int)
-@option(
-    "--parallel N",
-    "Ask for enough points at a time for N rollouts side by side.  [default: the solver's own, or that of FILE]",
-    type=click.IntRange(min=1),
+@grouped(
+    "running",
+    option("--rollouts N", "End when the study has N rollouts.", type=click.IntRange(min=1)),
+    option("--seconds S", "End after S seconds of wall time.", type=float),
+    option("--target H", "End when a point is at least as good as H.", type=float),
 )
-@option("--rollouts N", "End when the study has N rollouts.", type=click.IntRange(min=1))
-@option("--seconds S", "End after S seconds of wall time.", type=float)
-@option("--target H", "End when a point is at least as good as H.", type=float)
 @executor_options
-@option("--time-limit S", "Fail a rollout that takes longer than S seconds.", type=float)
-@option(
-    "--racing/--no-racing",
-    "Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
-    default=None,
+@grouped(
+    "running",
+    option("--time-limit S", "Fail a rollout that takes longer than S seconds.", type=float),
+    option(
+        "--racing/--no-racing",
+        "Drop points that can no longer win before all conditions have run.  [default: with several conditions]",
+        default=None,
+    ),
 )
 @on_error_option
-@option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True)
+@grouped(
+    "solving",
+    option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True),
+)
 def run(
     file: Path,
     scenario: Scenario,
@@ -117,13 +143,9 @@ def run(
     choose: tuple[Choice, ...],
     at_most: tuple[Constraint, ...],
     at_least: tuple[Constraint, ...],
-    *,
-    solver: str | None,
-    options: tuple[tuple[str, Any], ...],
-    seed: int | None,
-    parallel: int | None,
-    allow_changed_code: bool,
-    **others: Any,
+    problem: dict[str, Any],
+    solving: dict[str, Any],
+    running: dict[str, Any],
 ) -> None:
     """Begin a study, or resume the one in FILE. Ctrl-C keeps the finished rollouts.
 
@@ -139,13 +161,9 @@ def run(
     if not (vary or choose):
         raise click.UsageError("nothing is varied: add --vary or --choose")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    running = {name: others.pop(name) for name in _RUNNING}
-    stated = make_problem(scenario, [*vary, *choose], **others, constraints=[*at_most, *at_least])
-    chosen = settings(options) if options else None
-    begun = stated.study(
-        file, solver=solver, seed=seed, options=chosen, parallel=parallel, allow_changed_code=allow_changed_code
-    )
-    with begun as opened:
+    stated = make_problem(scenario, [*vary, *choose], **problem, constraints=[*at_most, *at_least])
+    solving["options"] = settings(solving["options"]) or None
+    with stated.study(file, **solving) as opened:
         opened.run(**running)
         click.echo(opened.summary())
         if opened.reason == "interrupted":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from math import exp, inf, isinf, log
 from typing import TYPE_CHECKING
@@ -13,9 +13,9 @@ import numpy as np
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.records import RolloutKey
-from vtbdrake.optimization.sweep import Sweep, borrowed, make_sweep, numeric, roll_out
+from vtbdrake.optimization.sweep import Sweep, make_sweep, numeric, roll_out
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask
-from vtbdrake.rollout.task import TERMINATED, catches
+from vtbdrake.rollout.task import TERMINATED
 from vtbdrake.state.variables import with_unit
 
 if TYPE_CHECKING:
@@ -345,23 +345,15 @@ def repeat_around(first: int, last: int, count: Callable[[Sequence[int]], Mappin
         wanted = [index for index in (down, up) if 0 <= index <= last]
 
 
-def search_boundary(
-    problem: Problem,
-    *,
-    resolution: float,
-    coarse: float,
-    repeats: int | None,
-    jitter: float,
-    executor: str | Executor,
-    workers: int | None,
-    on_error: str,
-    progress: bool,
-) -> Boundary:
-    """Search the boundary of a problem; see `Problem.boundary`."""
+def parameter_with_boundary(problem: Problem) -> Parameter:
+    """Return the parameter of a problem whose boundary can be searched.
+
+    Raises:
+        ValueError: There is not exactly one, or no rollout could be unsafe.
+    """
     if len(problem.parameters) != 1:
         raise ValueError(f"a boundary is that of one parameter, but the problem has {len(problem.parameters)}")
     (parameter,) = numeric(problem)
-    task = replace(problem.task, catch=catches(on_error))
     reason = why_never_unsafe(
         finite_threshold=problem.task.threshold is not None,
         minimize=[quality.minimize for quality in problem.objectives],
@@ -369,20 +361,15 @@ def search_boundary(
     )
     if reason:
         raise ValueError(reason)
-    refinement = Refinement(parameter, resolution=resolution, coarse=coarse)
-    repeats, jitter = _checked_jitter(parameter, repeats, jitter)
-    first = len(refinement.start()) * len(problem.conditions)
-    with borrowed(problem, executor, rollouts=first, workers=workers) as chosen:
-        search = _Search(problem, task, refinement, chosen, progress=progress)
-        outcomes = find_boundary(refinement, len(problem.conditions), search.examine)
-        if repeats:
-            unsafe = [index for found in outcomes for index, bad in found.items() if bad]
-            count = partial(search.repeat, repeats=repeats, jitter=jitter)
-            repeat_around(min(unsafe, default=refinement.last + 1), refinement.last, count)
-    return search.boundary()
+    return parameter
 
 
-def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> tuple[int, float]:
+def checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> tuple[int, float]:
+    """Return the number of repeats, by default that for this parameter, and their jitter.
+
+    Raises:
+        ValueError: One is out of range, or the parameter cannot be jittered.
+    """
     if repeats is None:
         repeats = 0 if parameter.integer or parameter.is_field else _REPEATS
     repeats, jitter = as_whole("the number of repeats", repeats), as_number("the jitter", jitter)
@@ -393,7 +380,7 @@ def _checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) ->
     return repeats, jitter
 
 
-class _Search:
+class BoundarySearch:
     """The rollouts of a search for a boundary: one at each value, and repeats with jitter close to the boundary."""
 
     def __init__(
@@ -409,6 +396,19 @@ class _Search:
         # Candidate -> (rollouts, unsafe ones).
         self._counts: dict[Candidate, tuple[int, int]] = {}
         self._chances: set[Candidate] = set()
+
+    def run(self, *, repeats: int, jitter: float) -> Boundary:
+        """Search the boundary, with so many rollouts with jitter for each value around it."""
+        outcomes = find_boundary(self._refinement, len(self._problem.conditions), self.examine)
+        if repeats:
+            last = self._refinement.last
+            unsafe = [index for outcome in outcomes for index, bad in outcome.items() if bad]
+            repeat_around(min(unsafe, default=last + 1), last, partial(self.repeat, repeats=repeats, jitter=jitter))
+        value = self._refinement.value
+        chances = [Chance(value(i), c, *self._counts[i, c]) for i, c in self._chances]
+        return boundary_of(
+            self._sorted(self._results), chances, self._sorted(self._repeated) if self._chances else None
+        )
 
     def examine(self, wanted: Sequence[Candidate]) -> list[bool]:
         """Run one rollout for each candidate; return whether it was unsafe."""
@@ -452,14 +452,6 @@ class _Search:
             raise KeyboardInterrupt
         results += zip(keys, finished, strict=True)
         return make_sweep(self._problem, keys, finished).unsafe
-
-    def boundary(self) -> Boundary:
-        """Return the boundary that the rollouts so far determine."""
-        value = self._refinement.value
-        chances = [Chance(value(i), c, *self._counts[i, c]) for i, c in self._chances]
-        return boundary_of(
-            self._sorted(self._results), chances, self._sorted(self._repeated) if self._chances else None
-        )
 
     def _sorted(self, results: list[tuple[RolloutKey, RolloutResult]]) -> Sweep:
         ordered = sorted(results, key=lambda pair: pair[0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import all_of, as_number, as_whole
-from vtbdrake.optimization.boundary import Boundary, search_boundary
+from vtbdrake.optimization.boundary import Boundary, BoundarySearch, Refinement, checked_jitter, parameter_with_boundary
 from vtbdrake.optimization.parameter import Dimension, checked_point
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
@@ -398,8 +398,8 @@ class Problem:
         checked = [self.point(point.tolist()) for point in table]
         keys = [(point, condition) for point in checked for condition in range(len(self.conditions))]
         task = replace(self.task, record=record, run_on=run_on, catch=catches(on_error))
-        with borrowed(self, executor, rollouts=len(keys), workers=workers) as chosen:
-            return make_sweep(self, keys, roll_out(self, chosen, task, keys, name="sweep", progress=progress))
+        with borrowed(self, executor, rollouts=len(keys), workers=workers) as opened:
+            return make_sweep(self, keys, roll_out(self, opened, task, keys, name="sweep", progress=progress))
 
     def boundary(
         self,
@@ -446,17 +446,14 @@ class Problem:
                 (which is a goal, not a danger), or the steps do not fit the range.
             KeyboardInterrupt: The search was interrupted.
         """
-        return search_boundary(
-            self,
-            resolution=resolution,
-            coarse=coarse,
-            repeats=repeats,
-            jitter=jitter,
-            executor=executor,
-            workers=workers,
-            on_error=on_error,
-            progress=progress,
-        )
+        parameter = parameter_with_boundary(self)
+        refinement = Refinement(parameter, resolution=resolution, coarse=coarse)
+        repeats, jitter = checked_jitter(parameter, repeats, jitter)
+        task = replace(self.task, catch=catches(on_error))
+        rollouts = len(refinement.start()) * len(self.conditions)
+        with borrowed(self, executor, rollouts=rollouts, workers=workers) as opened:
+            search = BoundarySearch(self, task, refinement, opened, progress=progress)
+            return search.run(repeats=repeats, jitter=jitter)
 
     def casadi_function(self, **options: Any) -> ProblemFunction:
         """Return h(s^0) as a ``casadi.Function`` with derivatives, for ``Opti`` and ``nlpsol``: a `ProblemFunction`."""

@@ -21,7 +21,8 @@ from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers import Solver, make_solver
 from vtbdrake.optimization.study_file import StudyError, StudyFile
 from vtbdrake.optimization.study_run import StudyRun, check_budget
-from vtbdrake.rollout import Executor, make_executor
+from vtbdrake.optimization.sweep import borrowed
+from vtbdrake.rollout import Executor
 from vtbdrake.rollout.task import catches
 
 if TYPE_CHECKING:
@@ -221,27 +222,22 @@ class Study:
         self._stopped = False
         racing = len(problem.conditions) > 1 and len(problem.objectives) == 1 if racing is None else racing
         budget = rollouts if rollouts is not None else 10**9
-        chosen = make_executor(
-            executor, testbed=problem.testbed, rollouts=budget, workers=workers, time_limit=time_limit
-        )
-        try:
-            with self._file.running(versions=versions(), revision=revision(problem.scenario)) as reason:
-                solver = self._make_solver(problem, rollouts, racing=racing)
-                run = StudyRun(
-                    self._file,
-                    problem,
-                    solver,
-                    chosen,
-                    racing=racing,
-                    catch=catch,
-                    progress=progress,
-                    after_batch=after_batch,
-                )
-                self.reason, self.message = run.until(rollouts=rollouts, seconds=seconds, target=target)
-                reason.append(self.reason)
-        finally:
-            if chosen is not executor:
-                chosen.close()
+        with (
+            borrowed(problem, executor, rollouts=budget, workers=workers, time_limit=time_limit) as opened,
+            self._file.running(versions=versions(), revision=revision(problem.scenario)) as reason,
+        ):
+            run = StudyRun(
+                self._file,
+                problem,
+                self._make_solver(problem, rollouts, racing=racing),
+                opened,
+                racing=racing,
+                catch=catch,
+                progress=progress,
+                after_batch=after_batch,
+            )
+            self.reason, self.message = run.until(rollouts=rollouts, seconds=seconds, target=target)
+            reason.append(self.reason)
         return self
 
     def stop(self) -> None:

@@ -375,14 +375,14 @@ def numeric(problem: Problem) -> tuple[Parameter, ...]:
 
 
 @contextmanager
-def borrowed(problem: Problem, executor: str | Executor, *, rollouts: int, workers: int | None) -> Iterator[Executor]:
-    """Provide an executor, and close it afterwards unless it is the user's."""
-    chosen = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, workers=workers)
+def borrowed(problem: Problem, executor: Any, *, rollouts: int, **settings: Any) -> Iterator[Executor]:
+    """Provide what `make_executor` returns, and close it afterwards unless it is the user's."""
+    borrowed_executor = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, **settings)
     try:
-        yield chosen
+        yield borrowed_executor
     finally:
-        if chosen is not executor:
-            chosen.close()
+        if borrowed_executor is not executor:
+            borrowed_executor.close()
 
 
 def roll_out(
