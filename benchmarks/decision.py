@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 
 from benchmarks.measure import LOWER, Benchmark, seconds, spread
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Belief, Budget, Reasoner, Starter
+from vtbdrake.reasoning import Belief, BeliefToStart, Budget, Reasoner
 from vtbdrake.rollout import Quality, RolloutRunner
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
@@ -23,7 +23,7 @@ ROLLOUTS, WORKERS = 3, 2
 def _begin_in_workers(reasoner: Reasoner, testbed: VirtualTestbed, context: Context) -> float:
     """Return the seconds beside two rollouts from a belief, without the reasoner's method and its choice."""
     begin = time.perf_counter()
-    start = reasoner.starter.start(Belief.of(testbed, context))
+    start = reasoner.belief_to_start.start(Belief.of(testbed, context))
     results = dict(reasoner.executor.run(reasoner.task, [{}] * WORKERS, start=start))
     return time.perf_counter() - begin - max(result.wall_time for result in results.values())
 
@@ -68,9 +68,9 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
                 own.append(used)
                 bare.append(_begin_in_workers(reasoner, testbed, context))
     runner = RolloutRunner(reasoner.task)
-    starter = Starter(runner.testbed)
+    belief_to_start = BeliefToStart(runner.testbed)
     belief = Belief.of(testbed, context)
-    one, other = starter.start(belief), starter.start(belief)
+    one, other = belief_to_start.start(belief), belief_to_start.start(belief)
 
     def begin_at(*starts: object) -> None:
         for start in starts:
@@ -82,7 +82,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
         for starts in ((one, other), (one, one))
     )
     ours += 2 * max(float(anew - again), 0.0)
-    parts = {"the belief": lambda: Belief.of(testbed, context), "its start": lambda: starter.start(belief)}
+    parts = {"the belief": lambda: Belief.of(testbed, context), "its start": lambda: belief_to_start.start(belief)}
     told = ", ".join(f"{name} {1e3 * np.median([seconds(f) for _ in range(200)]):.2f} ms" for name, f in parts.items())
     return Benchmark(
         name="decision_overhead",

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, LeafSystem
 from tests.testbeds import PENDULUM, AcrobotScenario, PendulumScenario
 from vtbdrake.components.sensors import JointEncoders
 from vtbdrake.components.sensors.errors import ErrorModel
-from vtbdrake.reasoning import Belief, BeliefError, Starter
+from vtbdrake.reasoning import Belief, BeliefError, BeliefToStart
 from vtbdrake.rollout import ProcessExecutor, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
 from vtbdrake.state import discrete_state
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal
@@ -239,14 +239,16 @@ def test_the_climber_walks_on_from_the_belief_of_its_dps_alone():
 def test_samples_have_the_covariance_that_is_given(tracked):
     testbed, context, mental = tracked
     belief = Belief.of(testbed, context)
-    starter = Starter(mental, uncertainty={THETA: 0.1, OMEGA: lambda w, rng: w + 0.5 * rng.uniform(-1.0, 1.0)}, seed=3)
-    starts = starter.starts(belief, samples=400)
+    to_start = BeliefToStart(
+        mental, uncertainty={THETA: 0.1, OMEGA: lambda w, rng: w + 0.5 * rng.uniform(-1.0, 1.0)}, seed=3
+    )
+    starts = to_start.starts(belief, samples=400)
     q, v = (mental.start_layout.slice_of(mental.variables()[a]) for a in (THETA, OMEGA))
     drawn = np.array([[s.contents.numbers[q][0], s.contents.numbers[v][0]] for s in starts])
     believed = [testbed.read(context, "dps.angle"), testbed.read(context, "dps.rate")]
     np.testing.assert_allclose(drawn.mean(axis=0), believed, atol=0.05)
     np.testing.assert_allclose(drawn.std(axis=0), [0.1, 0.5 / np.sqrt(3.0)], rtol=0.1)
-    again = starter.starts(belief, samples=2)
+    again = to_start.starts(belief, samples=2)
     np.testing.assert_array_equal(again[1].contents.numbers, starts[1].contents.numbers)
 
 
@@ -257,14 +259,16 @@ def test_a_covariance_matrix_correlates_the_entries_of_a_variable():
     simulator = testbed.simulator()
     simulator.AdvanceTo(0.1)
     C = 1e-2 * (np.eye(6) + 0.8 * (np.eye(6, k=1) + np.eye(6, k=-1)) / 2)
-    starts = Starter(mental, uncertainty={pose: C}).starts(Belief.of(testbed, simulator.get_context()), samples=500)
+    starts = BeliefToStart(mental, uncertainty={pose: C}).starts(
+        Belief.of(testbed, simulator.get_context()), samples=500
+    )
     place = mental.start_layout.slice_of(mental.variables()[pose])
     np.testing.assert_allclose(np.cov([s.contents.numbers[place] for s in starts], rowvar=False), C, atol=3e-3)
 
 
 def test_an_uncertain_parameter_of_the_world_varies_around_its_value_there(tracked):
     testbed, context, mental = tracked
-    starts = Starter(mental, uncertainty={ARM_MASS: 5.0}).starts(Belief.of(testbed, context), samples=30)
+    starts = BeliefToStart(mental, uncertainty={ARM_MASS: 5.0}).starts(Belief.of(testbed, context), samples=30)
     masses = [float(start.values[ARM_MASS]) for start in starts]
     assert min(masses) == 0.0 and max(masses) > 5.0 and len(set(masses)) > 10
     runner = RolloutRunner(RolloutTask(TrackedScenario(), 0.1, record=[ARM_MASS]), mental)
@@ -274,7 +278,7 @@ def test_an_uncertain_parameter_of_the_world_varies_around_its_value_there(track
 
 def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
     testbed, context, mental = tracked
-    first, second = Starter(mental).starts(Belief.of(testbed, context), samples=2)
+    first, second = BeliefToStart(mental).starts(Belief.of(testbed, context), samples=2)
     assert first is second
 
 
@@ -291,7 +295,7 @@ def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
 )
 def test_an_uncertainty_that_does_not_fit_is_refused(tracked, uncertainty, why):
     with pytest.raises(ValueError, match=why):
-        Starter(tracked[2], uncertainty=uncertainty)
+        BeliefToStart(tracked[2], uncertainty=uncertainty)
 
 
 # -- beliefs from which nothing can begin
@@ -308,28 +312,28 @@ def test_a_missing_belief_or_one_out_of_bounds_is_refused(tracked):
 
 def test_an_estimate_past_a_stop_is_clipped_or_refused(tracked):
     testbed, _, mental = tracked
-    context, starter = testbed.default_context(), Starter(mental)
+    context, to_start = testbed.default_context(), BeliefToStart(mental)
     for angle in (2.19, -2.19):
         testbed.write(context, {"dps.angle": angle})
-        start = starter.start(Belief.of(testbed, context))
+        start = to_start.start(Belief.of(testbed, context))
         assert start.contents.numbers[mental.start_layout.slice_of(mental.variables()[THETA])] == np.sign(angle) * 2.0
     testbed.write(context, {"dps.angle": 2.21})
     with pytest.raises(BeliefError, match=rf"{THETA} is 2.21 rad, .* must lie in \[-2, 2\]"):
-        starter.start(Belief.of(testbed, context))
+        to_start.start(Belief.of(testbed, context))
 
 
 def test_an_old_belief_is_refused(tracked):
     testbed, context, mental = tracked
-    belief, starter = Belief.of(testbed, context), Starter(mental, max_age=0.1)
-    starter.start(belief, now=0.7)
+    belief, to_start = Belief.of(testbed, context), BeliefToStart(mental, max_age=0.1)
+    to_start.start(belief, now=0.7)
     with pytest.raises(BeliefError, match=r"of t = 0.63 s and 0.12 s old, but at most 0.1 s"):
-        starter.start(belief, now=0.75)
+        to_start.start(belief, now=0.75)
     with pytest.raises(BeliefError, match="nan s old"):
-        starter.start(belief, now=float("nan"))
+        to_start.start(belief, now=float("nan"))
     with pytest.raises(BeliefError, match="of t = 0.63 s, which lies after now = 0.5 s"):
-        starter.start(belief, now=0.5)
+        to_start.start(belief, now=0.5)
     with pytest.raises(BeliefError, match=r"older than max_age = 0.1 s depends on now: give now="):
-        starter.start(belief)
+        to_start.start(belief)
 
 
 def test_a_world_without_rules_is_refused():
@@ -355,12 +359,12 @@ def test_the_mental_world_may_differ_where_the_dps_is_the_same(tracked):
 def test_what_is_no_belief_is_refused(tracked):
     testbed, context, mental = tracked
     with pytest.raises(BeliefError, match="not Snapshot"):
-        Starter(mental).start(testbed.snapshot(context))
+        BeliefToStart(mental).start(testbed.snapshot(context))
     with pytest.raises(ValueError, match="positive time"):
-        Starter(mental, max_age=0.0)
+        BeliefToStart(mental, max_age=0.0)
     belief = Belief.of(testbed, context)
     with pytest.raises(BeliefError, match="has not received angle"):
-        Starter(mental).start(replace(belief, dps=replace(belief.dps, received={})))
+        BeliefToStart(mental).start(replace(belief, dps=replace(belief.dps, received={})))
 
 
 @pytest.mark.parametrize("forked", [True, False])

@@ -19,7 +19,7 @@ from vtbdrake.rollout import (
     SerialExecutor,
     ThreadExecutor,
 )
-from vtbdrake.rollout import runner as keeping
+from vtbdrake.rollout import testbeds as cache
 from vtbdrake.state import SnapshotError
 from vtbdrake.testbed import ScenarioError
 
@@ -85,14 +85,14 @@ def test_a_given_testbed_serves_points_with_its_own_values(built):
 
 
 def test_the_testbed_not_used_for_longest_goes_first(built):
-    with SerialExecutor(kept=2) as executor:
+    with SerialExecutor(max_testbeds=2) as executor:
         _results(executor, _task(), [{STIFFNESS: value} for value in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0)])
     assert built == [1.0, 2.0, 3.0, 2.0]
 
 
 def test_runners_do_not_hold_testbeds_that_have_gone():
-    testbeds = keeping.Testbeds(kept=2)
-    runners, task = keeping.Runners(testbeds), _task()
+    testbeds = cache.Testbeds(max_testbeds=2)
+    runners, task = cache.Runners(testbeds), _task()
     kept = [runners.get(task, {"stiffness": value}) for value in (1.0, 2.0, 3.0)]
     assert len(testbeds) == 2
     assert [runner.testbed in testbeds for runner in kept] == [False, True, True]
@@ -101,7 +101,7 @@ def test_runners_do_not_hold_testbeds_that_have_gone():
 
 
 def test_threads_that_want_the_same_new_testbed_build_it_once(built):
-    testbeds, both = keeping.Testbeds(), threading.Barrier(4)
+    testbeds, both = cache.Testbeds(), threading.Barrier(4)
 
     def get(_):
         both.wait(timeout=10.0)
@@ -140,13 +140,13 @@ def test_threads_build_their_testbeds_one_after_another():
 
 def test_more_threads_than_testbeds_are_kept_take_them_from_each_other():
     points = [{STIFFNESS: float(k), THETA: 0.5} for k in range(60)]
-    with ThreadExecutor(4, kept=1) as threads, SerialExecutor(kept=1) as serial:
+    with ThreadExecutor(4, max_testbeds=1) as threads, SerialExecutor(max_testbeds=1) as serial:
         results, expected = (_results(executor, _task(), points) for executor in (threads, serial))
     assert all(ours.identical(theirs) for ours, theirs in zip(results, expected, strict=True))
 
 
 def test_a_testbed_whose_build_failed_is_tried_again(built):
-    testbeds = keeping.Testbeds()
+    testbeds = cache.Testbeds()
     for _ in range(2):
         with pytest.raises(RuntimeError, match="damped so"):
             testbeds.get(CountedScenario(damping=13.0))
@@ -203,4 +203,4 @@ def test_a_snapshot_is_of_its_own_scenario():
 def test_at_least_one_testbed_is_kept():
     for make in (SerialExecutor, ThreadExecutor, ProcessExecutor):
         with pytest.raises(ValueError, match="at least one testbed must be kept, not 0"):
-            make(kept=0)
+            make(max_testbeds=0)

@@ -105,7 +105,7 @@ def test_worker_that_died_while_idle_costs_nothing(caplog):
 def test_worker_killed_while_starting_costs_nothing():
     others = set(child_pids())
     with ProcessExecutor(2) as executor:
-        executor.start(2)
+        executor.start_workers(2)
         for pid in set(child_pids()) - others:
             os.kill(pid, signal.SIGKILL)
         _assert_right(executor, ANGLE, POINTS)

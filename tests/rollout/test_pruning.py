@@ -18,7 +18,7 @@ def ending(quality, samples, *, to_beat, pruning=None, measures=()):
     """How many samples are taken, how it ends, and what was reachable."""
     prospect = Prospect(pruning or Pruning(), quality, measures, HORIZON, to_beat)
     for count, (t, sample) in enumerate(zip(TIMES, samples, strict=True), 1):
-        end = prospect.take(t, [sample] * (1 + len(measures)), [])
+        end = prospect.update(t, [sample] * (1 + len(measures)), [])
         if end is not None:
             return count, end[0], prospect.reachable
     return len(samples), "", prospect.reachable

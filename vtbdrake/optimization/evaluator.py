@@ -16,8 +16,8 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.derivative import DerivativeRunner
 from vtbdrake.rollout.pruning import PRUNED
-from vtbdrake.rollout.runner import split
 from vtbdrake.rollout.task import FAILED
+from vtbdrake.rollout.testbeds import split
 
 # Racing goes through the conditions in rounds of at least this many rollouts, enough for several workers. It does not
 # depend on their number: a study is the same with any.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import all_of, as_flag, as_number
-from vtbdrake.rollout.runner import FIELD
+from vtbdrake.rollout.testbeds import FIELD
 from vtbdrake.state import Variable, Variables
 from vtbdrake.state.variables import with_unit
 

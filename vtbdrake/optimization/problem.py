@@ -29,8 +29,8 @@ from vtbdrake.rollout import (
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
 from vtbdrake.rollout.recorded_motion import MotionPlayer
-from vtbdrake.rollout.runner import Testbeds, split
 from vtbdrake.rollout.task import catches
+from vtbdrake.rollout.testbeds import Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.state.variables import overlap
 from vtbdrake.testbed import Scenario, VirtualTestbed

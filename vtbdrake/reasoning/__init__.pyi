@@ -2,7 +2,7 @@
 
 from vtbdrake.reasoning.belief import Belief as Belief
 from vtbdrake.reasoning.belief import BeliefError as BeliefError
-from vtbdrake.reasoning.belief import Starter as Starter
+from vtbdrake.reasoning.belief import BeliefToStart as BeliefToStart
 from vtbdrake.reasoning.budget import Budget as Budget
 from vtbdrake.reasoning.decision import Candidate as Candidate
 from vtbdrake.reasoning.decision import Decision as Decision

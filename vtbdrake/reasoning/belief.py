@@ -97,8 +97,8 @@ class Belief:
         return cls(testbed.dps_state(context), World(testbed.whole_layout.take(context), values))
 
     def start(self, mental: VirtualTestbed) -> Start:
-        """Return the start of a rollout of ``mental`` in the believed world; see `Starter.start`."""
-        return Starter(mental).start(self)
+        """Return the start of a rollout of ``mental`` in the believed world; see `BeliefToStart.start`."""
+        return BeliefToStart(mental).start(self)
 
 
 # How an estimate is uncertain: a standard deviation (scalar or of the variable's shape), a covariance matrix, or a
@@ -106,7 +106,7 @@ class Belief:
 Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
 
 
-class Starter:
+class BeliefToStart:
     """Turns beliefs into starts for the rollouts of one mental testbed.
 
     1. The DPS continues in its present state, at its own time, with its present commands u.
@@ -319,9 +319,9 @@ class Starter:
             raise BeliefError(f"the believed values cannot be set in the mental world: {error}") from error
         for name, sensor in self._sensors.items():
             _resume(sensor, context, dps.received[name])
-        own = self._mental.dps.GetMyContextFromRoot(context)
+        dps_context = self._mental.dps.GetMyContextFromRoot(context)
         for name, actuator in self._actuators.items():
-            _resume(actuator, context, self._mental.dps.GetOutputPort(name).Eval(own))
+            _resume(actuator, context, self._mental.dps.GetOutputPort(name).Eval(dps_context))
         return Start(dps.time, layout.take(context), {**commands, **later})
 
     def _perfect(self, dps: DpsState, world: World) -> Start:
@@ -379,19 +379,20 @@ class _Target:
         value = self.rule.value_of(of, late=late)
         if isinstance(value, float) and self.interval[0] <= value <= self.interval[1]:
             return value  # Most are of joints: numpy would take ten times as long.
-        variable, told = self.variable, dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))
+        variable = self.variable
+        basis = dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))
         try:
             believed = np.asarray(value, dtype=float).reshape(variable.shape)
         except (TypeError, ValueError) as error:
             raise BeliefError(
-                f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, of {told}"
+                f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, of {basis}"
             ) from error
         if not np.isfinite(believed).all():
-            raise BeliefError(f"the belief about {variable.address} is missing: {believed.tolist()}, of {told}")
+            raise BeliefError(f"the belief about {variable.address} is missing: {believed.tolist()}, of {basis}")
         if ((believed < self._least - self._tolerance) | (believed > self._most + self._tolerance)).any():
             amount, allowed = with_unit(str(believed.tolist()), variable.unit), variable.bounds_text()
             raise BeliefError(
-                f"the belief about {variable.address} is {amount}, of {told}, but it must lie in {allowed}"
+                f"the belief about {variable.address} is {amount}, of {basis}, but it must lie in {allowed}"
             )
         return np.clip(believed, self._least, self._most)
 
@@ -413,18 +414,18 @@ class _Copied:
         """
         values = estimates[self._from]
         if not ((values >= self._least) & (values <= self._most)).all():
-            told = zip(self.targets, values.tolist(), strict=True)
-            values = np.array([target.value({target.rule.of[0]: value}) for target, value in told])
+            pairs = zip(self.targets, values.tolist(), strict=True)
+            values = np.array([target.value({target.rule.of[0]: value}) for target, value in pairs])
         numbers[self._to] = values
 
 
 def _resume(system: System, root: Context, value: Any) -> None:
     """Set a sensor or an actuator to the state of one whose last output or input, respectively, was ``value``."""
-    own = system.GetMyMutableContextFromRoot(root)
+    context = system.GetMyMutableContextFromRoot(root)
     if is_hold(system):
-        own.SetDiscreteState(0, np.resize(value, own.get_discrete_state(0).size()))
+        context.SetDiscreteState(0, np.resize(value, context.get_discrete_state(0).size()))
     else:
-        system.resume(own, value)
+        system.resume(context, value)
 
 
 def can_resume(system: System) -> bool:

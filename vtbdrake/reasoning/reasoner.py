@@ -20,7 +20,7 @@ from vtbdrake.optimization.problem import Motion, Problem, recording_motion
 from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.reasoning.belief import Belief, BeliefError, Starter, Uncertainty
+from vtbdrake.reasoning.belief import Belief, BeliefError, BeliefToStart, Uncertainty
 from vtbdrake.reasoning.budget import Budget, check_budget
 from vtbdrake.reasoning.decision import Decision
 from vtbdrake.reasoning.decision_run import DecisionRun
@@ -28,7 +28,7 @@ from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
-from vtbdrake.rollout.start import Beginning, Start
+from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.addressed import AddressedDiagram
 
@@ -66,7 +66,7 @@ class Reasoner:
         constraints: Constraints that the rollouts of an eligible candidate keep.
         samples: Number of samples of an uncertain belief from which each candidate is simulated, at least 2; 1 if the
             belief is certain.
-        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `Starter`.
+        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `BeliefToStart`.
         max_age: The largest age of a belief, in seconds.
         risk: How the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
         threshold: Threshold f_m: a rollout ends when f exceeds it.
@@ -85,7 +85,7 @@ class Reasoner:
         problem: Problem (18) in the mental testbed, one condition per sample.
         task: The data that all rollouts share.
         executor: Where the rollouts run.
-        starter: Turns beliefs into starts of rollouts.
+        belief_to_start: Turns beliefs into starts of rollouts.
         space: The decided elements.
         budget: How much a decision may take.
         samples: Number of samples of the belief from which each candidate is simulated.
@@ -150,10 +150,10 @@ class Reasoner:
         # A quality that fails is a reason against a candidate, and no end of the DPS.
         self.task = replace(self.problem.task, catch=True, pruning=pruning)
         testbed = self.problem.testbed
-        self.starter = Starter(testbed, uncertainty=uncertainty, seed=seed, max_age=max_age)
+        self.belief_to_start = BeliefToStart(testbed, uncertainty=uncertainty, seed=seed, max_age=max_age)
         self._unbelieved = UnbelievedReadings(testbed, uncertain=uncertainty or ())
         # Reads values from a start.
-        self._beginning = Beginning(testbed, testbed.default_context(), testbed.copier_from(testbed))
+        self._start_context = StartContext(testbed, testbed.default_context(), testbed.copier_from(testbed))
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
         self._method = method
         self._options = dict(options or {})
@@ -269,7 +269,7 @@ class Reasoner:
     def _starts(self, believer: Belief | Start, now: float) -> Sequence[Start]:
         if isinstance(believer, Start):
             return [believer] * self.samples
-        return self.starter.starts(believer, samples=self.samples, now=now)
+        return self.belief_to_start.starts(believer, samples=self.samples, now=now)
 
     def _plan_in_use(self, start: Start) -> dict[str, Any]:
         """Return the values of the decided elements in a start, address -> value."""
@@ -277,8 +277,8 @@ class Reasoner:
             # Usually so: commands. Setting a context to the start would take a fifth of the time before the rollouts.
             given = {address: np.asarray(start.values[address], dtype=float) for address in self._readers}
             return {address: value if value.shape else value.item() for address, value in given.items()}
-        self._beginning.set(start)
-        return {address: read(self._beginning.context) for address, read in self._readers.items()}
+        self._start_context.set(start)
+        return {address: read(self._start_context.context) for address, read in self._readers.items()}
 
     def motion(self, decision: Decision, candidate: int) -> Motion:
         """Return the motion of the mental world under a candidate, from the first sample of the belief.

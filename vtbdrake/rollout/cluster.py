@@ -19,9 +19,9 @@ from vtbdrake.failures import error_text
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.runner import failed
 from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.testbeds import failed
 from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor, checked_time_limit
 
 try:
@@ -75,7 +75,7 @@ class DaskExecutor(Executor):
         if in_flight is not None and in_flight < 1:
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
         self._time_limit = checked_time_limit(time_limit)
-        self._own = not isinstance(client, Client)
+        self._closes_client = not isinstance(client, Client)
         self._client: Client = client if isinstance(client, Client) else _connected(client)
         if self._client.asynchronous:
             raise ValueError("an asynchronous Dask client cannot be waited for: make it with asynchronous=False")
@@ -180,7 +180,7 @@ class DaskExecutor(Executor):
             for name in self._sent.values():
                 self._forget(name)
         self._sent.clear()
-        if self._own:
+        if self._closes_client:
             self._client.close()
 
 

@@ -19,9 +19,10 @@ from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds
+from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask, quality_warning
+from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -96,19 +97,19 @@ class SerialExecutor(Executor):
 
     Args:
         testbed: A testbed to use for tasks of its scenario; others are built.
-        kept: Number of testbeds that are kept, for points with different scenario fields.
+        max_testbeds: Number of testbeds that are kept, for points with different scenario fields.
     """
 
-    def __init__(self, testbed: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
-        self._runners = Runners(Testbeds(testbed, kept=kept))
+    def __init__(self, testbed: VirtualTestbed | None = None, *, max_testbeds: int = MAX_TESTBEDS) -> None:
+        self._runners = Runners(Testbeds(testbed, max_testbeds=max_testbeds))
 
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
         starts = start_of_each(start, len(points))
-        for index, (point, begins) in enumerate(zip(points, starts, strict=True)):
+        for index, (point, point_start) in enumerate(zip(points, starts, strict=True)):
             try:
-                result = self._runners.run(task, point, start=begins, cutoff=cutoff)
+                result = self._runners.run(task, point, start=point_start, cutoff=cutoff)
             except CancelledError:
                 return
             yield index, result
@@ -137,12 +138,14 @@ class ThreadExecutor(Executor):
     Args:
         workers: Number of threads; by default the number of cores.
         testbed: A testbed to use for tasks of its scenario; others are built.
-        kept: Number of testbeds that are kept, for points with different scenario fields.
+        max_testbeds: Number of testbeds that are kept, for points with different scenario fields.
     """
 
-    def __init__(self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, kept: int = KEPT) -> None:
+    def __init__(
+        self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, max_testbeds: int = MAX_TESTBEDS
+    ) -> None:
         self._count = checked_workers(workers)
-        self._runners = Runners(Testbeds(testbed, kept=kept))
+        self._runners = Runners(Testbeds(testbed, max_testbeds=max_testbeds))
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         # The threads hold no reference to the executor, so that one that was not closed can be freed.
@@ -305,7 +308,7 @@ def make_executor(
     if isinstance(executor, str):
         made = _by_name(executor, testbed=testbed, workers=workers, time_limit=time_limit)
         if isinstance(made, ProcessExecutor):
-            made.start(rollouts)
+            made.start_workers(rollouts)
         return made
     if isinstance(executor, Executor):
         _refuse("an existing Executor", workers=workers, time_limit=time_limit)
@@ -349,10 +352,10 @@ def _dask(client: Any, *, workers: int | None, time_limit: float | None) -> Exec
     return DaskExecutor(client, time_limit=TIME_LIMIT if time_limit is None else time_limit)
 
 
-def _refuse(what: str, **options: float | None) -> None:
+def _refuse(executor: str, **options: float | None) -> None:
     for name, value in options.items():
         if value is not None:
-            raise ValueError(f"{what} has its own settings: {name}={value} cannot be given with it")
+            raise ValueError(f"{executor} has its own settings: {name}={value} cannot be given with it")
 
 
 def _unknown(executor: object) -> str:

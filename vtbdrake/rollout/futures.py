@@ -15,7 +15,7 @@ from functools import partial
 from vtbdrake.failures import error_text
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.pickled_task import (
-    KEPT_TASKS,
+    MAX_TASKS,
     PickledTask,
     TaskPickler,
     answer,
@@ -25,9 +25,9 @@ from vtbdrake.rollout.pickled_task import (
     unpack_start,
 )
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.runner import Runners, Testbeds, failed
 from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.testbeds import Runners, Testbeds, failed
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 _log = logging.getLogger(__name__)
@@ -164,7 +164,7 @@ class _Worker:
         with self._lock:
             if pickled.digest not in self._tasks:
                 self._tasks[pickled.digest] = unpack(pickled.content)
-                if len(self._tasks) > KEPT_TASKS:
+                if len(self._tasks) > MAX_TASKS:
                     self._tasks.popitem(last=False)
             self._tasks.move_to_end(pickled.digest)
             task = self._tasks[pickled.digest]

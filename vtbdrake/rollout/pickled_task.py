@@ -16,7 +16,7 @@ from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
 
-KEPT_TASKS = 16
+MAX_TASKS = 16
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TaskPickler:
         """
         if id(task) not in self._pickled:
             self._pickled[id(task)] = (task, _pickle(task))
-            if len(self._pickled) > KEPT_TASKS:
+            if len(self._pickled) > MAX_TASKS:
                 self._pickled.popitem(last=False)
         self._pickled.move_to_end(id(task))
         return self._pickled[id(task)][1]
@@ -93,8 +93,8 @@ def pack_starts(start: Starts, count: int) -> list[bytes]:
         StartError: It is no start, or there are too many or too few.
     """
     starts = start_of_each(start, count)
-    packed = {one: pickle.dumps(one) if one is not None else b"" for one in dict.fromkeys(starts)}
-    return [packed[one] for one in starts]
+    packed = {each: pickle.dumps(each) if each is not None else b"" for each in dict.fromkeys(starts)}
+    return [packed[each] for each in starts]
 
 
 @lru_cache(maxsize=16)

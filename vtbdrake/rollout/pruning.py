@@ -106,7 +106,7 @@ class Prospect:
         self._gained = (0.0, -inf)
         self.reachable = nan
 
-    def take(self, t: float, samples: Sequence[float], values: Sequence[object]) -> tuple[str, str] | None:
+    def update(self, t: float, samples: Sequence[float], values: Sequence[object]) -> tuple[str, str] | None:
         """Return how and why the rollout ends early at these samples; None if it goes on, or ends at its horizon.
 
         Args:

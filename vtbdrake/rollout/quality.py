@@ -228,5 +228,5 @@ def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize
 
     It is the first sample that exceeds ``threshold``; if none does, the first of the best.
     """
-    found = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
-    return int(found[0]) if found.size else int(np.argmin(samples) if minimize else np.argmax(samples))
+    exceeding = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
+    return int(exceeding[0]) if exceeding.size else int(np.argmin(samples) if minimize else np.argmax(samples))

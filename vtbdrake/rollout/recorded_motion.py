@@ -105,8 +105,10 @@ class MotionPlayer:
             )
         self._paths = tuple(path for path, _ in leaves(testbed.diagram))
         self._following = following = self._followers()
-        self._state = StateLayout(testbed.diagram, state=lambda path: path != BOARD, parameters=lambda path: False)
-        self._world = StateLayout(
+        self._state_layout = StateLayout(
+            testbed.diagram, state=lambda path: path != BOARD, parameters=lambda path: False
+        )
+        self._world_layout = StateLayout(
             testbed.diagram, state=lambda path: path != BOARD and path not in following, parameters=lambda path: False
         )
 
@@ -127,15 +129,15 @@ class MotionPlayer:
                     "vary parameters (of kind 'a')"
                 )
             sources[owner] = address
-        found = followers(self._testbed.diagram, sources)
-        for path in found:
+        following = followers(self._testbed.diagram, sources)
+        for path in following:
             if is_plant(systems[path]) or path.startswith(T_ACT):
-                way = chain(found, path)
+                way = chain(following, path)
                 raise MotionError(
                     f"the motion depends on {sources[way[0]]}, by way of {' -> '.join(way)}: let the DPS control the "
                     "motion by sensors that do not depend on it, or leave out motion="
                 )
-        return found
+        return following
 
     def _owner(self, address: str) -> str:
         """Return the path of the system that a variable belongs to; empty if it is the plant's, or no system's."""
@@ -150,21 +152,21 @@ class MotionPlayer:
             if self._owner(address) not in self._following or variables[address].kind != A
         }
 
-    def begins(self, instants: np.ndarray) -> list[float | None]:
+    def window_starts(self, instants: np.ndarray) -> list[float | None]:
         """Return when the window of each sample begins, in seconds; None if that is before the previous sample.
 
         Args:
             instants: The simulator's time at each sample, shape (n,).
         """
         periods = [period for period, _ in self._testbed.event_timings()]
-        found: list[float | None] = [None]
+        starts: list[float | None] = [None]
         for before, instant in pairwise(instants):
-            begin = float(instant) - self.motion.memory
+            start = float(instant) - self.motion.memory
             if periods:
                 step = min(periods)
-                begin = (np.floor(begin / step) - 1.0 + _BETWEEN) * step
-            found.append(float(begin) if begin > before else None)
-        return found
+                start = (np.floor(start / step) - 1.0 + _BETWEEN) * step
+            starts.append(float(start) if start > before else None)
+        return starts
 
     def recordings(self, instants: np.ndarray) -> dict[Hashable, Recording]:
         """Return the recordings from default starts with samples at these instants; the caller adds new ones.
@@ -172,34 +174,34 @@ class MotionPlayer:
         Args:
             instants: The simulator's time at each sample, shape (n,).
         """
-        known = _RECORDINGS.setdefault(self._testbed, {})
-        return known.setdefault((self.motion.memory, tuple(self._following), instants.tobytes()), {})
+        of_testbed = _RECORDINGS.setdefault(self._testbed, {})
+        return of_testbed.setdefault((self.motion.memory, tuple(self._following), instants.tobytes()), {})
 
-    def take(self, context: Context) -> FlatState:
+    def state(self, context: Context) -> FlatState:
         """Return the state from which a window begins."""
-        return self._state.take(context)
+        return self._state_layout.take(context)
 
     def world(self, context: Context) -> np.ndarray:
         """Return the numbers of all systems that are not followers, shape (n,)."""
-        return self._world.take(context).numbers
+        return self._world_layout.take(context).numbers
 
     def put(self, context: Context, time: float, start: FlatState) -> None:
         """Set time and state of ``context`` to a recorded one; its parameters stay."""
         context.SetTime(time)
-        self._state.put(context, start)
+        self._state_layout.put(context, start)
 
-    def check(self, context: Context, recorded: np.ndarray) -> None:
+    def compare(self, context: Context, recorded: np.ndarray) -> None:
         """Compare the systems that are not followers with the recorded numbers.
 
         Raises:
             MotionError: They differ.
         """
-        here = self._world.take(context).numbers
+        here = self._world_layout.take(context).numbers
         if np.array_equal(here, recorded, equal_nan=True):
             return
         index = int(np.flatnonzero((here != recorded) & ~(np.isnan(here) & np.isnan(recorded)))[0])
         raise MotionError(
-            f"the motion depends on {', '.join(self.motion.varied)}, although no connection leads there: at "
-            f"t = {context.get_time():g} s, {self._world.name_at(index)} is not as recorded. A system has memory "
+            f"the motion depends on {', '.join(self.motion.varied)}, although no connection leads there: at t = "
+            f"{context.get_time():g} s, {self._world_layout.name_at(index)} is not as recorded. A system has memory "
             "outside the Context, see Problem.check"
         )

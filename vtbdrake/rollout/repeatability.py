@@ -137,23 +137,23 @@ def _compare(
     reference: Sequence[tuple[float, Sample]],
     repeated: Sequence[tuple[float, Sample]],
     changed: Sequence[str],
-    what: str,
+    rerun: str,
 ) -> Iterator[str]:
     """Yield at most one finding: where the two rollouts differ first."""
-    for (t, expected), (_, found) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
-        parted = [path for path in {**expected, **found} if not _same(expected.get(path), found.get(path))]
+    for (t, expected), (_, actual) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
+        parted = [path for path in {**expected, **actual} if not _same(expected.get(path), actual.get(path))]
         if not parted:
             continue
         name = task.quality.name if task.quality is not None else "the quality"
         if parted == [""] and not changed:
             yield (
-                f"{what} differs at t = {t:g} s in its quality {name} (or another measure), not in its state: it must "
+                f"{rerun} differs at t = {t:g} s in its quality {name} (or another measure), not in its state: it must "
                 "depend on its arguments alone, so keep no memory in it, and draw no random numbers"
             )
         else:
             where = ", ".join(changed) or f"a system that drives {', '.join(path for path in parted if path)}"
             yield (
-                f"{what} differs from t = {t:g} s on: {where} has memory outside the Context. Declare it as state "
+                f"{rerun} differs from t = {t:g} s on: {where} has memory outside the Context. Declare it as state "
                 "(DeclareDiscreteState, DeclareAbstractState) and read it from the context, so that rollouts repeat"
             )
         return
@@ -211,12 +211,12 @@ def _unsendable(task: RolloutTask) -> Iterator[str]:
     scenario = task.scenario
     parts |= {f"the scenario's field {field.name}": getattr(scenario, field.name) for field in fields(scenario)}
     parts |= {"the scenario": scenario, "the problem": task}
-    for what, value in parts.items():
+    for part, value in parts.items():
         try:
             dumps(value)
         except Exception as error:
             yield (
-                f"{what} cannot be sent to workers ({error_text(error)}): use executor='threads' or "
+                f"{part} cannot be sent to workers ({error_text(error)}): use executor='threads' or "
                 "'serial', or make it where it is used, from plain data"
             )
             return

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +16,9 @@ from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
-from vtbdrake.rollout.start import Beginning, Start
+from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
-from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
+from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -74,7 +72,7 @@ class RolloutRunner:
         self._context = self._simulator.get_mutable_context()
         self._world_state = _world_state(self.testbed, self._context)
         self._copier = self.testbed.copier_from(self.testbed)
-        self._beginning = Beginning(self.testbed, self._s0, self._copier)
+        self._start_context = StartContext(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
         self._timed = False  # Whether the times are those of the present start.
         self._set_times()
@@ -104,11 +102,11 @@ class RolloutRunner:
             CancelledError: ``cancel`` was set, or the deadline of ``cutoff`` has passed.
             MotionError: The recorded motion of the task depends on the varied variables.
         """
-        begin = time.perf_counter()
-        self._begin(start)
+        started = time.perf_counter()
+        self._set_start(start)
         cutoff = cutoff or Cutoff()
 
-        def check() -> None:
+        def raise_if_cancelled() -> None:
             if cutoff.is_over or (cancel is not None and cancel.is_set()):
                 raise CancelledError
             interruptible.check()
@@ -117,17 +115,17 @@ class RolloutRunner:
         end, message = HORIZON, ""
         with Interruptible() as interruptible:
             try:
-                recording = self._recording(parameters, check)
+                recording = self._recording(parameters, raise_if_cancelled)
                 self._reset(parameters)
                 for index, (t, instant) in enumerate(zip(self._times.tolist(), self._instants.tolist(), strict=True)):
-                    check()
+                    raise_if_cancelled()
                     self._jump(recording, index)
                     status = self._advance(t, instant)
                     if self._player is not None and index < len(recording.worlds):
-                        self._player.check(self._context, recording.worlds[index])
+                        self._player.compare(self._context, recording.worlds[index])
                     terminated = _terminated(status)
                     reached = self._context.get_time() - self._t0 if terminated else t
-                    if samples.take(reached) and not self.task.run_on:
+                    if samples.add(reached) and not self.task.run_on:
                         break
                     if terminated:
                         end, message = TERMINATED, status.FormatMessage()
@@ -135,14 +133,14 @@ class RolloutRunner:
                     if samples.ending:
                         end, message = samples.ending
                         break
-                samples.check()
+                samples.refuse_overflow()
             except SimulationError as failure:
                 end, message = FAILED, str(failure)
             except QualityError as failure:
                 if not self.task.catch:
                     raise
                 end, message = FAILED, f"{QUALITY_FAILED}{failure}"
-            return samples.result(dict(parameters), end, message, begin)
+            return samples.result(dict(parameters), end, message, started)
 
     def simulate(self, parameters: Mapping[str, Any], *, start: Start | None = None) -> Iterator[float]:
         """Simulate from s0, and yield every sample time when the simulation has reached it.
@@ -155,7 +153,7 @@ class RolloutRunner:
             SimulationError: The simulation cannot go on.
             StartError: ``start`` does not fit the testbed.
         """
-        self._begin(start)
+        self._set_start(start)
         self._reset(parameters)
         for t, instant in zip(self._times, self._instants, strict=True):
             status = self._advance(t, instant)
@@ -167,7 +165,7 @@ class RolloutRunner:
         """Return f and the other measures in the present state, at the sample time ``t``."""
         with _failures_as_outcomes:
             values = {address: read(self._context) for address, read in self._readers.items()}
-        return [_sample(measure, [_own(values[a]) for a in measure.of], t) for measure in self._measures]
+        return [_sample(measure, [_copied(values[a]) for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float, *, start: Start | None = None) -> Any:
         """Return s(t) = Gamma(s0, t), equation (7), at a sample time, as a Snapshot.
@@ -182,7 +180,7 @@ class RolloutRunner:
             StartError: ``start`` does not fit the testbed.
             RuntimeError: The simulation fails before ``t``.
         """
-        self._begin(start)
+        self._set_start(start)
         last = int(np.argmin(np.abs(self._times - t)))
         if not abs(self._times[last] - t) <= 1e-9:
             raise ValueError(f"t = {t} s is not a sample time; the nearest is {self._times[last]:g} s")
@@ -198,26 +196,26 @@ class RolloutRunner:
             raise RuntimeError(f"the simulation fails before t = {t} s: {failure}") from failure
         return self.testbed.snapshot(self._context)
 
-    def _begin(self, start: Start | None) -> None:
+    def _set_start(self, start: Start | None) -> None:
         """Set where the next rollouts begin."""
-        if start is not self._beginning.start or not self._timed:
+        if start is not self._start_context.start or not self._timed:
             self._timed = False  # Ctrl-C may come before the times are set.
             try:
-                self._beginning.set(start)
+                self._start_context.set(start)
             finally:
                 self._set_times()
 
     def _set_times(self) -> None:
-        self._t0 = self._beginning.context.get_time()
+        self._t0 = self._start_context.context.get_time()
         self._instants = self.task.instants(self._t0, self._timings)
         self._windows: list[float | None] = [None] * len(self._times)
         if self._player is not None:
-            self._windows = self._player.begins(self._instants)
-            by_default = self.task.start is None and self._beginning.start is None
+            self._windows = self._player.window_starts(self._instants)
+            by_default = self.task.start is None and self._start_context.start is None
             self._recordings = self._player.recordings(self._instants) if by_default else {}
         self._timed = True
 
-    def _recording(self, parameters: Mapping[str, Any], check: Callable[[], None]) -> Recording:
+    def _recording(self, parameters: Mapping[str, Any], raise_if_cancelled: Callable[[], None]) -> Recording:
         """Return the recorded motion, in which the parameters of the followers are as in s0; record it if necessary.
 
         From default starts a motion is recorded once for all tasks on this testbed with the same samples. If it fails
@@ -225,17 +223,17 @@ class RolloutRunner:
         """
         if self._player is None:
             return Recording()
-        others = self._player.fixed(parameters)
-        key = _key(others)
+        fixed = self._player.fixed(parameters)
+        key = values_key(fixed)
         if key not in self._recordings:
             recording = Recording()
             with suppress(SimulationError):
-                self._reset(others)
+                self._reset(fixed)
                 for t, instant, window in zip(self._times, self._instants, self._windows, strict=True):
-                    check()
+                    raise_if_cancelled()
                     if window is not None and _terminated(self._advance(window, window)):
                         break
-                    start = self._player.take(self._context) if window is not None else None
+                    start = self._player.state(self._context) if window is not None else None
                     status = self._advance(t, instant)
                     recording.starts.append(start)
                     recording.worlds.append(self._player.world(self._context))
@@ -260,10 +258,10 @@ class RolloutRunner:
         # A new integrator: the step size of a used one would change the trajectory.
         apply_simulator_config(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
-        changed = None if self._changed is None else self._changed | self._beginning.hidden
-        self._copier.copy(self._beginning.context, self._context, hidden=changed)
+        changed = None if self._changed is None else self._changed | self._start_context.hidden
+        self._copier.copy(self._start_context.context, self._context, hidden=changed)
         self._changed = {self._variables[a].carried_by for a in parameters} - {""}
-        restored = self.task.start is not None or self._beginning.start is not None
+        restored = self.task.start is not None or self._start_context.start is not None
         with _failures_as_outcomes:
             self._variables.write(self._context, parameters)
             before = self._variables.read(self._context, list(parameters))
@@ -299,10 +297,11 @@ class RolloutRunner:
 
     def _with_command(self, failure: SimulationError) -> SimulationError:
         """Return the failure; if the DPS commands what is not finite, with the name of that signal."""
-        own = self.testbed.dps.GetMyContextFromRoot(self._context)
+        dps_context = self.testbed.dps.GetMyContextFromRoot(self._context)
         for signal in self.testbed.interface.act:
             with suppress(*FAILURES):
-                command = self.testbed.dps.GetOutputPort(signal.name).Eval(own) if signal.is_vector else np.zeros(0)
+                port = self.testbed.dps.GetOutputPort(signal.name)
+                command = port.Eval(dps_context) if signal.is_vector else np.zeros(0)
                 if not np.isfinite(command).all() and signal.name not in str(failure):
                     return SimulationError(f"the DPS commands {signal.name} = {command}; {failure}")
         return failure
@@ -333,8 +332,8 @@ def _world_state(testbed: VirtualTestbed, context: Context) -> Callable[[], np.n
     plant = testbed.plant
     if plant is None or plant.time_step() == 0.0:
         return lambda: context.get_continuous_state_vector().CopyToVector()
-    own = plant.GetMyContextFromRoot(context)
-    return lambda: plant.GetPositionsAndVelocities(own)
+    plant_context = plant.GetMyContextFromRoot(context)
+    return lambda: plant.GetPositionsAndVelocities(plant_context)
 
 
 def _terminated(status: SimulatorStatus) -> bool:
@@ -371,7 +370,7 @@ class _Samples:
         self._samples: list[list[float]] = [[] for _ in runner._measures]
         self._record: dict[str, list[Any]] = {address: [] for address in runner.task.record}
 
-    def take(self, t: float) -> bool:
+    def add(self, t: float) -> bool:
         """Sample f, the measures and the records; return whether the threshold is exceeded."""
         runner, task = self._runner, self._runner.task
         with _failures_as_outcomes:
@@ -386,12 +385,12 @@ class _Samples:
         if self._prospect is not None:
             with _failures_as_outcomes:
                 values = [read(runner._context) for read in runner._bound_readers]
-            self.ending = self._prospect.take(t, new, values)
+            self.ending = self._prospect.update(t, new, values)
         if task.quality is None or task.threshold is None:
             return False
         return bool(exceeds(np.array(new[0]), task.threshold, minimize=task.minimize))
 
-    def check(self) -> None:
+    def refuse_overflow(self) -> None:
         """Check that integrals are finite, as all their samples are.
 
         Raises:
@@ -407,7 +406,7 @@ class _Samples:
                     f"sample is {max(map(abs, samples)):g}: state it in a larger unit"
                 )
 
-    def result(self, parameters: dict[str, Any], end: str, message: str, begin: float) -> RolloutResult:
+    def result(self, parameters: dict[str, Any], end: str, message: str, started: float) -> RolloutResult:
         task, f = self._runner.task, self._runner.task.quality
         times = np.array(self._times)
         samples = np.array(self._samples[0]) if f is not None else np.array([])
@@ -441,7 +440,7 @@ class _Samples:
             quality=f.quality(samples) if f is not None else np.array([]),
             record={address: _stack(values) for address, values in self._record.items()},
             state=state,
-            wall_time=time.perf_counter() - begin,
+            wall_time=time.perf_counter() - started,
         )
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
@@ -451,10 +450,10 @@ class _Samples:
         at_end = runner.task.motion is None and t_star == self._times[-1] and runner.context.get_time() == self._clock
         if at_end:
             return runner.testbed.snapshot(runner.context)
-        return runner.state(parameters, t_star, start=runner._beginning.start)
+        return runner.state(parameters, t_star, start=runner._start_context.start)
 
 
-def _own(value: Any) -> Any:
+def _copied(value: Any) -> Any:
     # A function may write into its arguments, which others get, too.
     return value.copy() if isinstance(value, np.ndarray) else value
 
@@ -481,173 +480,9 @@ def _stack(values: list[Any]) -> Any:
     return np.array(values) if all(isinstance(value, float | np.ndarray) for value in values) else values
 
 
-FIELD = "scenario."
-# Number of testbeds that are kept besides a given one.
-KEPT = 4
-# Number of runners that a thread keeps; an executor may run any number of tasks.
-_RUNNERS = 16
+def values_key(values: Mapping[str, Any]) -> Hashable:
+    """Return a key for values by name or address, compared by their representation.
 
-
-class BuildError(Exception):
-    """No testbed can be built with some values of its scenario's fields; the error is the outcome of the rollout."""
-
-
-def split(point: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split a point into the scenario's fields, by their names, and the variables of s0, by address."""
-    fields = {address.removeprefix(FIELD): value for address, value in point.items() if address.startswith(FIELD)}
-    return fields, {address: value for address, value in point.items() if not address.startswith(FIELD)}
-
-
-def failed(point: Mapping[str, Any], message: str) -> RolloutResult:
-    """Return the result of a rollout that could not be run."""
-    return RolloutResult(parameters=dict(point), end=FAILED, message=message, times=np.array([]), quality=np.array([]))
-
-
-class Testbeds:
-    """The testbeds last used, built once per distinct scenario and shared by threads.
-
-    One testbed is built at a time: CasADi's expressions, of which a scenario may make its DPS, count their references
-    without atomics, and its Python package gives up the interpreter lock.
-
-    Args:
-        known: A testbed that exists already and is never dropped.
-        kept: Number of other testbeds that are kept; the least recently used one is dropped first.
+    1, 1.0 and True are equal, and so are 0.0 and -0.0, but not to a testbed.
     """
-
-    def __init__(self, known: VirtualTestbed | None = None, *, kept: int = KEPT) -> None:
-        if kept < 1:
-            raise ValueError(f"at least one testbed must be kept, not {kept}")
-        self.kept = kept
-        self._known = known if known is not None and known.scenario is not None else None
-        self._built: OrderedDict[Hashable, VirtualTestbed] = OrderedDict()
-        self._lock = threading.Lock()
-        self._building = threading.Lock()
-
-    def get(self, scenario: Scenario) -> VirtualTestbed:
-        """Return the testbed of ``scenario``; build it if it is not there, when other threads have built theirs."""
-        key = _key(scenario.record())
-        if self._known is not None and self._known.scenario is not None and key == _key(self._known.scenario.record()):
-            return self._known
-        if (testbed := self._used(key)) is not None:
-            return testbed
-        with self._building:
-            if (testbed := self._used(key)) is not None:
-                return testbed
-            testbed = scenario.build()
-            with self._lock:
-                self._built[key] = testbed
-                dropped = self._built.popitem(last=False) if len(self._built) > self.kept else None
-            del dropped  # Here, so that it is taken apart while nothing is built, and without the lock.
-            return testbed
-
-    def _used(self, key: Hashable) -> VirtualTestbed | None:
-        with self._lock:
-            if key in self._built:
-                self._built.move_to_end(key)
-            return self._built.get(key)
-
-    def touch(self, testbed: VirtualTestbed) -> None:
-        """Mark ``testbed`` as just used."""
-        with self._lock:
-            for key in [key for key, built in self._built.items() if built is testbed]:
-                self._built.move_to_end(key)
-
-    def __contains__(self, testbed: object) -> bool:
-        with self._lock:
-            return testbed is self._known or any(built is testbed for built in self._built.values())
-
-    def __len__(self) -> int:
-        return len(self._built)
-
-    def clear(self) -> None:
-        with self._lock:
-            self._built.clear()
-
-
-class Runners:
-    """The runners last used by each thread: one for every task and every choice of scenario fields."""
-
-    def __init__(self, testbeds: Testbeds) -> None:
-        self._testbeds = testbeds
-        self._threads = threading.local()
-
-    def get(self, task: RolloutTask, fields: Mapping[str, Any]) -> RolloutRunner:
-        """Return this thread's runner of ``task``, with ``fields`` (name -> value) set in its scenario.
-
-        Raises:
-            ScenarioError: There is no such field, or the scenario refuses its value.
-            BuildError: No testbed can be built with these fields for another reason.
-            SnapshotError: The task starts from a snapshot of the scenario without these fields.
-        """
-        mine: OrderedDict[Hashable, tuple[RolloutTask, RolloutRunner]]
-        mine = self._threads.__dict__.setdefault("runners", OrderedDict())
-        # By identity: comparing tasks can take longer than running them.
-        key = (id(task), _key(fields))
-        if key not in mine:
-            mine[key] = (task, self._make(task, fields))
-            # Other threads may have dropped the new one's testbed already: it is used all the same.
-            for old in [k for k, (_, runner) in mine.items() if k != key and runner.testbed not in self._testbeds]:
-                del mine[old]
-            if len(mine) > _RUNNERS:
-                mine.popitem(last=False)
-        mine.move_to_end(key)
-        runner = mine[key][1]
-        self._testbeds.touch(runner.testbed)
-        return runner
-
-    def _make(self, task: RolloutTask, fields: Mapping[str, Any]) -> RolloutRunner:
-        if not fields:
-            return RolloutRunner(task, self._testbeds.get(task.scenario))
-        changed = replace(task, scenario=task.scenario.with_fields(fields))
-        try:
-            testbed = self._testbeds.get(changed.scenario)
-        except ScenarioError:
-            raise
-        except FAILURES as error:
-            chosen = ", ".join(f"{FIELD}{name} = {value!r}" for name, value in fields.items())
-            raise BuildError(f"no testbed can be built with {chosen}: {error_text(error)}") from error
-        return RolloutRunner(changed, testbed)
-
-    def run(
-        self,
-        task: RolloutTask,
-        point: Mapping[str, Any],
-        *,
-        start: Start | None = None,
-        cutoff: Cutoff | None = None,
-        cancel: threading.Event | None = None,
-        begin: Callable[[], Any] | None = None,
-    ) -> RolloutResult:
-        """Run one rollout at ``point``, in this thread; see `RolloutRunner.run`.
-
-        A testbed that cannot be built with the point's fields is a failed rollout; fields that the scenario refuses
-        are an error.
-
-        Args:
-            task: The task of the rollout.
-            point: Address, or scenario field with its prefix -> value.
-            start: Where the rollout begins instead of the task's s0.
-            cutoff: When to end the rollout early.
-            cancel: An event that stops the rollout.
-            begin: Called when the testbed has been built, before the rollout.
-        """
-        with Interruptible():
-            fields, variables = split(point)
-            try:
-                runner = self.get(task, fields)
-            except BuildError as error:
-                return failed(point, str(error))
-            if begin is not None:
-                begin()
-            result = runner.run(variables, start=start, cutoff=cutoff, cancel=cancel)
-            return replace(result, parameters=dict(point)) if fields else result
-
-    def clear(self) -> None:
-        """Forget the runners of all threads, and the testbeds."""
-        self._threads = threading.local()
-        self._testbeds.clear()
-
-
-def _key(values: Mapping[str, Any]) -> Hashable:
-    # By their representation: 1, 1.0 and True are equal, and so are 0.0 and -0.0, but not to a testbed.
     return frozenset((name, repr(value)) for name, value in values.items())

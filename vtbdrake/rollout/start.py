@@ -69,7 +69,7 @@ class Start:
 Starts = Start | Sequence[Start] | None
 
 
-class Beginning:
+class StartContext:
     """The context from which the rollouts of one runner begin; it is set to one start after another.
 
     Args:
@@ -88,8 +88,8 @@ class Beginning:
         self._default = default
         self._copier = copier
         self._variables = testbed.variables()
-        self._own: Context | None = None
-        # The layout and the addresses of the last start in the own context.
+        self._written_context: Context | None = None
+        # The layout and the addresses of the last start that was written into it.
         self._last: tuple[StateLayout, frozenset[str]] | None = None
         self.start: Start | None = None
         self.context = default
@@ -110,22 +110,22 @@ class Beginning:
 
     def _written(self, start: Start) -> Context:
         layout = self._layout(start.contents)
-        if self._own is None:
-            self._own = self._testbed.default_context()
+        if self._written_context is None:
+            self._written_context = self._testbed.default_context()
         last, self._last = self._last, None
-        what = layout, frozenset(start.values)
-        if last != what:  # Otherwise this start overwrites everything that the last one has set.
-            self._copier.copy(self._default, self._own)
-            self._testbed.switch(self._own, "sim")
-        self._own.SetTime(start.time)
+        coverage = layout, frozenset(start.values)
+        if last != coverage:  # Otherwise this start overwrites everything that the last one has set.
+            self._copier.copy(self._default, self._written_context)
+            self._testbed.switch(self._written_context, "sim")
+        self._written_context.SetTime(start.time)
         try:
             self.hidden |= {self._variables[address].carried_by for address in start.values} - {""}
-            layout.put(self._own, start.contents)
-            self._variables.write(self._own, self._changes(start, self._own))
+            layout.put(self._written_context, start.contents)
+            self._variables.write(self._written_context, self._changes(start, self._written_context))
         except (AddressError, VariableError, SnapshotError) as error:
             raise StartError(f"the start does not fit: {error}") from error
-        self._last = what
-        return self._own
+        self._last = coverage
+        return self._written_context
 
     def _layout(self, contents: FlatState) -> StateLayout:
         testbed = self._testbed
@@ -160,9 +160,9 @@ def start_of_each(start: Starts, count: int) -> list[Start | None]:
         StartError: It is no start, or there are too many or too few.
     """
     starts: list[Start | None] = list(start) if isinstance(start, Sequence) else [start] * count
-    for one in starts:
-        if not isinstance(one, Start | None):
-            raise StartError(f"a rollout begins at a Start, such as Start.of(testbed, context), not at {one!r}")
+    for each in starts:
+        if not isinstance(each, Start | None):
+            raise StartError(f"a rollout begins at a Start, such as Start.of(testbed, context), not at {each!r}")
     if len(starts) != count:
         raise StartError(f"give one start for all rollouts, or one for each of the {count}, not {len(starts)}")
     return starts

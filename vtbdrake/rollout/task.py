@@ -177,8 +177,8 @@ class RolloutTask:
         check_is_scenario(self.scenario)
         if not isinstance(self.start, Snapshot | None):
             raise ValueError(f"the start of rollouts is a Snapshot, such as Snapshot.load(file), not {self.start!r}")
-        for name, what in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():
-            object.__setattr__(self, name, as_number(what, getattr(self, name)))
+        for name, description in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():
+            object.__setattr__(self, name, as_number(description, getattr(self, name)))
         object.__setattr__(self, "record", as_addresses("what to record", self.record))
         object.__setattr__(self, "measures", tuple(self.measures))
         # A copy: the caller may change the scenario afterwards.

@@ -21,9 +21,10 @@ from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.runner import KEPT, CancelledError, Runners, Testbeds, failed, split
+from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Starts
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds, failed, split
 
 _log = logging.getLogger(__name__)
 
@@ -56,31 +57,36 @@ class ProcessExecutor(Executor):
         workers: The number of processes; by default the number of cores.
         time_limit: The wall time for one rollout, in seconds; an hour by default, ``inf`` for none. Drake's integrators
             can loop for ever, for example on a NaN, and nothing but the end of the process stops them.
-        kept: The number of testbeds that each process keeps, for points with different scenario fields.
+        max_testbeds: The number of testbeds that each process keeps, for points with different scenario fields.
         growth: The number of bytes by which the memory of a process may grow after its first rollout.
     """
 
     def __init__(
-        self, workers: int | None = None, *, time_limit: float = TIME_LIMIT, kept: int = KEPT, growth: float = 1e9
+        self,
+        workers: int | None = None,
+        *,
+        time_limit: float = TIME_LIMIT,
+        max_testbeds: int = MAX_TESTBEDS,
+        growth: float = 1e9,
     ) -> None:
         self._count = checked_workers(workers)
         self.time_limit = checked_time_limit(time_limit)
         self._growth = as_number("the growth of a worker's memory", growth)
         if not self._growth > 0.0:
             raise ValueError(f"the growth of a worker's memory must be positive, not {growth} bytes")
-        self._kept = Testbeds(kept=kept).kept
+        self._max_testbeds = Testbeds(max_testbeds=max_testbeds).max_testbeds
         self._pickler = TaskPickler()
         self._workers: list[_Worker] = []
         self._running = False
-        self._starts_lost = 0  # The number of workers in a row that were killed before they were ready.
+        self._launches_lost = 0  # The number of workers in a row that were killed before they were ready.
 
-    def start(self, rollouts: int) -> None:
+    def start_workers(self, rollouts: int) -> None:
         """Start the workers that so many rollouts need, without waiting until they are ready, which takes a second.
 
         `run` starts those that are missing.
         """
         while len(self._workers) < min(self._count, rollouts):
-            self._workers.append(_Worker(self._kept, self._growth))
+            self._workers.append(_Worker(self._max_testbeds, self._growth))
 
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
@@ -112,7 +118,7 @@ class ProcessExecutor(Executor):
         points, cutoff, waiting = call.points, call.cutoff, call.waiting
         losses: dict[int, str] = {}
         error: BaseException | None = None
-        self.start(len(points))
+        self.start_workers(len(points))
         try:
             self._hand_out(call)
             left = len(points)
@@ -175,8 +181,8 @@ class ProcessExecutor(Executor):
         limited = self.time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
         announced = limited and not worker.has_testbed(call, index)
         start = call.starts[index]
-        sent = None if worker.has(start) else start
-        message = b"R" + pickle.dumps((index, pack(call.points[index]), sent, cutoff, announced))
+        new_start = None if worker.has(start) else start
+        message = b"R" + pickle.dumps((index, pack(call.points[index]), new_start, cutoff, announced))
         if worker.jobs and len(message) > _SMALL:
             return True
         waiting.popleft()
@@ -186,12 +192,12 @@ class ProcessExecutor(Executor):
             worker.jobs.pop()
             waiting.appendleft(index)
             if isinstance(error, ProcessStartError):
-                self._starts_lost += 1
+                self._launches_lost += 1
                 # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
-                if (worker.child.exit_code or 0) >= 0 or self._starts_lost > self._count:
+                if (worker.child.exit_code or 0) >= 0 or self._launches_lost > self._count:
                     raise WorkerError(str(error)) from error
             return False
-        self._starts_lost = 0
+        self._launches_lost = 0
         if len(worker.jobs) == 1:
             self._expect(worker, call)
         return True
@@ -199,7 +205,7 @@ class ProcessExecutor(Executor):
     def _expect(self, worker: _Worker, call: _Call) -> None:
         """Limit the time until a worker begins its next rollout, if it has the testbed of that already."""
         if worker.has_testbed(call, worker.jobs[0]):
-            worker.begin(self.time_limit, call.cutoff)
+            worker.limit_time(self.time_limit, call.cutoff)
 
     def _replies(self, call: _Call) -> list[tuple[_Worker, int, Any]]:
         """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
@@ -223,7 +229,7 @@ class ProcessExecutor(Executor):
                 try:
                     message = connection.recv_bytes()
                     if message == _BEGUN:
-                        worker.begin(self.time_limit, cutoff)
+                        worker.limit_time(self.time_limit, cutoff)
                     elif message == _GROWN:
                         worker.grown = True
                     else:
@@ -244,7 +250,7 @@ class ProcessExecutor(Executor):
     def _replace(self, worker: _Worker, call: _Call) -> _Worker:
         worker.kill()
         task = None if call.cutoff is None else call.task
-        new = self._workers[self._workers.index(worker)] = _Worker(self._kept, self._growth, task)
+        new = self._workers[self._workers.index(worker)] = _Worker(self._max_testbeds, self._growth, task)
         return new
 
     def close(self) -> None:
@@ -268,14 +274,14 @@ class _Worker:
     """A worker process and the rollouts that it was given.
 
     Args:
-        kept: The number of testbeds that it keeps.
+        max_testbeds: The number of testbeds that it keeps.
         growth: The number of bytes by which its memory may grow after its first rollout.
         task: A task whose testbed it builds before it is ready; None: it is ready without one.
     """
 
-    def __init__(self, kept: int, growth: float, task: bytes | None = None) -> None:
+    def __init__(self, max_testbeds: int, growth: float, task: bytes | None = None) -> None:
         # Without grace: its rollout may hang.
-        self.child = ChildProcess(_run_worker, kept, growth, task, name="a worker process", grace=0.0)
+        self.child = ChildProcess(_run_worker, max_testbeds, growth, task, name="a worker process", grace=0.0)
         self.connection: Connection | None = None  # None until the worker is known to be ready.
         self._task = task
         self._start = b""  # Of the rollouts that it is given; empty if they begin at the task's own s0.
@@ -312,7 +318,7 @@ class _Worker:
         self.connection.send_bytes(message)
         self._start = start
 
-    def begin(self, time_limit: float, cutoff: Cutoff | None) -> None:
+    def limit_time(self, time_limit: float, cutoff: Cutoff | None) -> None:
         """Start the time limit: the worker has its testbed, and begins its rollout or is about to."""
         now = time.monotonic()
         self.deadline = now + time_limit
@@ -355,7 +361,7 @@ def checked_time_limit(time_limit: float) -> float:
 # -- in the worker process
 
 
-def _run_worker(parent: socket.socket, kept: int, growth: float, task: bytes | None) -> None:
+def _run_worker(parent: socket.socket, max_testbeds: int, growth: float, task: bytes | None) -> None:
     """Run rollouts on request until the connection closes.
 
     A task (T) has no answer. A rollout (R) has one, from `answer`; it is announced by `_BEGUN` on request, unless its
@@ -363,11 +369,11 @@ def _run_worker(parent: socket.socket, kept: int, growth: float, task: bytes | N
 
     Args:
         parent: The connection to the executor.
-        kept: The number of testbeds to keep.
+        max_testbeds: The number of testbeds to keep.
         growth: The number of bytes by which the memory may grow after the first rollout.
         task: The first task, whose testbed is built before this process is ready; None: there is none yet.
     """
-    runners = Runners(Testbeds(kept=kept))
+    runners = Runners(Testbeds(max_testbeds=max_testbeds))
     load: Callable[[], RolloutTask] | None = None
     start = b""
     if task is not None:
@@ -388,8 +394,8 @@ def _run_worker(parent: socket.socket, kept: int, growth: float, task: bytes | N
             index, point, new_start, cutoff, announced = pickle.loads(content)
             start = start if new_start is None else new_start
             assert load is not None, "a worker got a rollout before its task"
-            begin = partial(connection.send_bytes, _BEGUN) if announced else None
-            reply = answer(index, partial(_rollout, runners, load, point, start, cutoff, begin))
+            announce = partial(connection.send_bytes, _BEGUN) if announced else None
+            reply = answer(index, partial(_rollout, runners, load, point, start, cutoff, announce))
             if limit == inf:
                 limit = _memory() + growth
             elif _memory() > limit:
@@ -406,9 +412,9 @@ def _rollout(
     point: bytes,
     start: bytes,
     cutoff: Cutoff | None,
-    begin: Callable[[], Any] | None,
+    announce: Callable[[], Any] | None,
 ) -> RolloutResult:
-    return runners.run(load(), unpack(point), start=unpack_start(start), cutoff=cutoff, begin=begin)
+    return runners.run(load(), unpack(point), start=unpack_start(start), cutoff=cutoff, announce=announce)
 
 
 def _memory() -> float:
