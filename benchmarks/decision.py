@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 
 from benchmarks.measure import LOWER, Benchmark, seconds, spread
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Belief, BeliefToStart, Budget, Reasoner
+from vtbdrake.reasoning import Belief, BeliefToStart, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Quality, RolloutRunner
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
@@ -50,9 +50,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
         horizon=horizon,
         sample_period=horizon,
         budget=Budget(rollouts=ROLLOUTS),
-        method="random",
-        executor="processes",
-        workers=WORKERS,
+        search=SearchConfig(method="random", executor="processes", workers=WORKERS),
     )
     overheads, taken, bare, own = [], [], [], []
     with reasoner:

@@ -11,7 +11,7 @@ from benchmarks.loop import histogram, percentiles
 from benchmarks.loop_rig import loop_rig
 from benchmarks.measure import LOWER, Benchmark
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Budget, OnboardReasoner
+from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig
 from vtbdrake.rollout import Quality
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbedBuilder
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
@@ -50,7 +50,7 @@ class ReasoningScenario(ManipulatorScenario):
             period=EVERY,
             latency=EVERY,
             mental=not self.reasons,
-            options={"method": "random"},
+            options={"search": SearchConfig(method="random")},
         )
         builder.AddNamedSystem("planner", reasoner)
         for k in range(law.num_input_ports()):

@@ -15,9 +15,11 @@ from vtbdrake.optimization import Problem as Problem
 from vtbdrake.optimization import Quantile as Quantile
 from vtbdrake.optimization import Study as Study
 from vtbdrake.reasoning.belief import Belief as Belief
-from vtbdrake.reasoning.budget import Budget as Budget
+from vtbdrake.reasoning.belief import BeliefConfig as BeliefConfig
+from vtbdrake.reasoning.decision import Budget as Budget
 from vtbdrake.reasoning.onboard import OnboardReasoner as OnboardReasoner
 from vtbdrake.reasoning.reasoner import Reasoner as Reasoner
+from vtbdrake.reasoning.reasoner import SearchConfig as SearchConfig
 from vtbdrake.reasoning.trajectory import Trajectory as Trajectory
 from vtbdrake.recording.log_reader import read_log as read_log
 from vtbdrake.recording.recorder import Recorder as Recorder

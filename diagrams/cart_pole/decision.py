@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.reasoning import Budget, Trajectory
-from vtbdrake.rollout import Quality
+from vtbdrake.reasoning import Budget, SearchConfig, Trajectory
+from vtbdrake.rollout import Executor, Quality
 
 if TYPE_CHECKING:
     from vtbdrake_diagrams.cart_pole.scenario import CartPoleScenario
@@ -26,7 +26,9 @@ def plan_of(scenario: CartPoleScenario, address: str) -> Trajectory:
     return Trajectory(address, scenario.knots, scenario.duration, scenario.order, lower=-limit, upper=limit)
 
 
-def reasoning(scenario: CartPoleScenario, address: str, budget: Budget) -> dict[str, Any]:
+def reasoning(
+    scenario: CartPoleScenario, address: str, budget: Budget, *, executor: str | Executor = "auto"
+) -> dict[str, Any]:
     """Return the arguments of a `Reasoner` that decides the plan at ``address``; the horizon is that of the plan."""
     return {
         "decision": [plan_of(scenario, address)],
@@ -34,6 +36,5 @@ def reasoning(scenario: CartPoleScenario, address: str, budget: Budget) -> dict[
         "horizon": scenario.duration,
         "sample_period": 2.0 * scenario.period,
         "budget": budget,
-        "method": "predictive-sampling",
-        "options": {"sigma": 0.3},
+        "search": SearchConfig(method="predictive-sampling", options={"sigma": 0.3}, executor=executor),
     }

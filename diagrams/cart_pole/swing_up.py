@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.reasoning import Budget, Decision, Reasoner
+from vtbdrake.rollout import Executor
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.cart_pole.decision import reasoning
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
@@ -25,15 +26,19 @@ Array = NDArray[np.float64]
 _PATIENCE = 60.0
 
 
-def make_reasoner(scenario: CartPoleScenario, *, rollouts: int = 32, **options: Any) -> Reasoner:
+def make_reasoner(
+    scenario: CartPoleScenario, *, rollouts: int = 32, executor: str | Executor = "auto", **options: Any
+) -> Reasoner:
     """Return a reasoner that decides the command ``u.plan`` of a cart-pole.
 
     Args:
         scenario: The scenario of the running cart-pole.
         rollouts: Budget of a decision.
+        executor: Where the rollouts run, see `SearchConfig`.
         options: Further arguments of `Reasoner`, which replace those of `reasoning`.
     """
-    return Reasoner(scenario=scenario, **{**reasoning(scenario, "u.plan", Budget(rollouts=rollouts)), **options})
+    arguments = reasoning(scenario, "u.plan", Budget(rollouts=rollouts), executor=executor)
+    return Reasoner(scenario=scenario, **{**arguments, **options})
 
 
 @dataclass(frozen=True)

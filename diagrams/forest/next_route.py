@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +119,7 @@ def variance(time: float, covariance: Array) -> float:
     return min(float(covariance[0, 0] + covariance[1, 1]), UNKNOWN**2) if time >= FOUND + HORIZON - COUNTED else 0.0
 
 
-def route_reasoner(scenario: RouteScenario, **options: Any) -> Reasoner:
+def route_reasoner(scenario: RouteScenario) -> Reasoner:
     """Return the reasoner of the carrier, which decides on the next route."""
     count = len(scenario.routes())
     return Reasoner(
@@ -129,10 +128,8 @@ def route_reasoner(scenario: RouteScenario, **options: Any) -> Reasoner:
         quality=vtb.Quality(variance, of=["time", COVARIANCE], reading="integral", minimize=True),
         horizon=HORIZON,
         sample_period=SAMPLE_PERIOD,
-        method="grid",
         budget=vtb.Budget(rollouts=count + 1),
-        time_limit=TIME_LIMIT,
-        **options,
+        search=vtb.SearchConfig(method="grid", time_limit=TIME_LIMIT),
     )
 
 

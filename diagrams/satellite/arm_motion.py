@@ -139,7 +139,7 @@ class ArmMotionScenario(Scenario):
 
     def _make_planner(self) -> OnboardReasoner:
         # Imported here: without it, the DPS needs no optimization.
-        from vtbdrake.reasoning import Budget, OnboardReasoner
+        from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig
         from vtbdrake_diagrams.satellite.arm_planning import MomentumDescent
 
         return OnboardReasoner(
@@ -158,8 +158,10 @@ class ArmMotionScenario(Scenario):
             options={
                 "constraints": limits(self, CANDIDATE),
                 "sample_period": SAMPLE_PERIOD,
-                "method": MomentumDescent,
-                "options": {"origin": self.start, "goal": self.goal, "duration": self.duration, "knots": self.knots},
+                "search": SearchConfig(
+                    method=MomentumDescent,
+                    options={"origin": self.start, "goal": self.goal, "duration": self.duration, "knots": self.knots},
+                ),
             },
         )
 

@@ -24,7 +24,7 @@ import numpy as np
 from pydrake.systems.analysis import SimulatorStatus
 
 import vtbdrake as vtb
-from vtbdrake.reasoning import Budget, Decision, Reasoner
+from vtbdrake.reasoning import BeliefConfig, Budget, Decision, Reasoner, SearchConfig
 from vtbdrake.rollout import RolloutResult, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import VirtualTestbed
@@ -102,7 +102,14 @@ def differing(seed: int, difference: int) -> World:
 
 
 def heading_reasoner(
-    scenario: CraterScenario, *, method: str = "grid", candidates: int = HEADINGS.size, samples: int = 1, **options: Any
+    scenario: CraterScenario,
+    *,
+    method: str = "grid",
+    candidates: int = HEADINGS.size,
+    samples: int = 1,
+    horizon: float = HORIZON,
+    executor: str = "auto",
+    workers: int | None = None,
 ) -> Reasoner:
     """Return the reasoner of the robot, which decides its heading.
 
@@ -111,21 +118,25 @@ def heading_reasoner(
         method: ``grid`` for the discrete headings of the paper, or another method for a continuous search.
         candidates: How many headings are tried, beside the plan in use.
         samples: How many samples of the belief each is tried from; with more than one, pose and mass are uncertain.
-        options: Options of `Reasoner`.
+        horizon: Length of a rollout, in s.
+        executor: Where the rollouts run, see `SearchConfig`.
+        workers: Number of threads or processes.
     """
-    given: dict[str, Any] = {"horizon": HORIZON, "sample_period": SAMPLE_PERIOD}
-    if method == "grid":
-        given["options"] = {"points": candidates}
-    if samples > 1:
-        given["uncertainty"] = {POSE: POSE_UNCERTAINTY, MASS: _uncertain_mass}
+    uncertainty = {POSE: POSE_UNCERTAINTY, MASS: _uncertain_mass} if samples > 1 else None
     return Reasoner(
         scenario=scenario,
         decision=[vtb.Parameter(HEADING, -LIMIT, LIMIT)],
         quality=vtb.Quality(elevation, of=ELEVATION),
         budget=Budget(rollouts=(candidates + 1) * samples),
-        method=method,
-        samples=samples,
-        **{**given, **options},
+        horizon=horizon,
+        sample_period=SAMPLE_PERIOD,
+        search=SearchConfig(
+            method=method,
+            options={"points": candidates} if method == "grid" else {},
+            executor=executor,
+            workers=workers,
+        ),
+        belief=BeliefConfig(samples=samples, uncertainty=uncertainty),
     )
 
 

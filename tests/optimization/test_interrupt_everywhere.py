@@ -5,7 +5,7 @@ import pytest
 from tests.interruptions import hanging_fails, interrupt, places
 from tests.optimization.studies import DAMPING, RATE, THETA, pendulum_problem
 from vtbdrake.optimization import Parameter, boundary, evaluator, study, study_run, sweep
-from vtbdrake.rollout import Quality, ThreadExecutor, executor, runner
+from vtbdrake.rollout import Quality, ThreadExecutor, executor, runner, testbeds
 
 # Each place costs a study: so every so many of the lines are interrupted.
 EVERY = 6
@@ -54,9 +54,9 @@ def test_ctrl_c_in_many_lines_of_a_sweep(threads):
 
     whole = operation()
     by_key = dict(zip([(*p, c) for p, c in zip(whole.points, whole.condition, strict=True)], whole.h, strict=True))
-    for place in places(operation, sweep, executor, runner, lines=True)[::EVERY]:
+    for place in places(operation, sweep, executor, testbeds, runner, lines=True)[::EVERY]:
         found = []
-        interrupt(lambda: found.append(operation()), sweep, executor, runner, at=place)  # noqa: B023
+        interrupt(lambda: found.append(operation()), sweep, executor, testbeds, runner, at=place)  # noqa: B023
         for part in found:
             keys = [(*p, c) for p, c in zip(part.points, part.condition, strict=True)]
             assert part.complete == (len(part) == 6), place

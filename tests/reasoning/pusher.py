@@ -16,7 +16,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Budget, OnboardReasoner
+from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
@@ -111,7 +111,7 @@ class PusherScenario(Scenario):
                 on_request=not self.every,
                 believed={"state": 2},
                 mental=not self.reasons,
-                options={"method": self.method, "constraints": walls, "workers": 1},
+                options={"search": SearchConfig(method=self.method, workers=1), "constraints": walls},
             ),
         )
         law = builder.AddNamedSystem("law", Law())

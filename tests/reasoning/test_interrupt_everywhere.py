@@ -6,10 +6,10 @@ from tests.interruptions import hanging_fails, interrupt, places
 from tests.reasoning.scenarios import MassScenario
 from tests.reasoning.test_reasoner import MISS, SWITCH
 from vtbdrake.optimization import evaluator
-from vtbdrake.reasoning import Belief, Budget, Reasoner, decision_run, reasoner
-from vtbdrake.rollout import SerialExecutor, ThreadExecutor, executor, runner
+from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig, decision_run, reasoner
+from vtbdrake.rollout import SerialExecutor, ThreadExecutor, executor, runner, testbeds
 
-MODULES = reasoner, decision_run, evaluator, executor, runner
+MODULES = reasoner, decision_run, evaluator, executor, testbeds, runner
 # Each place costs two decisions: so every so many of the lines are interrupted.
 EVERY = 6
 
@@ -29,7 +29,7 @@ def test_ctrl_c_in_many_lines_of_a_decision(make, seconds):
             horizon=3.0,
             sample_period=0.5,
             budget=Budget(rollouts=6, seconds=seconds),
-            executor=rollouts,
+            search=SearchConfig(executor=rollouts),
         ) as deciding,
     ):
 

@@ -14,7 +14,7 @@ from tests.reasoning.pusher import CANDIDATE, PERIOD, PLANNER, STATE, PusherScen
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.optimization import Parameter
 from vtbdrake.pickling import dumps
-from vtbdrake.reasoning import Budget, OnboardReasoner, Trajectory
+from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig, Trajectory
 from vtbdrake.rollout import Quality, RolloutTask, Start
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.testbed import DpsAlone
@@ -181,7 +181,7 @@ class PlanScenario(PusherScenario):
             latency=self.latency,
             believed={"state": 2},
             mental=not self.reasons,
-            options={"method": "predictive-sampling"},
+            options={"search": SearchConfig(method="predictive-sampling")},
         )
         planner = builder.AddNamedSystem("planner", reasoner)
         follow = builder.AddNamedSystem("follow", SplineCommand(plan.spline, period=PERIOD, after=0.0))

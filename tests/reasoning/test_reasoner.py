@@ -1,7 +1,7 @@
 """Decisions whose answers are known; budgets, candidates, methods, executors; what is refused."""
 
 import threading
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from tests.reasoning.scenarios import HANG, KILL, FencedMassScenario, MassScenario, SwingUpScenario
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization import Choice, Parameter
-from vtbdrake.reasoning import Belief, BeliefError, Budget, Reasoner, ReasonerError
+from vtbdrake.reasoning import Belief, BeliefConfig, BeliefError, Budget, Reasoner, ReasonerError, SearchConfig
 from vtbdrake.rollout import Constraint, ProcessExecutor, Pruning, Quality, SerialExecutor, Start, ThreadExecutor
 from vtbdrake.testbed import DpsAlone
 
@@ -35,8 +35,13 @@ def make(scenario=None, **changes):
         "sample_period": 0.5,
         "budget": Budget(rollouts=30),
         "executor": "serial",
+        **changes,
     }
-    return Reasoner(scenario=scenario or MassScenario(), **{**settings, **changes})
+    groups = {
+        name: config(**{field.name: settings.pop(field.name) for field in fields(config) if field.name in settings})
+        for name, config in (("search", SearchConfig), ("belief", BeliefConfig))
+    }
+    return Reasoner(scenario=scenario or MassScenario(), **groups, **settings)
 
 
 @pytest.fixture(scope="module")

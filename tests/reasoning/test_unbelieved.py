@@ -11,7 +11,7 @@ from pydrake.systems.primitives import LinearSystem, ZeroOrderHold
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.optimization import Choice
-from vtbdrake.reasoning import Belief, Budget, Reasoner
+from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Quality
 from vtbdrake.state import discrete_state
@@ -98,8 +98,7 @@ def _decisions(scenario):
         quality=Quality(lambda x: abs(x[0] - 3.0), CART, reading="end", minimize=True),
         horizon=4.0,
         budget=Budget(rollouts=4),
-        method="grid",
-        workers=1,
+        search=SearchConfig(method="grid", workers=1),
     )
     with reasoner:
         for t in (2.01, 2.21):

@@ -23,6 +23,7 @@ from vtbdrake.rollout import (
     pickled_task,
     runner,
     start,
+    testbeds,
     worker_processes,
 )
 from vtbdrake.rollout import cluster as dask
@@ -77,7 +78,7 @@ def survives(make, expected, *modules, lines=False, every=1, warm=(False, True),
 
 
 def test_ctrl_c_in_many_lines_of_a_serial_executor(expected):
-    assert survives(SerialExecutor, expected, executor, runner, lines=True, every=2) > 40
+    assert survives(SerialExecutor, expected, executor, testbeds, runner, lines=True, every=2) > 40
 
 
 def test_ctrl_c_in_many_lines_while_rollouts_begin_elsewhere():
@@ -87,12 +88,12 @@ def test_ctrl_c_in_many_lines_while_rollouts_begin_elsewhere():
     context.SetTime(0.5)
     begins = Start.of(testbed, context)
     expected = dict(SerialExecutor().run(TASK, POINTS, start=begins))
-    assert survives(SerialExecutor, expected, runner, start, lines=True, every=2, begins=begins) > 40
+    assert survives(SerialExecutor, expected, testbeds, runner, start, lines=True, every=2, begins=begins) > 40
 
 
 def test_ctrl_c_anywhere_in_threads(expected):
     before = threading.active_count()
-    assert survives(lambda: ThreadExecutor(2), expected, executor, runner) > 40
+    assert survives(lambda: ThreadExecutor(2), expected, executor, testbeds, runner) > 40
     assert threading.active_count() == before
 
 

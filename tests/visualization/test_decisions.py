@@ -8,7 +8,7 @@ from pydrake.geometry import Meshcat
 from tests.reasoning.scenarios import MassScenario, SwingUpScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Parameter
-from vtbdrake.reasoning import Belief, Budget, Reasoner
+from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.visualization import make_meshcat, plot_decision, show_decision, show_poses
 
@@ -25,10 +25,8 @@ def swung_up():
         horizon=2.0,
         sample_period=0.1,
         budget=Budget(rollouts=6),
-        method="grid",
-        options={"points": 5},
         constraints=[Constraint(lambda q: abs(q), of=ANGLE, at_most=6.0)],
-        executor="serial",
+        search=SearchConfig(method="grid", options={"points": 5}, executor="serial"),
     )
     testbed = reasoner.problem.testbed
     with reasoner:
@@ -68,8 +66,7 @@ def test_several_decided_elements_are_drawn_in_the_order_of_trying():
         horizon=3.0,
         sample_period=0.5,
         budget=Budget(rollouts=8),
-        method="random",
-        executor="serial",
+        search=SearchConfig(method="random", executor="serial"),
     ) as reasoner:
         testbed = reasoner.problem.testbed
         decision = reasoner.decide(Belief.perfect(testbed, testbed.default_context()))

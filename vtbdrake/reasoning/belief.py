@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 
+from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.start import Start
 from vtbdrake.state import VariableError
 from vtbdrake.state.layout import FlatState, LayoutError
@@ -21,6 +22,9 @@ from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.testbed.testbed import BeliefRule
+
+if TYPE_CHECKING:
+    from vtbdrake.optimization.risk import Risk
 
 # Times that differ by less are equal, in s.
 _ROUNDING = 1e-6
@@ -104,6 +108,38 @@ class Belief:
 # How an estimate is uncertain: a standard deviation (scalar or of the variable's shape), a covariance matrix, or a
 # function that draws: (believed value, random generator) -> value.
 Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeliefConfig:
+    """How a reasoner uses its belief: from how many samples, and how old it may be.
+
+    Attributes:
+        samples: Number of samples of an uncertain belief from which each candidate is simulated, at least 2; 1 if the
+            belief is certain.
+        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `BeliefToStart`.
+        max_age: The largest age of a belief, in seconds.
+        risk: How the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
+
+    Raises:
+        ValueError: There is no sample; there are several samples of a certain belief, or one of an uncertain one.
+    """
+
+    samples: int = 1
+    uncertainty: Mapping[str, Uncertainty] | None = None
+    max_age: float = inf
+    risk: str | Risk = "worst"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "samples", as_whole("the number of samples", self.samples))
+        if self.samples < 1:
+            raise ValueError(f"a belief has at least one sample, not {self.samples}")
+        if (self.samples > 1) != bool(self.uncertainty):
+            raise ValueError(
+                f"samples={self.samples} with uncertainty={self.uncertainty!r}: of an uncertain belief several samples "
+                "are drawn (one is a world by chance), of a certain one all are the same; give both, samples=8 say, or "
+                "neither"
+            )
 
 
 class BeliefToStart:
@@ -208,7 +244,7 @@ class BeliefToStart:
             BeliefError: The belief is too old; its DPS does not fit that of the mental testbed; an estimate is
                 missing (not finite) or lies outside the bounds of its variable; or the mental scenario has no rules.
         """
-        self._check(belief, now)
+        self._check_belief(belief, now)
         if belief.world is not None:
             return self._perfect(belief.dps, belief.world)
         return self._start(belief.dps, self._believed(belief.dps))
@@ -224,7 +260,7 @@ class BeliefToStart:
         """
         if not self._draws or belief.world is not None:
             return [self.start(belief, now=now)] * samples
-        self._check(belief, now)
+        self._check_belief(belief, now)
         believed = self._believed(belief.dps)
         starts = []
         for n in range(samples):
@@ -242,7 +278,7 @@ class BeliefToStart:
             )
         return np.clip(drawn, *variable.bounds)
 
-    def _check(self, belief: Belief, now: float) -> None:
+    def _check_belief(self, belief: Belief, now: float) -> None:
         if not isinstance(belief, Belief):
             raise BeliefError(f"a rollout begins from a Belief, from Belief.of(testbed, context), say, not {belief!r}")
         age = now - belief.dps.time

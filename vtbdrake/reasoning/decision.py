@@ -1,15 +1,16 @@
-"""The answer of a reasoner: the best candidate that was tried, the other candidates, and why the search ended."""
+"""A decision: the budget at which it ends, and the answer: the candidates that were tried, the best, and the end."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isnan, nan
+from math import isfinite, isnan, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.start import Start
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -19,6 +20,52 @@ if TYPE_CHECKING:
 
 # What became of a candidate.
 ELIGIBLE, VIOLATES, CUT_OFF, FAILED, UNFINISHED = "eligible", "violates", "cut off", "failed", "unfinished"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A Budget limits a decision by rollouts, by time, or by both: the decision ends at the first limit it reaches.
+
+    `DecisionRun` (``decision_run.py``) spends the budget, and ends the decision.
+
+    Attributes:
+        rollouts: Number of rollouts. A decision with this budget alone can be repeated exactly, with any executor.
+        seconds: Wall time. When it is over, the rollouts under way are cancelled, and the best candidate that has
+            finished is the decision.
+
+    Raises:
+        ValueError: Neither is given, or one is not positive.
+    """
+
+    rollouts: int | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.rollouts is None and self.seconds is None:
+            raise ValueError("a budget is given as Budget(rollouts=70), Budget(seconds=2.0) or both")
+        if self.rollouts is not None:
+            object.__setattr__(self, "rollouts", as_whole("a budget of rollouts", self.rollouts))
+            if self.rollouts < 1:
+                raise ValueError(f"a budget is at least one rollout, not {self.rollouts}")
+        if self.seconds is not None:
+            object.__setattr__(self, "seconds", as_number("a budget of wall time", self.seconds))
+            if not (isfinite(self.seconds) and self.seconds > 0.0):
+                raise ValueError(f"a budget of wall time is positive and finite, not {self.seconds} s")
+
+
+def check_budget(budget: Budget, samples: int) -> None:
+    """Check that a budget suffices for one candidate.
+
+    Raises:
+        ValueError: The budget does not suffice, or is not a `Budget`.
+    """
+    if not isinstance(budget, Budget):
+        raise ValueError(f"a budget is Budget(rollouts=...) or Budget(seconds=...), not {budget!r}")
+    if budget.rollouts is not None and budget.rollouts < samples:
+        raise ValueError(
+            f"a budget of {budget.rollouts} rollouts does not suffice for one candidate, which takes {samples}, one "
+            "per sample of the belief"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,10 +197,10 @@ class Decision:
         tried = f"{len(self.candidates)} candidates, {self.health.rollouts} rollouts, {self.health.elapsed:.3g} s"
         if self.chosen is None:
             return f"Decision(none at t = {self.time:g} s: {self.message}; {tried})"
-        kept = ", the plan in use" if self.keeps_plan else ""
+        plan = ", the plan in use" if self.keeps_plan else ""
         poor = ", poor" if self.poor else ""
-        chosen = self.candidates[self.chosen].text
-        return f"Decision({chosen}{kept}: {self.name} = {self.quality:.6g}{poor}; {tried})"
+        values = self.candidates[self.chosen].text
+        return f"Decision({values}{plan}: {self.name} = {self.quality:.6g}{poor}; {tried})"
 
     def __str__(self) -> str:
         """Show the best candidates, the health and the warnings as text."""

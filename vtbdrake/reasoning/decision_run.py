@@ -15,8 +15,17 @@ from vtbdrake.optimization.evaluator import Evaluator
 from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.risk import Worst
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
-from vtbdrake.reasoning.budget import Budget
-from vtbdrake.reasoning.decision import CUT_OFF, ELIGIBLE, FAILED, UNFINISHED, VIOLATES, Candidate, Decision, Health
+from vtbdrake.reasoning.decision import (
+    CUT_OFF,
+    ELIGIBLE,
+    FAILED,
+    UNFINISHED,
+    VIOLATES,
+    Budget,
+    Candidate,
+    Decision,
+    Health,
+)
 from vtbdrake.reasoning.space import same_values
 from vtbdrake.rollout import Cutoff, RolloutResult
 from vtbdrake.rollout.pruning import PRUNED, STALLED
@@ -37,8 +46,8 @@ KEEP: Point = ()
 # workers, so that a decision is the same with any.
 _ROUND = 8
 
-# The decision ends after this many batches in a row with known candidates only.
-_KNOWN_BATCHES = 50
+# The decision ends after this many batches in a row with candidates only that were tried before.
+_MAX_SILENT_BATCHES = 50
 
 # A decision is late if it took more than this many times its budget of wall time.
 _LATE = 1.5
@@ -62,9 +71,9 @@ class DecisionRun:
         reasoner: The reasoner that decides.
         budget: How much the decision may take.
         starts: Where the rollouts begin, one per sample of the belief.
-        held: Address -> value of the plan in use.
-        given: The user's plan as a point of the search, or None.
-        begin: When the decision was requested, by `time.monotonic`.
+        plan_in_use: Address -> value of the plan in use.
+        user_plan: The user's plan as a point of the search, or None.
+        requested_at: When the decision was requested, by `time.monotonic`.
     """
 
     def __init__(
@@ -72,26 +81,26 @@ class DecisionRun:
         reasoner: Reasoner,
         budget: Budget,
         starts: Sequence[Start],
-        held: Mapping[str, Any],
-        given: Point | None,
-        begin: float,
+        plan_in_use: Mapping[str, Any],
+        user_plan: Point | None,
+        requested_at: float,
     ) -> None:
         self._reasoner = reasoner
         self._budget = budget
-        self._deadline = inf if budget.seconds is None else begin + budget.seconds
+        self._deadline = inf if budget.seconds is None else requested_at + budget.seconds
         self._problem = reasoner.problem
         self._starts = starts
         self._time = starts[0].time
-        self._held = held
-        self._given = given
-        self._begin = begin
+        self._plan_in_use = plan_in_use
+        self._user_plan = user_plan
+        self._requested_at = requested_at
         self._results: dict[RolloutKey, RolloutResult] = {}
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
         # What each candidate sets, address -> value.
         self._planned: dict[Point, dict[str, Any]] = {KEEP: {}}
         # The plan in use as a point of the search, if it is one.
-        self._same: Point | None = None
+        self._point_in_use: Point | None = None
         # The candidates in the order in which they were proposed; the plan in use is the first.
         self._proposed: dict[Point, None] = {KEEP: None}
 
@@ -106,62 +115,62 @@ class DecisionRun:
     def _search(self) -> str:
         """Try candidates; return how the method ended."""
         reasoner, rollouts = self._reasoner, self._budget.rollouts
-        start = self._given or self._in_use()
-        if start is not None and same_values(self._values(start), self._held):
-            self._same = start
+        start = self._user_plan or self._in_use()
+        if start is not None and same_values(self._values(start), self._plan_in_use):
+            self._point_in_use = start
         first = [KEEP] if start is None else [KEEP, start]
         # The plan in use is never simulated twice.
-        taken = len(first) - (self._same is not None)
+        taken = len(first) - (self._point_in_use is not None)
         affordable = None if rollouts is None else rollouts // reasoner.samples - taken
-        known: list[Evaluation] = []
+        evaluations: list[Evaluation] = []
         if reasoner.task.pruning is not None or (affordable is not None and affordable <= 0):
             # Otherwise they run beside the first batch of the method, which keeps the workers busy.
-            known, first = self._try(first)[1:], []
+            evaluations, first = self._try(first)[1:], []
         if affordable is not None and affordable <= 0:
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
         solver = reasoner.solver(self._time, budget=affordable, start=start)
         try:
-            return self._iterate(solver, first, known)
+            return self._iterate(solver, first, evaluations)
         finally:
             solver.close()
 
     def _in_use(self) -> Point | None:
         """Return the plan in use as a point of the search; None if it lies outside the ranges."""
         try:
-            return self._reasoner.space.point(self._held, self._time)
+            return self._reasoner.space.point(self._plan_in_use, self._time)
         except ValueError:
             return None
 
     def _values(self, point: Point) -> dict[str, Any]:
         """Return the values that a candidate sets, address -> value."""
         if point not in self._planned:
-            self._planned[point] = self._reasoner.space.values(point, self._held, self._time)
+            self._planned[point] = self._reasoner.space.values(point, self._plan_in_use, self._time)
         return self._planned[point]
 
-    def _iterate(self, solver: Solver, first: Sequence[Point], known: Sequence[Evaluation]) -> str:
+    def _iterate(self, solver: Solver, first: Sequence[Point], evaluated: Sequence[Evaluation]) -> str:
         """Try the candidates that a method asks for; return how it ended.
 
         Args:
             solver: The method.
             first: Points to try beside the first batch: `KEEP`, which the method is not told, and perhaps a plan.
-            known: Evaluations to tell the method with its first batch.
+            evaluated: Evaluations to tell the method with its first batch.
         """
         silent, rollouts = 0, self._budget.rollouts
-        while silent < _KNOWN_BATCHES:
-            asked = ask_within(solver, self._deadline - time.monotonic())
-            if asked is None:
+        while silent < _MAX_SILENT_BATCHES:
+            proposals = ask_within(solver, self._deadline - time.monotonic())
+            if proposals is None:
                 raise _BudgetSpentError(TIME, f"{self._time_spent()}, before {solver.name} proposed more candidates")
-            points = [self._problem.point(point) for point in asked]
+            points = [self._problem.point(point) for point in proposals]
             before = self._count
             evaluations = self._try([*first, *points])
             if not points and rollouts is not None and rollouts - self._count < self._reasoner.samples:
                 raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
             if not points:
                 return f"{solver.name}: {solver.message}"
-            given = [*known, *evaluations[1 : len(first)]]
+            beside = [*evaluated, *evaluations[1 : len(first)]]
             # Their rollouts are not charged to the method.
-            solver.tell([*evaluations[len(first) :], *(replace(evaluation, effort=0.0) for evaluation in given)])
-            first, known = [], []
+            solver.tell([*evaluations[len(first) :], *(replace(evaluation, effort=0.0) for evaluation in beside)])
+            first, evaluated = [], []
             silent = 0 if self._count > before else silent + 1
         return f"{solver.name} asks for known candidates only"
 
@@ -169,31 +178,31 @@ class DecisionRun:
         count = max(1, len(points)) if self._reasoner.task.pruning is None else _ROUND
         evaluations = []
         for k in range(0, len(points), count):
-            now = points[k : k + count]
-            self._proposed |= dict.fromkeys(p for p in now if (p, 0) not in self._results and p != self._same)
-            evaluations += self._evaluator.evaluate(now)
+            batch = points[k : k + count]
+            self._proposed |= dict.fromkeys(p for p in batch if (p, 0) not in self._results and p != self._point_in_use)
+            evaluations += self._evaluator.evaluate(batch)
         return evaluations
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
         executor, rollouts = self._reasoner.executor, self._budget.rollouts
         if time.monotonic() >= self._deadline:
             raise _BudgetSpentError(TIME, self._time_spent())
-        new = [key for key in keys if key[0] != self._same]
-        now = new if rollouts is None else new[: rollouts - self._count]
-        if now:
-            points = [self._values(point) for point, _ in now]
-            starts = [self._starts[sample] for _, sample in now]
-            self._take(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), now)
-        if self._same is not None:
+        new = [key for key in keys if key[0] != self._point_in_use]
+        affordable = new if rollouts is None else new[: rollouts - self._count]
+        if affordable:
+            points = [self._values(point) for point, _ in affordable]
+            starts = [self._starts[sample] for _, sample in affordable]
+            self._collect(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), affordable)
+        if self._point_in_use is not None:
             # Setting the plan in use once more changes nothing.
-            kept = {sample: result for (point, sample), result in self._results.items() if point == KEEP}
-            self._results |= {(self._same, sample): result for sample, result in kept.items()}
-        if any(key not in self._results for key in now):
+            in_use = {sample: result for (point, sample), result in self._results.items() if point == KEEP}
+            self._results |= {(self._point_in_use, sample): result for sample, result in in_use.items()}
+        if any(key not in self._results for key in affordable):
             raise _BudgetSpentError(TIME, self._time_spent())
-        if len(now) < len(new):
+        if len(affordable) < len(new):
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
 
-    def _take(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
+    def _collect(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
         try:
             with Interruptible() as interruptible:
                 for index, result in results:
@@ -210,8 +219,8 @@ class DecisionRun:
         best, risk = self._evaluator.best, self._problem.risk
         # Under any other risk, a better candidate may have a worse sample.
         comparable = self._reasoner.samples == 1 or isinstance(risk, Worst)
-        known = nan if best is None or not comparable else self._evaluator.in_user_terms(best)[0]
-        return {"cutoff": Cutoff(deadline=self._deadline, to_beat=known)}
+        to_beat = nan if best is None or not comparable else self._evaluator.in_user_terms(best)[0]
+        return {"cutoff": Cutoff(deadline=self._deadline, to_beat=to_beat)}
 
     def _time_spent(self) -> str:
         return f"the budget of {self._budget.seconds:g} s is spent"
@@ -232,7 +241,7 @@ class DecisionRun:
             improvement = sign * (candidates[0].quality - best.quality) + 0.0
         if len(ranked) > 1:
             margin = sign * (ranked[1].quality - ranked[0].quality) + 0.0
-        elapsed = time.monotonic() - self._begin
+        elapsed = time.monotonic() - self._requested_at
         results = [self._results[point, sample] for point, sample in self._keys() if (point, sample) in self._results]
         budget = self._budget
         health = Health(
@@ -276,12 +285,12 @@ class DecisionRun:
             status = VIOLATES
         else:
             status = ELIGIBLE if evaluation.exact else CUT_OFF
-        known = status in (ELIGIBLE, VIOLATES, CUT_OFF)
+        has_quality = status in (ELIGIBLE, VIOLATES, CUT_OFF)
         return Candidate(
             number=number,
-            values=self._values(point) or dict(self._held),
+            values=self._values(point) or dict(self._plan_in_use),
             status=status,
-            quality=self._evaluator.in_user_terms(evaluation)[0] if known else nan,
+            quality=self._evaluator.in_user_terms(evaluation)[0] if has_quality else nan,
             violations=evaluation.violations,
             rollouts=finished,
         )
@@ -293,8 +302,13 @@ def _spent(rollouts: int | None) -> str:
 
 def _why_none(candidates: Sequence[Candidate]) -> str:
     counts = Counter(candidate.status for candidate in candidates)
-    what = {FAILED: "failed", CUT_OFF: "were cut off", VIOLATES: "violated a constraint", UNFINISHED: "did not finish"}
-    reasons = [f"{counts[status]} {text}" for status, text in what.items() if counts[status]]
+    phrases = {
+        FAILED: "failed",
+        CUT_OFF: "were cut off",
+        VIOLATES: "violated a constraint",
+        UNFINISHED: "did not finish",
+    }
+    reasons = [f"{counts[status]} {text}" for status, text in phrases.items() if counts[status]]
     messages = [rollout.message for candidate in candidates for rollout in candidate.rollouts if rollout.failed]
     return ", ".join(reasons) + (f"; the first failure: {messages[0]}" if messages else "")
 

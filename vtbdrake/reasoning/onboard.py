@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, State
 
 from vtbdrake.reasoning.belief import Belief, BeliefError
-from vtbdrake.reasoning.budget import Budget
-from vtbdrake.reasoning.reasoner import Reasoner
+from vtbdrake.reasoning.decision import Budget
+from vtbdrake.reasoning.reasoner import Reasoner, SearchConfig
 from vtbdrake.state import parameter
 from vtbdrake.state.declarations import NO_DICT
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
@@ -91,7 +91,7 @@ class OnboardReasoner(SlowPart):
             part is the value of the port at t_k, for the rules that lead from estimates to the simulated world
             (`VirtualTestbedBuilder.believe`).
         mental: Whether this is the part of a mental copy.
-        options: Further arguments of `Reasoner`. ``executor`` and ``workers`` apply beside a loop only.
+        options: Further arguments of `Reasoner`. The executor of its `SearchConfig` applies beside a loop only.
 
     Raises:
         ValueError: The budget does not count rollouts, another element than ``candidate`` is decided, the horizon ends
@@ -119,13 +119,14 @@ class OnboardReasoner(SlowPart):
         mental: bool = False,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        _check(decision, budget, horizon, latency)
+        _check_arguments(decision, budget, horizon, latency)
         arguments = {
             "scenario": scenario,
             "decision": tuple(decision),
             "quality": quality,
             "horizon": horizon,
             "budget": budget,
+            "search": SearchConfig(),
             **(options or {}),
         }
         believed = dict(believed or {})
@@ -224,7 +225,8 @@ class _Decider:
         """
         with self._taking_turns:
             if self._reasoner is None:
-                self._make(**{**self._arguments, "executor": "serial", "workers": None})
+                search = replace(self._arguments["search"], executor="serial", workers=None)
+                self._make(**{**self._arguments, "search": search})
             assert self._reasoner is not None
             try:
                 decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget, now=dps.time)
@@ -260,8 +262,8 @@ class _Decider:
         self._places = {name: testbed.dps_layout.slice_of(variable) for name, variable in self._variables.items()}
         if not reasoner.reproducible:
             raise ValueError(
-                f"{self._arguments['method']} takes its random numbers from the clock, so that a run could not be "
-                "repeated: take CEM, for example"
+                f"{self._arguments['search'].method} takes its random numbers from the clock, so that a run could not "
+                "be repeated: take CEM, for example"
             )
         for element in self._arguments["decision"]:
             if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
@@ -281,7 +283,7 @@ class _Decider:
         return Belief(replace(dps, contents=replace(contents, numbers=numbers)))
 
 
-def _check(decision: Sequence[Element], budget: Budget, horizon: float, latency: float) -> None:
+def _check_arguments(decision: Sequence[Element], budget: Budget, horizon: float, latency: float) -> None:
     if budget.rollouts is None:
         raise ValueError(f"a reasoner on board has a budget of rollouts, such as Budget(rollouts=70), not {budget}")
     for element in decision:

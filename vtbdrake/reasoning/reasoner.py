@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from math import inf
 from types import TracebackType
 from typing import Any, Self
@@ -17,12 +17,10 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.optimization.problem import Motion, Problem, recording_motion
-from vtbdrake.optimization.risk import Risk
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.reasoning.belief import Belief, BeliefError, BeliefToStart, Uncertainty
-from vtbdrake.reasoning.budget import Budget, check_budget
-from vtbdrake.reasoning.decision import Decision
+from vtbdrake.reasoning.belief import Belief, BeliefConfig, BeliefError, BeliefToStart
+from vtbdrake.reasoning.decision import Budget, Decision, check_budget
 from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
@@ -40,6 +38,32 @@ _LEAST_TIME_LIMIT = 10.0
 
 class ReasonerError(RuntimeError):
     """A decision was requested while another one is under way, or after the reasoner was closed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """How a reasoner searches: the method that proposes candidates, and where their rollouts run.
+
+    Attributes:
+        method: Name of a solver from `vtbdrake.optimization.solvers` (``CEM``, ``predictive-sampling``, ``MPPI``,
+            ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
+        options: Options of the method.
+        pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
+            one before its round of 8 candidates, if there is one sample or the risk is ``worst``. Methods that learn
+            from all points, such as CEM and MPPI, propose other candidates with pruning than without.
+        executor: Where the rollouts run, see `Problem.sweep`. ``auto`` takes processes if a system in Python has work
+            to do, else threads.
+        workers: Number of threads or processes; by default the number of cores.
+        time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
+            By default the horizon, but at least 10 s.
+    """
+
+    method: str | type[Solver] = "CEM"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    pruning: Pruning | None = None
+    executor: str | Executor = "auto"
+    workers: int | None = None
+    time_limit: float | None = None
 
 
 class Reasoner:
@@ -60,26 +84,12 @@ class Reasoner:
         quality: Quality f, larger is better, or a cost.
         horizon: Length of a rollout, in seconds.
         budget: How much a decision may take.
-        method: Name of a solver from `vtbdrake.optimization.solvers` (``CEM``, ``predictive-sampling``, ``MPPI``,
-            ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
-        options: Options of the method.
         constraints: Constraints that the rollouts of an eligible candidate keep.
-        samples: Number of samples of an uncertain belief from which each candidate is simulated, at least 2; 1 if the
-            belief is certain.
-        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `BeliefToStart`.
-        max_age: The largest age of a belief, in seconds.
-        risk: How the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
         threshold: Threshold f_m: a rollout ends when f exceeds it.
         sample_period: Sample period of f, in seconds.
-        pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
-            one before its round of 8 candidates, if there is one sample or the risk is ``worst``. Methods that learn
-            from all points, such as CEM and MPPI, propose other candidates with pruning than without.
-        executor: Where the rollouts run, see `Problem.sweep`. ``auto`` takes processes if a system in Python has work
-            to do, else threads.
-        workers: Number of threads or processes; by default the number of cores.
-        time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
-            By default the horizon, but at least 10 s.
-        seed: Seed of the method; combined with the time at which a decision begins.
+        search: How candidates are proposed, and where their rollouts run.
+        belief: How the belief is used: samples, uncertainty, age, risk.
+        seed: Seed of the method and of the samples; for the method combined with the time at which a decision begins.
 
     Attributes:
         problem: Problem (18) in the mental testbed, one condition per sample.
@@ -106,32 +116,18 @@ class Reasoner:
         quality: Quality,
         horizon: float,
         budget: Budget,
-        method: str | type[Solver] = "CEM",
-        options: Mapping[str, Any] | None = None,
         constraints: Sequence[Constraint] = (),
-        samples: int = 1,
-        uncertainty: Mapping[str, Uncertainty] | None = None,
-        max_age: float = inf,
-        risk: str | Risk = "worst",
         threshold: float | None = None,
         sample_period: float = 0.05,
-        pruning: Pruning | None = None,
-        executor: str | Executor = "auto",
-        workers: int | None = None,
-        time_limit: float | None = None,
+        search: SearchConfig | None = None,
+        belief: BeliefConfig | None = None,
         seed: int = 0,
     ) -> None:
         if not isinstance(quality, Quality):
             raise ValueError(f"a decision has one quality, Quality(f, of=[address, ...]), not {quality!r}")
-        self.samples = as_whole("the number of samples", samples)
-        if self.samples < 1:
-            raise ValueError(f"a belief has at least one sample, not {samples}")
+        search, belief = search or SearchConfig(), belief or BeliefConfig()
+        self.samples = belief.samples
         check_budget(budget, self.samples)
-        if (self.samples > 1) != bool(uncertainty):
-            raise ValueError(
-                f"samples={samples} with uncertainty={uncertainty!r}: of an uncertain belief several samples are drawn "
-                "(one is a world by chance), of a certain one all are the same; give both, samples=8 say, or neither"
-            )
         self.budget = budget
         self.space = DecisionSpace(decision)
         mental = _mental(scenario)
@@ -143,30 +139,29 @@ class Reasoner:
             threshold=threshold,
             sample_period=sample_period,
             conditions=[{}] * self.samples,
-            risk=risk,
+            risk=belief.risk,
             constraints=constraints,
         )
         self.space.find(self.problem.testbed.variables())
         # A quality that fails is a reason against a candidate, and no end of the DPS.
-        self.task = replace(self.problem.task, catch=True, pruning=pruning)
+        self.task = replace(self.problem.task, catch=True, pruning=search.pruning)
         testbed = self.problem.testbed
-        self.belief_to_start = BeliefToStart(testbed, uncertainty=uncertainty, seed=seed, max_age=max_age)
-        self._unbelieved = UnbelievedReadings(testbed, uncertain=uncertainty or ())
+        self.belief_to_start = BeliefToStart(testbed, uncertainty=belief.uncertainty, seed=seed, max_age=belief.max_age)
+        self._unbelieved = UnbelievedReadings(testbed, uncertain=belief.uncertainty or ())
         # Reads values from a start.
         self._start_context = StartContext(testbed, testbed.default_context(), testbed.copier_from(testbed))
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
-        self._method = method
-        self._options = dict(options or {})
+        self._search = search
         self._seed = as_whole("a seed", seed)
         # A method that cannot decide this is refused here. Candidate 0 does not count: the method does not propose it.
         affordable = None if budget.rollouts is None else max(budget.rollouts // self.samples - 1, 1)
         solver = self.solver(0.0, budget=affordable)
         solver.close()
         self.reproducible = solver.reproducible
-        self._workers = checked_workers(workers)
-        self._owned = not isinstance(executor, Executor)
-        self.executor = _make_executor(executor, self.problem, budget, workers, time_limit)
-        if pruning is not None or budget.seconds is not None:
+        self._workers = checked_workers(search.workers)
+        self._owned = not isinstance(search.executor, Executor)
+        self.executor = _make_executor(search, self.problem, budget)
+        if search.pruning is not None or budget.seconds is not None:
             self._check_executor()
         self._alone = threading.Lock()
         self._warm = False
@@ -186,13 +181,13 @@ class Reasoner:
         """
         entropy = [self._seed, int(np.float64(time).view(np.uint64))]
         return make_solver(
-            self._method,
+            self._search.method,
             self.space.parameters,
             constraints=len(self.problem.constraints),
             seed=int(np.random.SeedSequence(entropy).generate_state(1)[0]),
             budget=budget,
-            start=start if solver_type(self._method).takes_start else None,
-            **self._options,
+            start=start if solver_type(self._search.method).takes_start else None,
+            **self._search.options,
         )
 
     def warm_up(self) -> None:
@@ -244,17 +239,17 @@ class Reasoner:
             if budget.seconds is not None:
                 self._check_executor()
                 self._warm_up()
-            begin = time.monotonic()
+            requested_at = time.monotonic()
             if isinstance(believer, AddressedDiagram):
                 if context is None:
                     raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")
                 believer, now = Belief.of(believer, context), max(now, context.get_time())
             try:
                 starts = self._starts(believer, now)
-                held = self._plan_in_use(starts[0])
-                given = None if plan is None else self.space.point(plan, starts[0].time)
+                plan_in_use = self._plan_in_use(starts[0])
+                user_plan = None if plan is None else self.space.point(plan, starts[0].time)
                 try:
-                    decision = DecisionRun(self, budget, starts, held, given, begin).decision()
+                    decision = DecisionRun(self, budget, starts, plan_in_use, user_plan, requested_at).decision()
                 except BaseException:
                     self._warm = False  # Workers that are interrupted are ended, and others take their place.
                     raise
@@ -275,8 +270,8 @@ class Reasoner:
         """Return the values of the decided elements in a start, address -> value."""
         if self._readers.keys() <= start.values.keys():
             # Usually so: commands. Setting a context to the start would take a fifth of the time before the rollouts.
-            given = {address: np.asarray(start.values[address], dtype=float) for address in self._readers}
-            return {address: value if value.shape else value.item() for address, value in given.items()}
+            arrays = {address: np.asarray(start.values[address], dtype=float) for address in self._readers}
+            return {address: value if value.shape else value.item() for address, value in arrays.items()}
         self._start_context.set(start)
         return {address: read(self._start_context.context) for address, read in self._readers.items()}
 
@@ -336,9 +331,8 @@ class Reasoner:
         self.close()
 
 
-def _make_executor(
-    executor: str | Executor, problem: Problem, budget: Budget, workers: int | None, time_limit: float | None
-) -> Executor:
+def _make_executor(search: SearchConfig, problem: Problem, budget: Budget) -> Executor:
+    executor, workers, time_limit = search.executor, search.workers, search.time_limit
     if executor == "auto":
         executor = "serial" if checked_workers(workers) == 1 else choose_executor(problem.testbed)
         workers = None if executor == "serial" else workers

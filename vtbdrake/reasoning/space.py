@@ -79,7 +79,7 @@ class DecisionSpace:
         for element in self.elements:
             value = plan[element.address]
             if isinstance(element, Trajectory):
-                begin, *knots = element.check(value)
+                begin, *knots = element.as_numbers(value)
                 for parameter, knot in zip(element.parameters, knots, strict=True):
                     parameter.check(knot)
                 point += element.shifted(knots, time - begin).tolist()

@@ -80,12 +80,12 @@ class Trajectory:
         assert self.parameters  # Their ranges are checked.
 
     def _limit(self, name: str) -> tuple[float, ...]:
-        given = getattr(self, name)
+        limit = getattr(self, name)
         try:
-            values = np.broadcast_to(np.asarray(given, dtype=float), (self.size,))
+            values = np.broadcast_to(np.asarray(limit, dtype=float), (self.size,))
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"{name} of {self.address} is a number, or one for each of its {self.size} entries, not {given!r}"
+                f"{name} of {self.address} is a number, or one for each of its {self.size} entries, not {limit!r}"
             ) from error
         return tuple(values.tolist())
 
@@ -106,7 +106,7 @@ class Trajectory:
         return tuple(Parameter(f"{self.address}[{1 + k}]", *ends) for k, ends in enumerate(ranges))
 
     @property
-    def begin(self) -> str:
+    def begin_address(self) -> str:
         """Return the address of t_begin."""
         return f"{self.address}[0]"
 
@@ -136,7 +136,7 @@ class Trajectory:
         for parameter in self.parameters:
             parameter.find(variables)
 
-    def check(self, plan: ArrayLike) -> list[float]:
+    def as_numbers(self, plan: ArrayLike) -> list[float]:
         """Return a plan [t_begin, knots] as numbers.
 
         Raises:
@@ -207,8 +207,8 @@ class Trajectory:
         if not (self.spline.stays_within_knots and self._has_only_range):
             exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
             for j in np.flatnonzero(exceeded).tolist():
-                kept = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
-                w[:, j] = self._slowed(kept, j)
+                projected = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+                w[:, j] = self._slowed(projected, j)
         return w.reshape(np.shape(knots))
 
     def _slowed(self, w: Array, j: int) -> Array:
@@ -234,9 +234,9 @@ class Trajectory:
             *((sign * speed, (1.0 - _ACCURACY) * rate) for sign in (1, -1)),
             *((sign * change, (1.0 - _ACCURACY) * acceleration) for sign in (1, -1)),
         )
-        kept = [(rows, limit) for rows, limit in sides if limit < inf]
-        rows = np.concatenate([rows for rows, _ in kept])
-        room = np.concatenate([np.full(len(rows), limit) for rows, limit in kept]) - rows @ w
+        finite = [(rows, limit) for rows, limit in sides if limit < inf]
+        rows = np.concatenate([rows for rows, _ in finite])
+        room = np.concatenate([np.full(len(rows), limit) for rows, limit in finite]) - rows @ w
         return w + np.concatenate((np.zeros(fixed), _shortest(rows[:, fixed:], room)))
 
     def excess(self, knots: ArrayLike) -> dict[str, float]:

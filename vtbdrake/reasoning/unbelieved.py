@@ -49,16 +49,16 @@ class UnbelievedReadings:
             _change(variables[address], changed, 1.0 + 0.1 * number)
         unreached = measured(changed) == values
         # Index of a reading -> address of a variable that it depends on.
-        found: dict[int, str] = {}
+        cause: dict[int, str] = {}
         for variable in _world(variables) if unreached.any() else ():
             before = variable.get(context)
             free = np.equal(before, variable.get(changed))
             if free.any() and variable.address not in believed:
                 _change(variable, context, free)
                 for index in np.flatnonzero(unreached & (measured(context) != values)).tolist():
-                    found.setdefault(index, variable.address)
+                    cause.setdefault(index, variable.address)
                 variable.set(context, before)
-        self._readings = [(*entries[k], float(values[k]), units[entries[k][0]], found[k]) for k in sorted(found)]
+        self._readings = [(*entries[k], float(values[k]), units[entries[k][0]], cause[k]) for k in sorted(cause)]
 
     def warnings(self, belief: Belief) -> tuple[str, ...]:
         """Return a sentence about the first reading that does not begin with what the DPS has received, if any."""
@@ -69,18 +69,18 @@ class UnbelievedReadings:
         if not wrong:
             return ()
         name, entry, value, unit, address = self._readings[wrong[0]]
-        others = f"; the same holds for further readings: {len(wrong) - 1}" if len(wrong) > 1 else ""
+        more = f"; the same holds for further readings: {len(wrong) - 1}" if len(wrong) > 1 else ""
         return (
             f"the simulated sensor signal {name}[{entry}] begins at {with_unit(f'{value:g}', unit)}, but the DPS has "
             f"received {with_unit(f'{received[wrong[0]]:g}', unit)} last: no belief rule reaches it; declare a belief "
-            f"for {address} (VirtualTestbedBuilder.believe){others}",
+            f"for {address} (VirtualTestbedBuilder.believe){more}",
         )
 
 
 def _world(variables: Variables) -> list[Variable]:
     """Return the state of the world that can be set, without that of sensors and actuators."""
-    own = [v for v in variables.values() if v.address.startswith(("sim.sys.", "sim.env."))]
-    return [v for v in own if v.kind == X and not v.derived]
+    world = [v for v in variables.values() if v.address.startswith(("sim.sys.", "sim.env."))]
+    return [v for v in world if v.kind == X and not v.derived]
 
 
 def _is_examined(sensor: System) -> bool:
@@ -89,8 +89,8 @@ def _is_examined(sensor: System) -> bool:
 
 def _measurement(sensor: System, root: Context) -> np.ndarray:
     """Return what a sensor would sample now, without its errors."""
-    own = sensor.GetMyContextFromRoot(root)
-    return np.array(sensor.get_input_port().Eval(own) if is_hold(sensor) else sensor.measurement(own))
+    context = sensor.GetMyContextFromRoot(root)
+    return np.array(sensor.get_input_port().Eval(context) if is_hold(sensor) else sensor.measurement(context))
 
 
 def _change(variable: Variable, context: Context, amount: ArrayLike) -> None:

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 
 import vtbdrake as vtb
 from vtbdrake.reasoning import Belief
-from vtbdrake.rollout.start import Beginning
+from vtbdrake.rollout.start import StartContext
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.decision import cost, plan_of
 from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner, swing_up, swing_up_on_machine, swing_up_onboard
@@ -93,7 +93,7 @@ def test_a_mental_copy_begins_at_the_present_not_at_the_last_measurement(instant
     context = testbed.default_context()
     testbed.write(context, {"sim.sys.cart_pole.pole_pin.position": 2.0, "u.plan": [0.0, *[20.0] * scenario.knots]})
     testbed.simulator(context).AdvanceTo(instant)
-    beginning = Beginning(mental, mental.default_context(), mental.copier_from(mental))
+    beginning = StartContext(mental, mental.default_context(), mental.copier_from(mental))
     beginning.set(Belief.of(testbed, context).start(mental))
     true, believed = testbed.reader("plant.state")(context), mental.reader("plant.state")(beginning.context)
     assert abs(true[3]) > 5.0  # In two periods the pole turns by 0.2 rad.
