@@ -612,7 +612,10 @@ def test_a_senseless_budget_is_refused(arguments, message):
         ({"budget": 70}, "a budget is Budget.*not 70"),
         ({"scenario": "MassScenario"}, "the scenario of the running testbed, .*not 'MassScenario'"),
         ({"samples": 0}, "at least one sample, not 0"),
-        ({"samples": 8, "budget": Budget(rollouts=7)}, "7 rollouts does not suffice for one candidate, which takes 8"),
+        (
+            {"samples": 8, "uncertainty": {"sim.sys.mass.discrete_state_0": 0.1}, "budget": Budget(rollouts=7)},
+            "7 rollouts does not suffice for one candidate, which takes 8",
+        ),
         ({"uncertainty": {"sim.sys.mass.discrete_state_0": 0.1}}, "samples=1 with .*one is a world by chance"),
         ({"samples": 3}, "samples=3 with uncertainty=None.*of a certain one all are the same"),
         ({"decision": []}, "a reasoner decides something"),
