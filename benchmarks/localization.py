@@ -12,9 +12,9 @@ from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.testbed.slow_part import slow_parts
-from vtbdrake_diagrams.forest.detections import Detector, Wood
 from vtbdrake_diagrams.forest.scenario import ForestScenario, scanner_config
-from vtbdrake_diagrams.forest.stand import ACCURATE, Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
+from vtbdrake_diagrams.forest.world.stand import ACCURATE, Stand
 
 POINTS = 20_000
 DUE = 0.07  # s after the end of a scan, when the localizer has taken it

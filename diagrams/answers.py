@@ -27,7 +27,7 @@ APPLICATIONS: Registry = {
     "R1": "vtbdrake_diagrams.space_climber.answers:heading",
     "R2": "vtbdrake_diagrams.satellite.trajectory:answer",
     "C1": "vtbdrake_diagrams.manipulator.answers:control",
-    "C2": "vtbdrake_diagrams.forest.answers:localization",
+    "C2": "vtbdrake_diagrams.forest.studies.answers:localization",
 }
 
 FILE = "answers.json"

@@ -1,1 +1,1 @@
-"""The forest: stands of trees, and maps of them with errors."""
+"""A forest machine that localizes itself among trees: the testbed, its world, its studies and its pictures."""

@@ -10,9 +10,9 @@ from pydrake.math import RollPitchYaw
 
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.testbed import VirtualTestbedBuilder
-from vtbdrake_diagrams.forest.carrier import Carrier, standing_pose
-from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.routes import Route
+from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.routes import Route
 
 Array = NDArray[np.float64]
 

@@ -29,13 +29,13 @@ from vtbdrake.lcm.drake_messages import image_array_map, scan_map
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
-from vtbdrake_diagrams.forest.ground import Ground
 from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
-from vtbdrake_diagrams.forest.plain import RockField
-from vtbdrake_diagrams.forest.routes import Route
-from vtbdrake_diagrams.forest.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig, StereoLandmarks, add_stereo
-from vtbdrake_diagrams.forest.vegetation import Vegetation
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.routes import Route
+from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.world.vegetation import Vegetation
+from vtbdrake_diagrams.plain.rocks import RockField
 
 Array = NDArray[np.float64]
 
@@ -284,8 +284,14 @@ class CarrierScenario(Scenario):
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the carrier runs without a plant.
         from vtbdrake_diagrams.forest.belief import declare_belief
-        from vtbdrake_diagrams.forest.carrier import Carrier, WheelOdometer, Wheels, add_carrier, standing_pose
-        from vtbdrake_diagrams.forest.driver import Driver
+        from vtbdrake_diagrams.forest.world.carrier import (
+            Carrier,
+            WheelOdometer,
+            Wheels,
+            add_carrier,
+            standing_pose,
+        )
+        from vtbdrake_diagrams.forest.world.driver import Driver
 
         plant, _ = builder.add_plant(self.plant_config)
         plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -self.gravity])
@@ -403,7 +409,7 @@ class ForestScenario(CarrierScenario):
         return self.stand().map(errors, seed=self.map_seed)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
-        from vtbdrake_diagrams.forest.world import add_forest
+        from vtbdrake_diagrams.forest.world.geometry import add_forest
 
         textured = self.perception == "stereo"
         add_forest(plant, self.stand(), self.ground(), self.vegetation(), textured=textured)
@@ -498,6 +504,6 @@ class PlainScenario(CarrierScenario):
         return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
-        from vtbdrake_diagrams.forest.world import add_plain
+        from vtbdrake_diagrams.plain.geometry import add_plain
 
         add_plain(plant, self.rock_field(), self.ground())

@@ -20,7 +20,7 @@ from tests.visualization.meshcat_page import decoded
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.testbed import Interface
-from vtbdrake_diagrams.forest.display import main, program
+from vtbdrake_diagrams.forest.pictures.display import main, program
 
 SCENARIO = "tests.cli.test_forest:PatientScenario"
 SEED = 4
@@ -67,7 +67,7 @@ def test_display_shows_what_another_process_knows() -> None:
         programs = [
             stack.enter_context(start(*arguments))
             for arguments in (
-                ("vtbdrake_diagrams.forest.display", *common, "--timeout", TIMEOUT),
+                ("vtbdrake_diagrams.forest.pictures.display", *common, "--timeout", TIMEOUT),
                 ("vtbdrake.cli", "run", *common, "--pace", "imu", "--priority", 0),
                 ("vtbdrake.cli", "machine", *common, "--period", 0.02, "--brake", "idle"),
             )

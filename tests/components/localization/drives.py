@@ -8,8 +8,8 @@ import numpy as np
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse, wrap
-from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
-from vtbdrake_diagrams.forest.stand import MapErrors, Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
+from vtbdrake_diagrams.forest.world.stand import MapErrors, Stand
 
 PERIOD = 0.2
 SIZE = 60.0

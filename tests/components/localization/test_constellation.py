@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse, transform, wrap
-from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, Stand
-from vtbdrake_diagrams.forest.trials import Case, run
+from vtbdrake_diagrams.forest.studies.trials import Case, run
+from vtbdrake_diagrams.forest.world.stand import ACCURATE, POOR, Stand
 
 pytestmark = pytest.mark.one_python
 

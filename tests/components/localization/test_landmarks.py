@@ -9,7 +9,7 @@ from vtbdrake.components.localization.planar import compose, inverse, transform,
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake.state.codecs import codec_of
-from vtbdrake_diagrams.forest.stand import REMOTE, Stand
+from vtbdrake_diagrams.forest.world.stand import REMOTE, Stand
 
 DIAMETER = Quantity(0.3, "m", 0.02)
 

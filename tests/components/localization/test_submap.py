@@ -6,7 +6,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.state.codecs import codec_of
-from vtbdrake_diagrams.forest.stand import ACCURATE
+from vtbdrake_diagrams.forest.world.stand import ACCURATE
 
 pytestmark = pytest.mark.one_python
 

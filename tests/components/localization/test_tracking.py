@@ -13,8 +13,8 @@ from vtbdrake.components.localization.planar import compose, inverse, rotation, 
 from vtbdrake.components.localization.track_state import TrackState
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.state.codecs import codec_of
-from vtbdrake_diagrams.forest.detections import Odometry
-from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE
+from vtbdrake_diagrams.forest.studies.detections import Odometry
+from vtbdrake_diagrams.forest.world.stand import ACCURATE, POOR, REMOTE
 
 pytestmark = pytest.mark.one_python
 

@@ -17,7 +17,7 @@ from vtbdrake.components.localization.unit import (
     UNIT_STATE_CODEC,
     LocalizationUnit,
 )
-from vtbdrake_diagrams.forest.stand import ACCURATE, REMOTE
+from vtbdrake_diagrams.forest.world.stand import ACCURATE, REMOTE
 
 pytestmark = pytest.mark.one_python
 

@@ -12,10 +12,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from vtbdrake_diagrams.forest.carrier import Carrier, Wheels, add_carrier, standing_pose
-from vtbdrake_diagrams.forest.driver import Driver
-from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.routes import strip_roads
+from vtbdrake_diagrams.forest.world.carrier import Carrier, Wheels, add_carrier, standing_pose
+from vtbdrake_diagrams.forest.world.driver import Driver
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.routes import strip_roads
 
 FLAT = Ground(relief=0.0, bumps=0.0)
 WEIGHT = Carrier().mass * 9.81

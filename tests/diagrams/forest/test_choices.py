@@ -9,9 +9,10 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import DOUBTFUL, TRACKING
 from vtbdrake.testbed import ScenarioError
-from vtbdrake_diagrams.forest import next_route
-from vtbdrake_diagrams.forest.drives import Drive, Track, localize, simulated_drive
-from vtbdrake_diagrams.forest.next_route import (
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.studies import next_route
+from vtbdrake_diagrams.forest.studies.drives import Drive, Track, localize, simulated_drive
+from vtbdrake_diagrams.forest.studies.next_route import (
     COUNTED,
     FOUND,
     HORIZON,
@@ -23,7 +24,7 @@ from vtbdrake_diagrams.forest.next_route import (
     summary,
     variance,
 )
-from vtbdrake_diagrams.forest.scanner_choice import (
+from vtbdrake_diagrams.forest.studies.scanner_choice import (
     BEAMS,
     HEIGHTS,
     SETTLING,
@@ -32,9 +33,8 @@ from vtbdrake_diagrams.forest.scanner_choice import (
     position_error,
     scanner_problem,
 )
-from vtbdrake_diagrams.forest.scanner_choice import UNKNOWN as FAR
-from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.stand import REMOTE, Stand
+from vtbdrake_diagrams.forest.studies.scanner_choice import UNKNOWN as FAR
+from vtbdrake_diagrams.forest.world.stand import REMOTE, Stand
 
 # The true pose and velocity, and the time of the pose of the DPS: the carrier has come 3 cm and 4 cm since then.
 TRUTH, VELOCITY, LAG = np.array([3.03, 4.04, 0.5, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0, 1.5, 2.0, 0.0]), 0.02

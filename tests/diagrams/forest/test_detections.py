@@ -5,8 +5,8 @@ import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform
-from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned, gathered, visible
-from vtbdrake_diagrams.forest.stand import Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned, gathered, visible
+from vtbdrake_diagrams.forest.world.stand import Stand
 
 pytestmark = pytest.mark.one_python
 

@@ -9,7 +9,8 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
-from vtbdrake_diagrams.forest.drives import (
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     SOURCES,
     STANDING,
@@ -24,8 +25,7 @@ from vtbdrake_diagrams.forest.drives import (
     score,
     simulated_drive,
 )
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
-from vtbdrake_diagrams.forest.stand import Stand
+from vtbdrake_diagrams.forest.world.stand import Stand
 
 pytestmark = pytest.mark.one_python
 

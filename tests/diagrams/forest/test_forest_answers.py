@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake_diagrams.forest.answers import over_lcm
-from vtbdrake_diagrams.forest.drives import REACH, Drive, best_error_along, forest, least_error, least_error_along
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.studies.answers import over_lcm
+from vtbdrake_diagrams.forest.studies.drives import (
+    REACH,
+    Drive,
+    best_error_along,
+    forest,
+    least_error,
+    least_error_along,
+)
+from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 
 
 def test_unit_over_lcm_finds_the_simulated_pose() -> None:

@@ -25,11 +25,18 @@ from vtbdrake.components.world_model import (
 )
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
-from vtbdrake_diagrams.forest.ground import Ground
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
-from vtbdrake_diagrams.forest.stand import Stand
-from vtbdrake_diagrams.forest.vegetation import BREAST_HEIGHT, Vegetation, branches, crowns, trunks, undergrowth
-from vtbdrake_diagrams.forest.world import add_ground, add_surface
+from vtbdrake_diagrams.forest.world.geometry import add_ground, add_surface
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.stand import Stand
+from vtbdrake_diagrams.forest.world.vegetation import (
+    BREAST_HEIGHT,
+    Vegetation,
+    branches,
+    crowns,
+    trunks,
+    undergrowth,
+)
 
 GROUND = Ground(seed=6)
 AT_REST = SpatialVelocity(np.zeros(3), np.zeros(3))

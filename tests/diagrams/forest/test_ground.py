@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.world.ground import Ground
 
 pytestmark = pytest.mark.one_python
 

@@ -1,8 +1,8 @@
 """Global localization in a forest from another generator than the one it was developed with.
 
-That of `vtbdrake_diagrams.forest.stand` draws places and diameters from distributions. Here a forest grows: seedlings
-stand anywhere, and each year a tree grows by its vigour, divided by one plus the crowding around it, the sum of
-d_j / (d_i r_ij) over its neighbours within 5 m (Hegyi's index). What hardly grows dies. Spacing, density and the
+That of `vtbdrake_diagrams.forest.world.stand` draws places and diameters from distributions. Here a forest grows:
+seedlings stand anywhere, and each year a tree grows by its vigour, divided by one plus the crowding around it, the sum
+of d_j / (d_i r_ij) over its neighbours within 5 m (Hegyi's index). What hardly grows dies. Spacing, density and the
 distribution of the diameters come out.
 """
 
@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, gathered
-from vtbdrake_diagrams.forest.stand import MAPS, surveyed
-from vtbdrake_diagrams.forest.trials import Case, Trial, judged
+from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, gathered
+from vtbdrake_diagrams.forest.studies.trials import Case, Trial, judged
+from vtbdrake_diagrams.forest.world.stand import MAPS, surveyed
 
 pytestmark = pytest.mark.one_python
 

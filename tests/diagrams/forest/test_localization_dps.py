@@ -39,11 +39,11 @@ from vtbdrake.recording.replay import replay
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake.visualization import make_meshcat
-from vtbdrake_diagrams.forest.carrier import Carrier
-from vtbdrake_diagrams.forest.display import STATUS, WATCHED, DriverDisplay, main, status_text
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.perception import Localizer
+from vtbdrake_diagrams.forest.pictures.display import STATUS, WATCHED, DriverDisplay, main, status_text
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.world.carrier import Carrier
 
 POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
 CYCLES = 200

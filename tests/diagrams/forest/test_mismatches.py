@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from vtbdrake.components.localization.constellation import ConstellationMap
-from vtbdrake_diagrams.forest.mismatches import mirrored, pairs
-from vtbdrake_diagrams.forest.recordings import FOLDER, read_r, rioja, stems
+from vtbdrake_diagrams.forest.studies.mismatches import mirrored, pairs
+from vtbdrake_diagrams.forest.studies.recordings import FOLDER, read_r, rioja, stems
 
 pytestmark = pytest.mark.one_python
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from vtbdrake.visualization.plots import Picture
-from vtbdrake_diagrams.forest.picture import draw_errors, draw_surroundings, simulated
+from vtbdrake_diagrams.forest.pictures.picture import draw_errors, draw_surroundings, simulated
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 
 

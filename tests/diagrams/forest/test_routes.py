@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.forest.carrier import Carrier
-from vtbdrake_diagrams.forest.routes import Route, strip_roads
+from vtbdrake_diagrams.forest.world.carrier import Carrier
+from vtbdrake_diagrams.forest.world.routes import Route, strip_roads
 
 pytestmark = pytest.mark.one_python
 

@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import kstest, weibull_min
 
 from vtbdrake.components.world_model import WorldModel, add_to_plant
-from vtbdrake_diagrams.forest.stand import ACCURATE, POOR, REMOTE, MapErrors, Stand, tree_height
+from vtbdrake_diagrams.forest.world.stand import ACCURATE, POOR, REMOTE, MapErrors, Stand, tree_height
 
 pytestmark = pytest.mark.one_python
 

@@ -14,7 +14,7 @@ from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.forest.perception import SHOWN, Localizer
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES, StereoConfig
-from vtbdrake_diagrams.forest.stereo_trials import errors
+from vtbdrake_diagrams.forest.studies.stereo_trials import errors
 
 SCENARIO = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
 

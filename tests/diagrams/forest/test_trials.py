@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake_diagrams.forest.trials import GOALS, LARGEST_WRONG, Case, Trial, cases, judged, run, verdicts
+from vtbdrake_diagrams.forest.studies.trials import GOALS, LARGEST_WRONG, Case, Trial, cases, judged, run, verdicts
 
 pytestmark = pytest.mark.one_python
 

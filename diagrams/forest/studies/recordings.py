@@ -25,7 +25,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 
 Array = NDArray[np.float64]
 
-FOLDER = Path(os.environ.get("VTBDRAKE_RECORDINGS", Path(__file__).parents[3] / "shared" / "real"))
+FOLDER = Path(os.environ.get("VTBDRAKE_RECORDINGS", Path(__file__).parents[4] / "shared" / "real"))
 """The folder of the recordings."""
 
 # How the files of R are compressed: their first bytes, and the function that decompresses them.

@@ -1,6 +1,6 @@
 """The picture of docs/forest.md: the carrier in its forest, its scan on the map, and the errors of its position.
 
-``python -m vtbdrake_diagrams.forest.picture`` draws it.
+``python -m vtbdrake_diagrams.forest.pictures.picture`` draws it.
 """
 
 from __future__ import annotations

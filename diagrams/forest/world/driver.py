@@ -11,8 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, 
 
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake_diagrams.forest.carrier import quaternion_matrix
-from vtbdrake_diagrams.forest.routes import Route
+from vtbdrake_diagrams.forest.world.carrier import quaternion_matrix
+from vtbdrake_diagrams.forest.world.routes import Route
 
 # The distance along the route of the point that the driver steers to, and the distance from the route beyond which
 # the driver looks for it again, in m.

@@ -1,9 +1,10 @@
 """Pairs of a scan and a map that does not show the place of the scan: how often is a pose claimed all the same?
 
-``python -m vtbdrake_diagrams.forest.mismatches [--pairs N] [--seed S]`` draws random pairs of each kind, matches them
-(`ConstellationMap.locate`), and prints how many were sure: each of them is wrong. It also prints the largest logarithm
-of the likelihood ratio, and the one that came nearest to what is required. Only poses without a rival of more than half
-of it count there: in the rows of plantations many poses have large ratios, and refuse each other. The kinds:
+``python -m vtbdrake_diagrams.forest.studies.mismatches [--pairs N] [--seed S]`` draws random pairs of each kind,
+matches them (`ConstellationMap.locate`), and prints how many were sure: each of them is wrong. It also prints the
+largest logarithm of the likelihood ratio, and the one that came nearest to what is required. Only poses without a rival
+of more than half of it count there: in the rows of plantations many poses have large ratios, and refuse each other. The
+kinds:
 
 * ``mirrored``: the map of the same stand in a mirror, so that density, diameters and the kind of pattern are the same;
   whole or only a square of 20 to 60 m around the place.
@@ -29,9 +30,9 @@ from numpy.typing import NDArray
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
-from vtbdrake_diagrams.forest.detections import Detector, Wood
-from vtbdrake_diagrams.forest.recordings import FOLDER, rioja, stems
-from vtbdrake_diagrams.forest.stand import KINDS, MAPS, Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
+from vtbdrake_diagrams.forest.studies.recordings import FOLDER, rioja, stems
+from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, Stand
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Which height of the scanner and which number of beams give the least error of the position?
 
-``python -m vtbdrake_diagrams.forest.scanner_choice [--full]`` compares them in the finished testbed: in the same
-forests, on the same drives, with as many rays per second. It prints the errors over the grid, and draws them.
+``python -m vtbdrake_diagrams.forest.studies.scanner_choice [--full]`` compares them in the finished testbed: in the
+same forests, on the same drives, with as many rays per second. It prints the errors over the grid, and draws them.
 
 To avoid bias, these were fixed before the first result was seen: the grid; the forests, whose seeds begin at `SEED`;
 the duration of a drive (`HORIZON`); and the criterion, the error of the present position, averaged over time and
@@ -159,6 +159,6 @@ def main(full: bool, figure: str) -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.forest.scanner_choice import main as program
+    from vtbdrake_diagrams.forest.studies.scanner_choice import main as program
 
-    program(prog_name="python -m vtbdrake_diagrams.forest.scanner_choice")
+    program(prog_name="python -m vtbdrake_diagrams.forest.studies.scanner_choice")

@@ -1,6 +1,6 @@
 """Trials of global localization: how often a place is recognized on a map without a guess, and how often wrongly.
 
-``python -m vtbdrake_diagrams.forest.trials [--trials N] [--seed S]`` draws stands, maps with errors and places,
+``python -m vtbdrake_diagrams.forest.studies.trials [--trials N] [--seed S]`` draws stands, maps with errors and places,
 simulates the detections (`detections`), and prints a table: how often the matching of constellations was sure and
 right, sure and wrong, or not sure, with its errors, consistency and time.
 
@@ -30,8 +30,8 @@ from vtbdrake.cli.output import table
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, wrap
-from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, gathered
-from vtbdrake_diagrams.forest.stand import MAPS, Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, gathered
+from vtbdrake_diagrams.forest.world.stand import MAPS, Stand
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Trials of the detection of trunks by stereo: its errors in pixels, and their consistency with the covariances.
 
-``python -m vtbdrake_diagrams.forest.stereo_trials [--forests N] [--views N] [--seed S]`` takes pairs of images along
-the routes of forests, detects trunks in them, compares each with the tree that fits best by the covariance of the
+``python -m vtbdrake_diagrams.forest.studies.stereo_trials [--forests N] [--views N] [--seed S]`` takes pairs of images
+along the routes of forests, detects trunks in them, compares each with the tree that fits best by the covariance of the
 detection, and prints a table by distance. A detection with a squared error of more than 25 (of 2 degrees of freedom)
 counts as false: it shows a crown, or several trees. The constants of `StereoTrunkDetector` were calibrated with forests
 of other seeds.
@@ -24,9 +24,9 @@ from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera
 from vtbdrake.state.systems import pose_to_array
-from vtbdrake_diagrams.forest.carrier import Carrier, standing_pose
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
+from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
 
 Array = NDArray[np.float64]
 

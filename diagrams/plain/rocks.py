@@ -19,9 +19,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from vtbdrake.components.meshes import Surface, copies, unit_sphere
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
-from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.routes import Route, distances, strip_roads
-from vtbdrake_diagrams.forest.stand import MapErrors, surveyed
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
+from vtbdrake_diagrams.forest.world.stand import MapErrors, surveyed
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ To check the choice, every route is driven in the true forest once, and the dete
 odometry. On these drives, units localize with many surveys of the same forest: with the map in use, by which the
 carrier has chosen, and with `SURVEYS` others, which the choice did not use.
 
-``python -m vtbdrake_diagrams.forest.next_route [--forests N]`` prints, for each forest, the expected and the true
-errors of all routes, and in the end the gains of the choices. The criteria were fixed before any forest from `SEED` on
-was driven:
+``python -m vtbdrake_diagrams.forest.studies.next_route [--forests N]`` prints, for each forest, the expected and the
+true errors of all routes, and in the end the gains of the choices. The criteria were fixed before any forest from
+`SEED` on was driven:
 
 * The error of a route is the root mean square of the error of the position over the last `COUNTED` s of its drive and
   over the other surveys. With one map, it is a single draw of that map's errors, and draws differ by more than routes.
@@ -36,9 +36,9 @@ from vtbdrake.cli.output import table
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
-from vtbdrake_diagrams.forest.drives import Track, localize, recorded_drive
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.studies.drives import Track, localize, recorded_drive
+from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 
 Array = NDArray[np.float64]
 
@@ -265,6 +265,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.forest.next_route import main as program
+    from vtbdrake_diagrams.forest.studies.next_route import main as program
 
     program()

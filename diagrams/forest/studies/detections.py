@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
-from vtbdrake_diagrams.forest.stand import Stand
+from vtbdrake_diagrams.forest.world.stand import Stand
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,8 @@ from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.forest.dps import PERIOD
-from vtbdrake_diagrams.forest.drives import (
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     REACH,
     SEED,
@@ -23,8 +24,7 @@ from vtbdrake_diagrams.forest.drives import (
     least_error_along,
     scores,
 )
-from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.stand import MAPS
+from vtbdrake_diagrams.forest.world.stand import MAPS
 
 CYCLES = 150
 """The number of cycles of the loop in lock-step with the process that sends the sensors' data."""

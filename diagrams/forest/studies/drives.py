@@ -1,9 +1,9 @@
 """Drives through many forests: the errors of the localization unit with each of the three maps.
 
-``python -m vtbdrake_diagrams.forest.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each forest
-once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one unit per
-map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the scanner,
-``--simulated`` takes simulated detections (`detections`), ``--plain`` drives among rocks instead of trees.
+``python -m vtbdrake_diagrams.forest.studies.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each
+forest once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one
+unit per map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the
+scanner, ``--simulated`` takes simulated detections (`detections`), ``--plain`` drives among rocks instead of trees.
 
 The criteria, fixed before any of the forests from `SEED` on was driven:
 
@@ -36,11 +36,11 @@ from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit
-from vtbdrake_diagrams.forest.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.perception import SETTLED
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
-from vtbdrake_diagrams.forest.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
+from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ SCANS = 5.0
 DENSITIES = (605.0, 1210.0)
 """The numbers of trees per hectare of the plots that `stand` cites, before roads are cleared."""
 ABUNDANCES = (0.03, 0.1)
-"""The shares of the ground that rocks cover: InSight's to twice Spirit's, see `vtbdrake_diagrams.forest.plain`."""
+"""The shares of the ground that rocks cover: InSight's to twice Spirit's, see `vtbdrake_diagrams.plain.rocks`."""
 SOURCES = {
     "scanner": "a scanner in a forest (the default)",
     "stereo": "a pair of cameras instead of a scanner",
@@ -567,6 +567,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its classes.
-    from vtbdrake_diagrams.forest.drives import main as program
+    from vtbdrake_diagrams.forest.studies.drives import main as program
 
     program()

@@ -1,7 +1,8 @@
 """The driver's display: map, pose, covariance, landmarks and status of a running localization unit, live in Meshcat.
 
-``python -m vtbdrake_diagrams.forest.display SCENARIO --url URL`` is a process of its own. It watches the live values of
-a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and takes the map from the scenario.
+``python -m vtbdrake_diagrams.forest.pictures.display SCENARIO --url URL`` is a process of its own. It watches the live
+values of a loop that runs by ``vtbdrake run`` (or `Scenario.deploy` with ``live=True``), and takes the map from the
+scenario.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.components.meshes import Surface, copies, unit_cone, unit_sphere
 from vtbdrake.components.world_model import WorldModel
-from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.world.ground import Ground
 
 Array = NDArray[np.float64]
 

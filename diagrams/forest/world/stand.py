@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
-from vtbdrake_diagrams.forest.routes import Route, distances, strip_roads
+from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The simulated world as geometry of a plant: forest or plain, on uneven ground."""
+"""The simulated world as geometry of a plant: a forest on uneven ground."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from vtbdrake.components.meshes import Surface, surface_mesh
 from vtbdrake.components.textures import grain, tiled_mesh
-from vtbdrake_diagrams.forest.ground import Ground
-from vtbdrake_diagrams.forest.plain import RockField, rock_surface
-from vtbdrake_diagrams.forest.stand import Stand
-from vtbdrake_diagrams.forest.vegetation import Vegetation, branches, crowns, trunks, undergrowth
+from vtbdrake_diagrams.forest.world.ground import Ground
+from vtbdrake_diagrams.forest.world.stand import Stand
+from vtbdrake_diagrams.forest.world.vegetation import Vegetation, branches, crowns, trunks, undergrowth
 
 Array = NDArray[np.float64]
 
@@ -29,7 +28,7 @@ _MARGIN = 15.0
 # The extents of grained images in m: of bark, which is stretched upwards, and of everything else.
 _BARK_TILE, _TILE = (2.0, 40.0), (5.0, 5.0)
 
-_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
+_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES = (
     np.array(color)
     for color in (
         (0.35, 0.3, 0.2, 1.0),
@@ -37,8 +36,6 @@ _SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES, _SAND, _STONE = (
         (0.15, 0.32, 0.17, 1.0),
         (0.4, 0.37, 0.33, 1.0),
         (0.3, 0.5, 0.2, 1.0),
-        (0.6, 0.42, 0.28, 1.0),
-        (0.42, 0.32, 0.26, 1.0),
     )
 )
 
@@ -82,20 +79,6 @@ def add_ground(
     """Register the ground of an area from (0, 0) to (length, width) in m, and some around it, like `add_surface`."""
     lower, upper = np.full(2, -_MARGIN), np.array([length, width]) + _MARGIN
     add_surface(plant, "ground", ground.mesh(lower, upper), color, tile=tile)
-
-
-def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> None:
-    """Register rocks on their ground on the world body of a plant, like `add_forest`; nothing collides with them.
-
-    Args:
-        plant: A plant that is registered with a SceneGraph, and not finalized.
-        rock_field: The rocks.
-        ground: The ground.
-    """
-    add_ground(plant, ground, length=rock_field.length, width=rock_field.width, color=_SAND)
-    rocks = rock_field.rocks()
-    if len(rocks):
-        add_surface(plant, "rocks", rock_surface(rocks, ground), _STONE)
 
 
 def add_forest(

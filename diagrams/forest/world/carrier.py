@@ -51,7 +51,7 @@ from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import discrete_state, parameter
 from vtbdrake.state.declarations import NO_DICT, weakly
-from vtbdrake_diagrams.forest.ground import Ground
+from vtbdrake_diagrams.forest.world.ground import Ground
 
 Array = NDArray[np.float64]
 

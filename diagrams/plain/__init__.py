@@ -1,0 +1,1 @@
+"""A planetary plain with rocks, on which the carrier of the forest localizes itself."""
