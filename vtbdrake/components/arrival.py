@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, EventStatus, State
 
-from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.codecs import codec_of
-from vtbdrake.state.declarations import NO_DICT
 
 
-class Arrival(LeafSystem):
+class Arrival(AddressedSystem):
     """Holds the newest sample of an abstract signal, with its number and the time at which it was taken.
 
     .. pydrake_system::
@@ -40,8 +39,6 @@ class Arrival(LeafSystem):
     the next: its age is one period, plus the latency of the sensor.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, model_value: Any, *, period: float, age: float) -> None:
         """Declare the system.
 
@@ -61,16 +58,12 @@ class Arrival(LeafSystem):
         self._codec = codec_of(model_value, varying=True)
         self._signal = self.DeclareAbstractInputPort("signal", Value(model_value))
         sample = self.DeclareAbstractState(Value(model_value))
-        time, number = (self.DeclareDiscreteState(1) for _ in range(2))
-        for name, index in {"sample": sample, "time": time, "number": number}.items():
+        self._time = self.declare_discrete_state(time=Quantity(0.0, "s"))
+        self._number = self.declare_discrete_state(number=Quantity(0.0, bounds=(0.0, inf)))
+        for name, index in {"sample": sample, "time": self._time.index, "number": self._number.index}.items():
             self.DeclareStateOutputPort(name, index)
-        self._sample, self._time, self._number = int(sample), int(time), int(number)
-        self.DeclareNumericParameter(BasicVector([age]))
-        self.variables = (
-            discrete_state("time", self._time, unit="s"),
-            discrete_state("number", self._number, bounds=(0.0, inf)),
-            parameter("age", 0, unit="s", bounds=(0.0, 60.0)),
-        )
+        self._sample = int(sample)
+        self._settings = self.declare_parameters(age=Quantity(age, "s", (0.0, 60.0)))
         self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
@@ -78,11 +71,10 @@ class Arrival(LeafSystem):
         value = self._signal.Eval(context)
         if self._is_same(value, context.get_abstract_state(self._sample).get_value()):
             return EventStatus.DidNothing()
-        age = float(context.get_numeric_parameter(0).value()[0])
         state.get_mutable_abstract_state(self._sample).set_value(value)
         numbers = state.get_mutable_discrete_state()
-        numbers.set_value(self._time, [max(context.get_time() - age, 0.0)])
-        numbers.set_value(self._number, context.get_discrete_state(self._number).value() + 1.0)
+        self._time.mutable(numbers).time = max(context.get_time() - self._settings.view(context).age, 0.0)
+        self._number.mutable(numbers).number += 1.0
         return EventStatus.Succeeded()
 
     def _is_same(self, one: Any, other: Any) -> bool:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vtbdrake.components.environment.light import light_sources
+from vtbdrake.components.environment.light import LIGHT, light_sources
 
 if TYPE_CHECKING:
     from pydrake.geometry import GeometryVersion, QueryObject, RenderEngine, SceneGraphInspector
@@ -86,12 +86,12 @@ class Illumination:
     @property
     def shadows(self) -> bool:
         """Return whether the sun throws shadows."""
-        return bool(self.light) and self.light[14] >= 0.5
+        return bool(self.light) and LIGHT.view(np.asarray(self.light)).shadows >= 0.5
 
     @property
     def fills(self) -> bool:
         """Return whether there is light beside the sun's."""
-        return (bool(self.light) and self.light[10] > 0.0) or self.lamp > 0.0
+        return (bool(self.light) and LIGHT.view(np.asarray(self.light)).earth_shine > 0.0) or self.lamp > 0.0
 
     def renderer(self, name: str) -> RenderEngine:
         """Return one of Drake's VTK renderers, without a display: `SUN` in sunlight, `FILL` in all other light."""
@@ -104,8 +104,8 @@ class Illumination:
         lights = [sun] if name == SUN else fill or [LightParameter(intensity=0.0)]
         for light in lights:
             light.intensity *= self.exposure
-        background = np.asarray(self.light[11:14] if self.light else sky) if name == SUN else np.zeros(3)
-        shown = np.minimum(self.exposure * background, 1.0)
+        background = LIGHT.view(np.asarray(self.light)).background if self.light else np.asarray(sky)
+        shown = np.minimum(self.exposure * background, 1.0) if name == SUN else np.zeros(3)
         return MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL", lights=lights, default_clear_color=shown))
 
 

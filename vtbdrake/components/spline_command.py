@@ -6,17 +6,16 @@ from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.spline import Spline
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 
 # In seconds: a plan that begins at k * period begins at the sample of that number, however both are rounded.
 _ROUNDING = 1e-9
 
 
-class SplineCommand(LeafSystem):
+class SplineCommand(AddressedSystem):
     """Follows a plan: a spline over time whose knots are decided while it runs.
 
     .. pydrake_system::
@@ -34,8 +33,6 @@ class SplineCommand(LeafSystem):
 
     Before t_begin the value does not change. After the end of the plan it is the last one, or ``after``.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -72,10 +69,9 @@ class SplineCommand(LeafSystem):
         _ = spline.pieces
         self._after = None if after is None else _vector("after", after, self._size)
         self._plan = self.DeclareVectorInputPort("plan", 1 + spline.knots * self._size)
-        value = self.DeclareDiscreteState(_vector("initial", initial, self._size))
-        self.DeclareStateOutputPort("value", value)
-        shape = () if self._size == 1 else (self._size,)
-        self.variables = (discrete_state("value", int(value), shape=shape, unit=unit),)
+        first = _vector("initial", initial, self._size)
+        self._value = self.declare_discrete_state(value=Quantity(first if size > 1 else first.item(), unit))
+        self.DeclareStateOutputPort("value", self._value.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
@@ -85,10 +81,11 @@ class SplineCommand(LeafSystem):
         t = context.get_time() - float(plan[0])
         if t < -_ROUNDING:
             return
+        value = np.asarray(self._value.mutable(state))
         if t > spline.duration + _ROUNDING and self._after is not None:
-            state.set_value(0, self._after)
+            value[:] = self._after
         else:
-            spline.write_value(min(max(t, 0.0), spline.duration), plan[1:], state.get_mutable_value(0))
+            spline.write_value(min(max(t, 0.0), spline.duration), plan[1:], value)
 
 
 def _vector(name: str, value: ArrayLike, size: int) -> np.ndarray:

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, State
+from pydrake.systems.framework import Context, State
 
 from vtbdrake.reasoning.belief import Belief, BeliefError
 from vtbdrake.reasoning.decision import Budget
 from vtbdrake.reasoning.reasoner import Reasoner, SearchConfig
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import Quantity
 from vtbdrake.testbed import Scenario, SlowPart, slow_parts
 from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.slow_part import SlowFunction
@@ -98,8 +97,6 @@ class OnboardReasoner(SlowPart):
             before a decision is shown, or see `SlowPart`.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self,
         size: int,
@@ -148,15 +145,12 @@ class OnboardReasoner(SlowPart):
             samples_dps=True,
         )
         self.mental = mental
-        sizes = {_CANDIDATE: size, **believed}
-        groups = {name: self.DeclareNumericParameter(BasicVector(np.zeros(n))) for name, n in sizes.items()}
-        self._candidate = groups[_CANDIDATE]
-        self._candidate_at = self.DeclareNumericParameter(BasicVector([-inf]))
-        self.variables = (
-            *self.variables,
-            *(parameter(name, groups[name], shape=() if n == 1 else (n,)) for name, n in sizes.items()),
-            parameter(_CANDIDATE_AT, self._candidate_at, unit="s"),
-        )
+        parameters = {
+            name: Quantity(np.zeros(n) if n > 1 else 0.0) for name, n in {_CANDIDATE: size, **believed}.items()
+        }
+        parameters[_CANDIDATE_AT] = Quantity(-inf, "s")
+        groups = {name: self.declare_parameters(**{name: quantity}) for name, quantity in parameters.items()}
+        self._candidate, self._candidate_at = groups[_CANDIDATE], groups[_CANDIDATE_AT]
 
     def function_beside(self, period: float) -> SlowFunction:
         return replace(self.function, function=self._decider.limited(_SHARE * (self.latency - period)))
@@ -173,11 +167,11 @@ class OnboardReasoner(SlowPart):
             return
         tick = self._tick(context, self.latency)
         if self._is_for_candidate(tick, context):
-            self._show_vectors(state, tick, {_DECISION: context.get_numeric_parameter(self._candidate).value()})
+            self._show_vectors(state, tick, {_DECISION: np.asarray(self._candidate.view(context))})
 
     def _is_for_candidate(self, tick: int, context: Context) -> bool:
         """Return whether the candidate of the rollout is the result of sample number ``tick``."""
-        (at,) = context.get_numeric_parameter(self._candidate_at).value()
+        at = self._candidate_at.view(context).candidate_at
         return bool(abs(at - self.offset - tick * self.period) < 0.5 * self.period)
 
 

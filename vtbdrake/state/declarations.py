@@ -63,7 +63,7 @@ class Quantity:
 class NamedView:
     """The quantities of one array as attributes: numbers as float, others as views of their shape.
 
-    It is made by `NamedVector.view`. What is assigned is written to the array.
+    It is made by `NamedVector.view`. What is assigned is written to the array, which ``np.asarray(view)`` returns.
     """
 
     __slots__ = ("_array",)
@@ -160,8 +160,6 @@ def _accessor(start: int, shape: tuple[int, ...]) -> property:
 class _Group:
     """A numeric group of a system's Context whose quantities have names."""
 
-    __slots__ = ("_number", "_view", "vector")
-
     def __init__(self, vector: NamedVector, number: int) -> None:
         self.vector = vector
         self._number = number
@@ -173,14 +171,12 @@ class ParameterGroup(_Group):
 
     Attributes:
         vector: Names, defaults and layout.
+        index: Drake's index of the group.
     """
 
-    __slots__ = ()
-
-    @property
-    def index(self) -> NumericParameterIndex:
-        """Return Drake's index of the group."""
-        return NumericParameterIndex(self._number)
+    def __init__(self, vector: NamedVector, number: int) -> None:
+        super().__init__(vector, number)
+        self.index = NumericParameterIndex(number)
 
     def view(self, context: Context) -> NamedView:
         """Return the values in the system's own context by name, to be read."""
@@ -196,14 +192,12 @@ class DiscreteGroup(_Group):
 
     Attributes:
         vector: Names, defaults and layout.
+        index: Drake's index of the group.
     """
 
-    __slots__ = ()
-
-    @property
-    def index(self) -> DiscreteStateIndex:
-        """Return Drake's index of the group."""
-        return DiscreteStateIndex(self._number)
+    def __init__(self, vector: NamedVector, number: int) -> None:
+        super().__init__(vector, number)
+        self.index = DiscreteStateIndex(number)
 
     def view(self, context: Context) -> NamedView:
         """Return the values in the system's own context by name, to be read."""
@@ -224,14 +218,12 @@ class ContinuousGroup(_Group):
 
     Attributes:
         vector: Names, defaults and layout; ``derivatives.SetFromVector(group.vector.array(...))`` sets derivatives.
+        index: Drake's index of the group.
     """
 
-    __slots__ = ()
-
-    @property
-    def index(self) -> ContinuousStateIndex:
-        """Return Drake's index of the group."""
-        return ContinuousStateIndex(self._number)
+    def __init__(self, vector: NamedVector, number: int) -> None:
+        super().__init__(vector, number)
+        self.index = ContinuousStateIndex(number)
 
     def view(self, context: Context) -> NamedView:
         """Return a copy of the values in the system's own context by name."""

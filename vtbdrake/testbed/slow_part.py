@@ -9,12 +9,13 @@ from math import ceil, inf
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import Context, Diagram, InputPort, LeafSystem, State
+from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, InputPort, State
 
-from vtbdrake.state import Codec, discrete_state
+from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.codecs import array_codec, codec_of
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state.declarations import weakly
 from vtbdrake.state.systems import leaves
 from vtbdrake.testbed.dps_state import DPS_STATE_CODEC, DpsReader, RootReference
 
@@ -226,7 +227,7 @@ _REQUEST, _TAKEN, _DPS = "request", "taken", "dps"
 _RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED, _REQUEST, _TAKEN, _DPS)
 
 
-class SlowPart(LeafSystem):
+class SlowPart(AddressedSystem):
     """A part of a DPS that takes longer than a cycle of the loop: perception, a planner, a localization.
 
     .. pydrake_system::
@@ -282,8 +283,6 @@ class SlowPart(LeafSystem):
             DPS, more than one), or a value has no codec.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self,
         function: Callable[..., Any],
@@ -328,22 +327,24 @@ class SlowPart(LeafSystem):
         self._root = self._declare_input(_DPS, RootReference()) if samples_dps else None
         self._read_dps: DpsReader | None = None
         sizes = {name: model for name, model in outputs.items() if _is_size(model)}
-        self._vectors = {name: self.DeclareDiscreteState(shown.pop(name)) for name in sizes}
-        told = {_SAMPLED_AT: -inf, _VALID: 0.0, _MISSED: 0.0, **({_TAKEN: 0.0} if on_request else {})}
-        self._told = {name: self.DeclareDiscreteState([value]) for name, value in told.items()}
+        vectors = {name: Quantity(shown.pop(name) if n > 1 else shown.pop(name).item()) for name, n in sizes.items()}
+        report = {
+            _SAMPLED_AT: Quantity(-inf, "s"),
+            _VALID: Quantity(0.0, bounds=(0.0, 1.0)),
+            _MISSED: Quantity(0.0, bounds=(0.0, inf)),
+            **({_TAKEN: Quantity(0.0)} if on_request else {}),
+        }
+        self._vectors = tuple(vectors)
+        self._indices = {
+            name: int(self.declare_discrete_state(**{name: quantity}).index)
+            for name, quantity in {**vectors, **report}.items()
+        }
         self._progress = self.DeclareAbstractState(Value(Progress(shown, remembers)))
         for name, model in outputs.items():
             if name not in sizes:
                 self._declare_abstract_output(name, model)
-        for name, index in {**self._vectors, **self._told}.items():
-            self.DeclareStateOutputPort(name, index)
-        self.variables = (
-            *(discrete_state(name, self._vectors[name], shape=() if n == 1 else (n,)) for name, n in sizes.items()),
-            discrete_state(_SAMPLED_AT, self._told[_SAMPLED_AT], unit="s"),
-            discrete_state(_VALID, self._told[_VALID], bounds=(0.0, 1.0)),
-            discrete_state(_MISSED, self._told[_MISSED], bounds=(0.0, inf)),
-            *(discrete_state(name, self._told[name]) for name in (_TAKEN,) if on_request),
-        )
+        for name, index in self._indices.items():
+            self.DeclareStateOutputPort(name, DiscreteStateIndex(index))
         self.codecs = {int(self._progress): PROGRESS_CODEC}
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, max(0.0, offset - _EARLY), self._sample)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency - _SHOWN_EARLY, self._show)
@@ -386,12 +387,12 @@ class SlowPart(LeafSystem):
     def _is_wanted(self, context: Context, progress: Progress) -> bool:
         if self._request is None:
             return True
-        request, taken = self._request.Eval(context)[0], context.get_discrete_state(self._told[_TAKEN]).value()[0]
+        request, taken = self._request.Eval(context)[0], self._number(context, _TAKEN)
         return abs(request) > 0.0 and request != taken and not progress.under_way  # NaN is no request.
 
     def _take_request(self, context: Context, state: State) -> None:
         assert self._request is not None
-        state.get_mutable_discrete_state().set_value(int(self._told[_TAKEN]), self._request.Eval(context))
+        self._set_numbers(state, {_TAKEN: self._request.Eval(context)})
 
     def _root_of(self, context: Context) -> Context:
         assert self._root is not None
@@ -414,8 +415,7 @@ class SlowPart(LeafSystem):
             self._show_vectors(state, tick, {name: outputs.pop(name) for name in self._vectors})
             progress = progress.after(work, shown=outputs)
         else:
-            missed = context.get_discrete_state(self._told[_MISSED]).value()
-            self._set_numbers(state, {self._told[_MISSED]: missed + 1.0, self._told[_VALID]: [0.0]})
+            self._set_numbers(state, {_MISSED: [self._number(context, _MISSED) + 1.0], _VALID: [0.0]})
             progress = progress.after(work, shown=progress.shown)
         value.set_value(progress)
 
@@ -425,14 +425,14 @@ class SlowPart(LeafSystem):
 
     def _show_vectors(self, state: State, tick: int, vectors: Arrays) -> None:
         """Show vector outputs of the result of sample number ``tick``."""
-        numbers: dict[Any, Any] = {self._vectors[name]: vector for name, vector in vectors.items()}
-        numbers |= {self._told[_SAMPLED_AT]: [self.offset + tick * self.period], self._told[_VALID]: [1.0]}
-        self._set_numbers(state, numbers)
+        self._set_numbers(state, {**vectors, _SAMPLED_AT: [self.offset + tick * self.period], _VALID: [1.0]})
 
-    @staticmethod
-    def _set_numbers(state: State, numbers: Mapping[Any, Any]) -> None:
-        for index, number in numbers.items():
-            state.get_mutable_discrete_state().set_value(int(index), number)
+    def _number(self, context: Context, name: str) -> float:
+        return float(context.get_discrete_state(self._indices[name]).value()[0])
+
+    def _set_numbers(self, state: State, numbers: Mapping[str, ArrayLike]) -> None:
+        for name, number in numbers.items():
+            state.get_mutable_discrete_state().set_value(self._indices[name], number)
 
     # -- the state of the whole DPS, for a part that samples it
 
@@ -500,7 +500,7 @@ class SlowPart(LeafSystem):
         if memory.keys() not in (set(), whole_memory) or outputs.keys() not in (set(), whole_outputs):
             expected = ", ".join(sorted(self.function.makes))
             raise SlowPartError(f"the result of a slow part has the arrays {expected}, not {', '.join(arrays)}")
-        for name in self._vectors.keys() & outputs.keys():
+        for name in outputs.keys() & self._vectors:
             size = self.GetOutputPort(name).size()
             if arrays[name].shape != (size,):
                 raise SlowPartError(f"the result {name} has {size} entries, not the shape {arrays[name].shape}")

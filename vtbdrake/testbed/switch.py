@@ -16,7 +16,6 @@ from pydrake.systems.framework import (
     DiagramBuilder,
     InputPort,
     InputPortIndex,
-    LeafSystem,
     LeafSystem_,
     OutputPort,
     System,
@@ -25,7 +24,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Adder, ConstantValueSource, Gain, PortSwitch
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from vtbdrake.state.declarations import DISCRETE, NO_DICT, Codec, Element, weakly
+from vtbdrake.state.declarations import DISCRETE, NO_DICT, AddressedSystem, Codec, Element, weakly
 from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variables import Variable, VariableError, X
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
@@ -364,7 +363,7 @@ class ActuatorCommand:
     value: Any = None
 
 
-class AbstractSwitch(LeafSystem):
+class AbstractSwitch(AddressedSystem):
     """A PortSwitch for abstract values, which pydrake binds for vectors only. It evaluates the selected input alone.
 
     .. pydrake_system::
@@ -379,8 +378,6 @@ class AbstractSwitch(LeafSystem):
         - value
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, signal: Signal, count: int) -> None:
         super().__init__()
         self._selector = self.DeclareAbstractInputPort("port_selector", Value(InputPortIndex(1)))
@@ -389,7 +386,7 @@ class AbstractSwitch(LeafSystem):
         self.DeclareAbstractOutputPort(
             "value",
             signal.abstract_value,
-            weakly(self, AbstractSwitch._calc),
+            self._calc,
             prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 
@@ -398,7 +395,7 @@ class AbstractSwitch(LeafSystem):
         output.SetFrom(self.EvalAbstractInput(context, int(selected)))
 
 
-class ActuatorGate(LeafSystem):
+class ActuatorGate(AddressedSystem):
     """A gate before the real port of an abstract actuator signal, with an `ActuatorCommand` as output.
 
     The command is empty while the switch is at port ``closed``.
@@ -413,8 +410,6 @@ class ActuatorGate(LeafSystem):
         - value
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, signal: Signal, *, closed: InputPortIndex) -> None:
         super().__init__()
         self._closed = closed
@@ -423,7 +418,7 @@ class ActuatorGate(LeafSystem):
         self.DeclareAbstractOutputPort(
             "value",
             lambda: Value(ActuatorCommand()),
-            weakly(self, ActuatorGate._calc),
+            self._calc,
             prerequisites_of_calc={self.all_input_ports_ticket()},
         )
 

@@ -138,6 +138,7 @@ def test_every_value_is_a_variable() -> None:
         "torque",
         "motor_torque",
         "reference",
+        "in_transit",
         "limit",
         "rate",
         "viscous",
@@ -145,7 +146,6 @@ def test_every_value_is_a_variable() -> None:
         "coulomb_velocity",
         "time_constant",
         "delay",
-        "in_transit",
     ]
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING
 
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Kernel, clamp
-from vtbdrake.state import Element, discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 _TINY = float(np.finfo(float).tiny)
 
 
-class JointDrives(LeafSystem):
+class JointDrives(AddressedSystem):
     r"""Motors with current loops behind backlash-free gears, one for each of some joints.
 
     .. pydrake_system::
@@ -53,8 +52,6 @@ class JointDrives(LeafSystem):
 
     All values are parameters of the Context, by address; ``delay`` counts whole periods, up to ``max_delay``.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -113,14 +110,19 @@ class JointDrives(LeafSystem):
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
-        torque = self.DeclareDiscreteState(before)
-        self.DeclareStateOutputPort("torque", torque)
+        self._torque = self.declare_discrete_state(torque=Quantity(before, "N m"))
+        self.DeclareStateOutputPort("torque", self._torque.index)
         # One group for all internal state: every group costs more than the arithmetic.
-        memory = self.DeclareDiscreteState(np.tile(before, 2 + self._max_delay))
-        values = [*np.concatenate(list(entries.values())), float(time_constant), float(delay)]
-        parameters = self.DeclareNumericParameter(BasicVector(values))
-        self._torque, self._memory, self._parameters = int(torque), int(memory), int(parameters)
-        self.variables = tuple(self._elements())
+        memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
+        if self._max_delay:
+            memory["in_transit"] = Quantity(np.tile(before, (self._max_delay, 1)), "N m")
+        self._memory = self.declare_discrete_state(**memory)
+        units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
+        self._settings = self.declare_parameters(
+            **{name: Quantity(value, units[name], (0.0, inf)) for name, value in entries.items()},
+            time_constant=Quantity(time_constant, "s", (0.0, inf)),
+            delay=Quantity(delay, "period", (0.0, float(self._max_delay))),
+        )
         velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
         self._kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
@@ -128,33 +130,21 @@ class JointDrives(LeafSystem):
     def resume(self, context: Context, command: ArrayLike) -> None:
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""
         torque = np.asarray(command, dtype=float)
-        context.SetDiscreteState(self._torque, torque)
-        context.SetDiscreteState(self._memory, np.tile(torque, 2 + self._max_delay))
-
-    def _elements(self) -> Iterator[Element]:
-        n, index = self._n, self._parameters
-        yield discrete_state("torque", self._torque, shape=(n,), unit="N m")
-        yield discrete_state("motor_torque", self._memory, shape=(n,), unit="N m")
-        yield discrete_state("reference", self._memory, start=n, shape=(n,), unit="N m")
-        units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
-        for k, (name, unit) in enumerate(units.items()):
-            yield parameter(name, index, start=k * n, shape=(n,), unit=unit, bounds=(0.0, inf))
-        yield parameter("time_constant", index, start=5 * n, unit="s", bounds=(0.0, inf))
-        yield parameter("delay", index, start=5 * n + 1, unit="period", bounds=(0.0, float(self._max_delay)))
-        if self._max_delay:
-            yield discrete_state("in_transit", self._memory, start=2 * n, shape=(self._max_delay, n), unit="N m")
+        context.SetDiscreteState(self._torque.index, torque)
+        context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self._max_delay))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
-        values = context.get_numeric_parameter(self._parameters).value()
-        memory = context.get_discrete_state(self._memory).value()
+        settings, memory = self._settings.view(context), self._memory.view(context)
         u, x = self._command.Eval(context), self._state_port.Eval(context)
-        line = memory[2 * n :]
-        delay = round(float(values[-1])) if self._max_delay else 0
-        delayed = line[(delay - 1) * n : delay * n] if delay else u
-        y = self._kernel.value((values, memory[: 2 * n], delayed, x))
-        state.set_value(self._torque, y[:n])
-        state.set_value(self._memory, np.concatenate((y[n:], u, line[:-n])) if self._max_delay else y[n:])
+        delay = round(settings.delay) if self._max_delay else 0
+        delayed = memory.in_transit[delay - 1] if delay else u
+        y = self._kernel.value((np.asarray(settings), np.asarray(memory)[: 2 * n], delayed, x))
+        self._torque.mutable(state).torque = y[:n]
+        following = self._memory.mutable(state)
+        np.asarray(following)[: 2 * n] = y[n:]
+        if self._max_delay:
+            following.in_transit = np.concatenate((u[np.newaxis], memory.in_transit[:-1]))
 
 
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context
 
-from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericParameterIndex
-
-from vtbdrake.state import Element
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem, Quantity
 
 
-class Conditions(LeafSystem):
-    """Shows one numeric parameter group at its only output port.
+class Conditions(AddressedSystem):
+    """Shows a vector of parameters at its only output port.
 
-    Its named pieces are variables: a rollout changes the conditions by writing them.
+    They are variables: a rollout changes the conditions by writing them.
     """
 
-    __slots__ = NO_DICT
-
-    def __init__(self, port: str, values: Sequence[float], variables: tuple[Element, ...]) -> None:
+    def __init__(self, port: str, **quantities: Quantity) -> None:
         super().__init__()
-        index = NumericParameterIndex(self.DeclareNumericParameter(BasicVector(list(values))))
-        self.DeclareVectorOutputPort(
-            port, len(values), weakly(self, Conditions._calc), {self.numeric_parameter_ticket(index)}
-        )
-        self.variables = variables
+        self._conditions = self.declare_parameters(**quantities)
+        ticket = self.numeric_parameter_ticket(self._conditions.index)
+        self.DeclareVectorOutputPort(port, self._conditions.vector.size, self._calc, {ticket})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        values: ArrayLike = context.get_numeric_parameter(0).value()
-        output.SetFromVector(values)
+        output.SetFromVector(np.asarray(self._conditions.view(context)))

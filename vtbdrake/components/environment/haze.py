@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.environment.conditions import Conditions
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import NamedVector, Quantity
 
 # Contrast at which a black object disappears before the sky, in the definition of the visibility (Koschmieder 1924).
 _CONTRAST_THRESHOLD = 0.02
@@ -105,8 +104,6 @@ class Haze(Conditions):
     and `false_return_ranges`. Airlight is given in the brightness of a white surface that faces the sun.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self, *, extinction: float = 0.0, backscatter: float = 0.0, airlight: Sequence[float] = (0.8, 0.8, 0.8)
     ) -> None:
@@ -126,9 +123,17 @@ class Haze(Conditions):
                 "Haze: extinction, backscatter and the three entries of airlight must be finite and not negative, not "
                 f"{extinction!r}, {backscatter!r} and {airlight!r}"
             )
-        variables = (
-            parameter("extinction", 0, unit="1/m", bounds=(0.0, inf)),
-            parameter("backscatter", 0, start=1, unit="1/m", bounds=(0.0, inf)),
-            parameter("airlight", 0, start=2, shape=(3,), bounds=(0.0, inf)),
-        )
-        super().__init__("haze", values, variables)
+        super().__init__("haze", **_quantities(extinction, backscatter, airlight))
+
+
+def _quantities(extinction: float, backscatter: float, airlight: Sequence[float]) -> dict[str, Quantity]:
+    positive = (0.0, inf)
+    return {
+        "extinction": Quantity(extinction, "1/m", positive),
+        "backscatter": Quantity(backscatter, "1/m", positive),
+        "airlight": Quantity(airlight, bounds=positive),
+    }
+
+
+HAZE = NamedVector(**_quantities(0.0, 0.0, [0.0, 0.0, 0.0]))
+"""The port ``haze`` of a `Haze`; by default there is none."""

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.components.environment.conditions import Conditions
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import NamedVector, Quantity
 
 if TYPE_CHECKING:
     from pydrake.geometry import LightParameter
@@ -29,8 +28,6 @@ EARTH_RADIUS = 6.371e6
 
 # How far away the source of the earth-shine is in a renderer, in m. In VTK a point source casts no shadow.
 _FAR = 1e5
-# Entries of the port `light`.
-LIGHT_SIZE = 15
 
 
 def earth_shine(altitude: float) -> float:
@@ -95,41 +92,39 @@ class Light(Conditions):
     light by writing them, and each camera that reads the port then sets its renderer anew, before its next image.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, config: LightConfig | None = None) -> None:
         config = config or LightConfig()
         config.check()
-        values = [
-            *config.direction,
-            config.intensity,
-            *config.color,
-            *config.earth_direction,
-            config.earth_shine,
-            *config.background,
-            float(config.shadows),
-        ]
-        variables = (
-            parameter("direction", 0, shape=(3,)),
-            parameter("intensity", 0, start=3, bounds=(0.0, inf)),
-            parameter("color", 0, start=4, shape=(3,), bounds=(0.0, 1.0)),
-            parameter("earth_direction", 0, start=7, shape=(3,)),
-            parameter("earth_shine", 0, start=10, bounds=(0.0, inf)),
-            parameter("background", 0, start=11, shape=(3,), bounds=(0.0, 1.0)),
-            parameter("shadows", 0, start=14, bounds=(0.0, 1.0)),
-        )
-        super().__init__("light", values, variables)
+        super().__init__("light", **_quantities(config))
+
+
+def _quantities(config: LightConfig) -> dict[str, Quantity]:
+    share = (0.0, 1.0)
+    return {
+        "direction": Quantity(config.direction),
+        "intensity": Quantity(config.intensity, bounds=(0.0, inf)),
+        "color": Quantity(config.color, bounds=share),
+        "earth_direction": Quantity(config.earth_direction),
+        "earth_shine": Quantity(config.earth_shine, bounds=(0.0, inf)),
+        "background": Quantity(config.background, bounds=share),
+        "shadows": Quantity(float(config.shadows), bounds=share),
+    }
+
+
+LIGHT = NamedVector(**_quantities(LightConfig()))
+"""The port ``light`` of a `Light`."""
 
 
 def light_sources(light: Sequence[float]) -> list[LightParameter]:
     """Return the sources of light for a renderer, from the value of the port ``light`` of a `Light`."""
     from pydrake.geometry import LightParameter, Rgba
 
-    direction, earth_direction = _unit(light[0:3]), _unit(light[7:10])
+    values = LIGHT.view(np.asarray(light))
+    direction, earth_direction = _unit(values.direction), _unit(values.earth_direction)
     sun = LightParameter(
-        type="directional", frame="world", direction=direction, intensity=light[3], color=Rgba(*light[4:7])
+        type="directional", frame="world", direction=direction, intensity=values.intensity, color=Rgba(*values.color)
     )
-    earth = LightParameter(type="point", frame="world", position=-_FAR * earth_direction, intensity=light[10])
+    earth = LightParameter(type="point", frame="world", position=-_FAR * earth_direction, intensity=values.earth_shine)
     return [sun, earth] if earth.intensity > 0.0 else [sun]
 
 

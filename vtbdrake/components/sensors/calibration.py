@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer
 
-from vtbdrake.state import parameter
+from vtbdrake.state.declarations import PARAMETER, Element
 
 
 def make_calibration(signals: Mapping[str, int], *, largest: Mapping[str, float] | None = None) -> Diagram:
@@ -22,7 +22,7 @@ def make_calibration(signals: Mapping[str, int], *, largest: Mapping[str, float]
     raw = builder.AddNamedSystem("raw", Multiplexer(sizes))
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(sum(sizes))))
     most = np.concatenate([np.full(size, (largest or {}).get(name, np.inf)) for name, size in signals.items()])
-    offset.variables = (parameter("value", 0, shape=most.shape, bounds=(-most, most)),)
+    offset.variables = (Element("value", PARAMETER, 0, most.shape, bounds=(-most, most)),)
     measured = builder.AddNamedSystem("measured", Adder(2, sum(sizes)))
     split = builder.AddNamedSystem("split", Demultiplexer(sizes))
     builder.Connect(raw.get_output_port(), measured.get_input_port(0))

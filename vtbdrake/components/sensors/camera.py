@@ -22,24 +22,20 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     AbstractStateIndex,
-    BasicVector,
     Context,
     EventStatus,
-    LeafSystem,
     State,
-    ValueProducer,
 )
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 from scipy.ndimage import minimum_filter
 
-from vtbdrake.components.environment.haze import hazed
-from vtbdrake.components.environment.light import LIGHT_SIZE
+from vtbdrake.components.environment.haze import HAZE, hazed
+from vtbdrake.components.environment.light import LIGHT
 from vtbdrake.components.rendering import FILL, SUN, Illumination, RenderedScene, RenderingError
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream, uniform_noise
 from vtbdrake.components.shadows import sunlit
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
 if TYPE_CHECKING:
@@ -71,7 +67,7 @@ class ImagesInTransit:
         self.color.flags.writeable = self.depth.flags.writeable = False
 
 
-class Camera(LeafSystem):
+class Camera(AddressedSystem):
     r"""Takes colour images, and depth images if asked, at t = 0, T, 2 T, ... and holds them in between.
 
     .. pydrake_system::
@@ -123,8 +119,6 @@ class Camera(LeafSystem):
 
     Each Context has its own copy of the scene, with its own renderer.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -188,12 +182,10 @@ class Camera(LeafSystem):
             frame.GetFixedPoseInBodyFrame() @ (X_FC or RigidTransform()), info, errors, photon_noise
         )
         self._query_port = self.DeclareAbstractInputPort("geometry_query", Value[QueryObject]())
-        self._light_port = self.DeclareVectorInputPort("light", LIGHT_SIZE)
-        self._haze_port = self.DeclareVectorInputPort("haze", 5)
+        self._light_port = self.DeclareVectorInputPort("light", LIGHT.size)
+        self._haze_port = self.DeclareVectorInputPort("haze", HAZE.size)
         self._declare_state(depth, max(errors.latency, errors.max_latency))
-        scenes = ValueProducer(allocate=lambda: Value(object()), calc=_make_scene)
-        entry = self.DeclareCacheEntry("scene", scenes, {self.nothing_ticket()})
-        self._scene = entry.cache_index()
+        self._scene = self.declare_cache("scene", lambda context: RenderedScene(), {self.nothing_ticket()})
         self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
         self.timings = ((self._period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, self._sample)
@@ -202,22 +194,19 @@ class Camera(LeafSystem):
         self, X_PC: RigidTransform, info: CameraInfo, errors: ErrorModel, photon_noise: float
     ) -> None:
         intrinsics = [info.focal_x(), info.focal_y(), info.center_x(), info.center_y()]
-        values = [*pose_to_array(X_PC), *intrinsics, 1.0, 1.0, 0.0]
-        values += [errors.noise, photon_noise, errors.latency, errors.dropout, errors.seed]
-        index = int(self.DeclareNumericParameter(BasicVector(values)))
         largest = np.array([inf, inf, self._width, self._height])
-        longest = float(max(errors.latency, errors.max_latency))
-        self.variables = (
-            parameter("pose", index, shape=(6,), unit=POSE_UNIT),
-            parameter("intrinsics", index, start=6, shape=(4,), unit="pixel", bounds=([1.0, 1.0, 0.0, 0.0], largest)),
-            parameter("exposure", index, start=10, bounds=(0.0, inf)),
-            parameter("gain", index, start=11, bounds=(0.0, inf)),
-            parameter("lamp", index, start=12, bounds=(0.0, inf)),
-            parameter("noise", index, start=13, unit="count", bounds=(0.0, inf)),
-            parameter("photon_noise", index, start=14, unit="count", bounds=(0.0, inf)),
-            parameter("latency", index, start=15, unit="period", bounds=(0.0, longest)),
-            parameter("dropout", index, start=16, bounds=(0.0, 1.0)),
-            parameter("seed", index, start=17, bounds=(0.0, 2.0**53)),
+        longest, positive = float(max(errors.latency, errors.max_latency)), (0.0, inf)
+        self._settings = self.declare_parameters(
+            pose=Quantity(pose_to_array(X_PC), POSE_UNIT),
+            intrinsics=Quantity(intrinsics, "pixel", ([1.0, 1.0, 0.0, 0.0], largest)),
+            exposure=Quantity(1.0, bounds=positive),
+            gain=Quantity(1.0, bounds=positive),
+            lamp=Quantity(0.0, bounds=positive),
+            noise=Quantity(errors.noise, "count", positive),
+            photon_noise=Quantity(photon_noise, "count", positive),
+            latency=Quantity(errors.latency, "period", (0.0, longest)),
+            dropout=Quantity(errors.dropout, bounds=(0.0, 1.0)),
+            seed=Quantity(errors.seed, bounds=(0.0, 2.0**53)),
         )
 
     def _declare_state(self, depth: bool, longest: int) -> None:
@@ -270,35 +259,34 @@ class Camera(LeafSystem):
             depth = np.repeat(image.data[np.newaxis, ..., 0], depth.shape[0], axis=0)
         context.SetAbstractState(self._transit, ImagesInTransit(color, depth))
 
-    def _parameters(self, context: Context) -> NDArray[np.float64]:
-        values: NDArray[np.float64] = context.get_numeric_parameter(0).value()
-        return values
-
     def _see(self, context: Context) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return the expected counts before saturation, (h, w, 3), and the depth image, (h, w), if there is one."""
-        values = self._parameters(context)
+        settings = self._settings.view(context)
         light = tuple(self._light_port.Eval(context).tolist()) if self._light_port.HasValue(context) else ()
-        haze = self._haze_port.Eval(context) if self._haze_port.HasValue(context) else np.zeros(5)
-        illumination = Illumination(light, float(values[10] * values[11]), float(values[12]))
+        haze = HAZE.view(self._haze_port.Eval(context) if self._haze_port.HasValue(context) else HAZE.array())
+        illumination = Illumination(light, settings.exposure * settings.gain, settings.lamp)
         query = self._query_port.Eval(context)
-        scene: RenderedScene = self.get_cache_entry(self._scene).Eval(context)
+        scene: RenderedScene = self._scene(context)
         view = scene.view(query, illumination)
-        X_WC = _pose_of(query, self._frame_number) @ pose_from_array(values[:6])
+        X_WC = _pose_of(query, self._frame_number) @ pose_from_array(settings.pose)
         self._check_outside(view, X_WC.translation())
-        info = CameraInfo(self._width, self._height, *values[6:10])
+        info = CameraInfo(self._width, self._height, *settings.intrinsics)
         camera = _RenderCamera(scene, view, info, (self._near, self._far), X_WC, points=self._supersampling)
         # Where nothing changes a pixel that is saturated, there is no need to know how bright it is.
-        bracket = _BRACKET if illumination.shadows or haze[0] or values[13] or values[14] else ()
+        unsaturated = illumination.shadows or haze.extinction or settings.noise or settings.photon_noise
+        bracket = _BRACKET if unsaturated else ()
         expected = camera.color(SUN, bracket)
-        depth = camera.depth() if illumination.shadows or haze[0] or self._depth is not None else None
+        depth = camera.depth() if illumination.shadows or haze.extinction or self._depth is not None else None
         if depth is not None and illumination.shadows:
-            _shade(expected, camera, depth, direction=light[:3], reach=self._far)
+            direction = LIGHT.view(np.asarray(light)).direction
+            _shade(expected, camera, depth, direction=direction, reach=self._far)
         if illumination.fills:
             expected += camera.color(FILL, bracket)
-        if depth is not None and haze[0]:
+        if depth is not None and haze.extinction:
             distance = depth * np.linalg.norm(camera.rays_C, axis=0)
-            airlight = _FULL_SCALE * illumination.exposure * haze[2:]
-            expected = hazed(expected, distance=distance, extinction=haze[0], airlight=airlight).astype(np.float32)
+            airlight = _FULL_SCALE * illumination.exposure * haze.airlight
+            veiled = hazed(expected, distance=distance, extinction=haze.extinction, airlight=airlight)
+            expected = veiled.astype(np.float32)
         return expected, depth if self._depth is not None else None
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
@@ -313,10 +301,11 @@ class Camera(LeafSystem):
     def _take(self, context: Context, tick: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return the colour image of a tick with its noise, and the depth image."""
         expected, depth = self._see(context)
-        values = self._parameters(context)
-        gain, noise, photon_noise, seed = values[[11, 13, 14, 17]].tolist()
+        settings = self._settings.view(context)
+        gain, noise, photon_noise = settings.gain, settings.noise, settings.photon_noise
         if noise or photon_noise:
-            generator = noise_generator(seed=int(seed), stream=self._stream(), tick=tick, channel=_PIXEL_CHANNEL)
+            seed = int(settings.seed)
+            generator = noise_generator(seed=seed, stream=self._stream(), tick=tick, channel=_PIXEL_CHANNEL)
             sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / _FULL_SCALE * expected)
             expected += sigma * generator.standard_normal(expected.shape, np.float32)
         return _counts(expected), np.zeros((0, 0), np.float32) if depth is None else depth
@@ -337,16 +326,17 @@ class Camera(LeafSystem):
     def _sample(self, context: Context, state: State) -> EventStatus:
         tick = self._tick(context)
         color, depth = self._take(context, tick)
-        latency, dropout, seed = self._parameters(context)[15:18].tolist()
+        settings = self._settings.view(context)
         if self._transit is not None:
             transit = context.get_abstract_state(int(self._transit)).get_value()
             colors = np.concatenate((color[np.newaxis], transit.color))
             depths = np.concatenate((depth[np.newaxis], transit.depth))
-            color, depth = colors[round(latency)], depths[round(latency)]
+            latency = round(settings.latency)
+            color, depth = colors[latency], depths[latency]
             images = ImagesInTransit(colors[:-1], depths[:-1])
             state.get_mutable_abstract_state(int(self._transit)).set_value(images)
-        if not dropout or dropout <= uniform_noise(
-            seed=int(seed), stream=self._stream(), tick=tick, channel=_DROPOUT_CHANNEL
+        if not settings.dropout or settings.dropout <= uniform_noise(
+            seed=int(settings.seed), stream=self._stream(), tick=tick, channel=_DROPOUT_CHANNEL
         ):
             self._show(state, color, depth)
         return EventStatus.Succeeded()
@@ -370,10 +360,6 @@ def connect_camera(
     for name, system in (("light", light), ("haze", haze)):
         if system is not None:
             builder.Connect(system.GetOutputPort(name), camera.GetInputPort(name))
-
-
-def _make_scene(context: Context, value: Value) -> None:
-    value.set_value(RenderedScene())
 
 
 def _pose_of(query: QueryObject, frame_number: int) -> RigidTransform:

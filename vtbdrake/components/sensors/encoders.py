@@ -11,7 +11,6 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state.declarations import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
 
 class _JointSensor(SampledSensor):
     """Measures one entry of the plant's [q; v] for each of some joints."""
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -60,8 +57,6 @@ class JointEncoders(_JointSensor):
     ``joints``. Before the first sample it shows the plant's default positions.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self,
         plant: MultibodyPlant,
@@ -94,8 +89,6 @@ class JointTachometers(_JointSensor):
     ``state`` is the plant's [q; v]; ``joint_velocity`` holds one velocity (rad/s or m/s) per joint, in the order of
     ``joints``. Before the first sample it shows zeros.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,

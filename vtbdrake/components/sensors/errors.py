@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import inf, isfinite, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-    NumericParameterIndex,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.noise import normal_noise, random_stream, uniform_noise
 from vtbdrake.components.settings import check_settings
-from vtbdrake.state import Element, discrete_state, parameter
-from vtbdrake.state.declarations import weakly
+from vtbdrake.state import AddressedSystem, Quantity
 
 # Channels of a sensor's stream; 0 is its white noise.
 _DRIFT_CHANNEL, _DROPOUT_CHANNEL, _OUTLIER_CHANNEL, _OUTLIER_SIZE_CHANNEL = 1, 2, 3, 4
@@ -123,16 +114,14 @@ def _unless_zero(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 class ErrorStage:
     """The errors of a sensor, in its Context.
 
-    Attributes:
-        variables: The parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also
-            ``bias``, ``drift``, ``quantization`` (one per entry), ``latency``, ``dropout``, ``outlier_probability``
-            and ``outlier_size``, and the state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown,
-            newest first).
+    It declares the parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also ``bias``,
+    ``drift``, ``quantization`` (one per entry), ``latency``, ``dropout``, ``outlier_probability`` and ``outlier_size``,
+    and the state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown, newest first).
     """
 
     def __init__(
         self,
-        sensor: LeafSystem,
+        sensor: AddressedSystem,
         model: ErrorModel | None,
         *,
         noise: Mapping[str, tuple[int, str]],
@@ -154,80 +143,66 @@ class ErrorStage:
             period: Sample period in seconds.
             unit: Unit of the reading.
         """
-        self._n, self._output, self._period = default.size, output, period
+        n = default.size
+        self._n, self._output, self._period = n, output, period
         self._stream = random_stream(sensor, stream)
-        self._counts = [count for count, _ in noise.values()]
+        self._noise = {name: count for name, (count, _) in noise.items()}
         self._more = model is not None
         seed, std = (0, 0.0) if model is None else (model.seed, model.noise)
-        values = [float(seed), *[std] * len(noise)]
+        positive, probability = (0.0, inf), (0.0, 1.0)
+        settings = {"seed": Quantity(seed, bounds=(0.0, 2.0**53))}
+        settings |= {name: Quantity(std, noise_unit, positive) for name, (_, noise_unit) in noise.items()}
         if model is not None:
             self._longest = max(int(model.latency), int(model.max_latency))
-            values += np.repeat([model.bias, model.drift, model.quantization], self._n).tolist()
-            values += [float(model.latency), float(model.dropout), model.outlier_probability, model.outlier_size]
-            self._memory = int(sensor.DeclareDiscreteState(np.r_[np.zeros(self._n), np.tile(default, self._longest)]))
-        self._parameters = int(sensor.DeclareNumericParameter(BasicVector(values)))
-        entry = sensor.DeclareCacheEntry(
-            "error settings",
-            ValueProducer(allocate=lambda: Value(object()), calc=weakly(self, type(self)._calc_settings)),
-            {sensor.numeric_parameter_ticket(NumericParameterIndex(self._parameters))},
+            settings |= {
+                "bias": Quantity(np.full(n, model.bias), unit),
+                "drift": Quantity(np.full(n, model.drift), f"({unit})/s^0.5", positive),
+                "quantization": Quantity(np.full(n, model.quantization), unit, positive),
+                "latency": Quantity(model.latency, "period", (0.0, float(self._longest))),
+                "dropout": Quantity(model.dropout, bounds=probability),
+                "outlier_probability": Quantity(model.outlier_probability, bounds=probability),
+                "outlier_size": Quantity(model.outlier_size, unit, positive),
+            }
+        self._parameters = sensor.declare_parameters(**settings)
+        self._settings = sensor.declare_cache(
+            "error settings", self._calc_settings, {sensor.numeric_parameter_ticket(self._parameters.index)}
         )
-        # The entry itself would hold the sensor, which holds this.
-        index = entry.cache_index()
-        self._settings = weakly(sensor, lambda sensor, context: sensor.get_cache_entry(index).Eval(context))
-        self.variables = tuple(self._elements(noise, unit))
+        if model is not None:
+            memory = {"walk": Quantity(np.zeros(n), unit)}
+            if self._longest:
+                memory["in_transit"] = Quantity(np.tile(default, (self._longest, 1)), unit)
+            self._memory = sensor.declare_discrete_state(**memory)
 
-    def _elements(self, noise: Mapping[str, tuple[int, str]], unit: str) -> Iterator[Element]:
-        n, index = self._n, self._parameters
-        yield parameter("seed", index, bounds=(0.0, 2.0**53))
-        for k, (name, (_, noise_unit)) in enumerate(noise.items()):
-            yield parameter(name, index, start=1 + k, unit=noise_unit, bounds=(0.0, inf))
-        if not self._more:
-            return
-        start = 1 + len(noise)
-        yield parameter("bias", index, start=start, shape=(n,), unit=unit)
-        yield parameter("drift", index, start=start + n, shape=(n,), unit=f"({unit})/s^0.5", bounds=(0.0, inf))
-        yield parameter("quantization", index, start=start + 2 * n, shape=(n,), unit=unit, bounds=(0.0, inf))
-        yield parameter("latency", index, start=start + 3 * n, unit="period", bounds=(0.0, float(self._longest)))
-        yield parameter("dropout", index, start=start + 3 * n + 1, bounds=(0.0, 1.0))
-        yield parameter("outlier_probability", index, start=start + 3 * n + 2, bounds=(0.0, 1.0))
-        yield parameter("outlier_size", index, start=start + 3 * n + 3, unit=unit, bounds=(0.0, inf))
-        yield discrete_state("walk", self._memory, shape=(n,), unit=unit)
-        if self._longest:
-            yield discrete_state("in_transit", self._memory, start=n, shape=(self._longest, n), unit=unit)
-
-    def _calc_settings(self, context: Context, settings: Value) -> None:
-        n, start = self._n, 1 + len(self._counts)
-        values = context.get_numeric_parameter(self._parameters).value()
-        read = _Settings(int(values[0]), noise=_unless_zero(np.repeat(values[1:start], self._counts)))
+    def _calc_settings(self, context: Context) -> _Settings:
+        parameters = self._parameters.view(context)
+        deviations = [getattr(parameters, name) for name in self._noise]
+        settings = _Settings(
+            int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self._noise.values())))
+        )
         if self._more:
-            bias, drift, quantization = values[start : start + 3 * n].reshape(3, n)
-            latency, dropout, outlier_probability, outlier_size = values[start + 3 * n :].tolist()
-            read = replace(
-                read,
-                bias=_unless_zero(bias),
-                drift=_unless_zero(sqrt(self._period) * drift),
-                quantization=_unless_zero(quantization),
-                latency=round(latency),
-                dropout=dropout,
-                outlier_probability=outlier_probability,
-                outlier_size=outlier_size,
+            settings = replace(
+                settings,
+                bias=_unless_zero(parameters.bias),
+                drift=_unless_zero(sqrt(self._period) * parameters.drift),
+                quantization=_unless_zero(parameters.quantization),
+                latency=round(parameters.latency),
+                dropout=parameters.dropout,
+                outlier_probability=parameters.outlier_probability,
+                outlier_size=parameters.outlier_size,
             )
-        if read.noise is not None or read.drift is not None or read.dropout or read.outlier_probability:
-            read = replace(read, stream=self._stream())
-        settings.set_value(read)
+        if settings.noise is not None or settings.drift is not None or settings.dropout or settings.outlier_probability:
+            settings = replace(settings, stream=self._stream())
+        return settings
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
         """Let ``y`` be in transit, throughout."""
         if self._more and self._longest:
-            memory = np.array(context.get_discrete_state(self._memory).value())
-            memory[self._n :] = np.tile(y, self._longest)
-            context.SetDiscreteState(self._memory, memory)
+            self._memory.mutable(context.get_mutable_discrete_state()).in_transit = y
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
-        values = context.get_numeric_parameter(self._parameters).value()
-        # All but the seed.
-        if not (np.count_nonzero(values[1:]) or (self._more and self._remembers(context))):
+        all_but_seed = np.asarray(self._parameters.view(context))[1:]
+        if not (np.count_nonzero(all_but_seed) or (self._more and self._remembers(context))):
             return y
         settings: _Settings = self._settings(context)
         key = {"seed": settings.seed, "stream": settings.stream, "tick": round(context.get_time() / self._period)}
@@ -237,7 +212,7 @@ class ErrorStage:
 
     def _remembers(self, context: Context) -> bool:
         """Return whether samples may be in transit, or the random walk has left zero."""
-        return self._longest > 0 or any(context.get_discrete_state(self._memory).value().tolist())
+        return self._longest > 0 or any(self._memory.view(context).walk.tolist())
 
     def _shown(
         self,
@@ -248,8 +223,8 @@ class ErrorStage:
         key: Mapping[str, int],
     ) -> NDArray[np.float64]:
         n, q = self._n, settings.quantization
-        memory = context.get_discrete_state(self._memory).value()
-        walk = memory[:n]
+        memory = self._memory.view(context)
+        walk = memory.walk
         if settings.drift is not None:
             walk = walk + settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
         if settings.outlier_probability and (
@@ -265,9 +240,12 @@ class ErrorStage:
             y = np.where(q > 0.0, np.round(y / steps) * steps, y)
         newest = y
         if settings.latency:
-            y = memory[settings.latency * n : (settings.latency + 1) * n]
+            y = memory.in_transit[settings.latency - 1]
         if settings.dropout and uniform_noise(channel=_DROPOUT_CHANNEL, **key) < settings.dropout:
             y = context.get_discrete_state(self._output).value()
         if self._longest or settings.drift is not None:
-            state.set_value(self._memory, np.concatenate((walk, newest, memory[n:]))[: memory.size])
+            following = self._memory.mutable(state)
+            following.walk = walk
+            if self._longest:
+                following.in_transit = np.concatenate((newest[np.newaxis], memory.in_transit[:-1]))
         return y

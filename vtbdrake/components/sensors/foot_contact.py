@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.contact_kernel import contact_forces
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import Quantity
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -37,8 +36,6 @@ class ContactSensor(SampledSensor):
     follow from its state; with a discrete one they are those of its last step, and empty between a restore and the next
     step.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -68,10 +65,9 @@ class ContactSensor(SampledSensor):
             for k, body in enumerate(bodies)
             for geometry in plant.GetCollisionGeometriesForBody(body)
         }
-        self._threshold = int(self.DeclareNumericParameter(BasicVector([threshold])))
-        self.variables += (parameter("threshold", self._threshold, unit="N", bounds=(0.0, np.inf)),)
+        self._settings = self.declare_parameters(threshold=Quantity(threshold, "N", (0.0, np.inf)))
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         results = self._results_port.Eval(context)
         forces = contact_forces(results, self._slots, self._geometry_slots, self._count)
-        return (forces > context.get_numeric_parameter(self._threshold)[0]).astype(float)
+        return (forces > self._settings.view(context).threshold).astype(float)

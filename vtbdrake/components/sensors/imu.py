@@ -11,13 +11,12 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.imu_kernel import sample, specific_force_at_rest
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import Quantity
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -50,8 +49,6 @@ class Imu(SampledSensor):
     moving ``frame`` afterwards does not change it.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self,
         plant: MultibodyPlant,
@@ -77,14 +74,12 @@ class Imu(SampledSensor):
             stream=stream,
             errors=errors,
         )
-        # [number of samples (0 or 1 is all that matters), v_WF, q_WF (wxyz)] at the last sample.
-        self._memory = int(self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])))
-        self._mount = int(self.DeclareNumericParameter(BasicVector(mount)))
-        self.variables += (
-            parameter("mount", self._mount, shape=(6,), unit="m, rad"),
-            discrete_state("sampled", self._memory, start=0, bounds=(0.0, 1.0)),
-            discrete_state("last_velocity", self._memory, shape=(3,), start=1, unit="m/s"),
-            discrete_state("last_orientation", self._memory, shape=(4,), start=4),
+        self._settings = self.declare_parameters(mount=Quantity(mount, "m, rad"))
+        # Whether there was a sample; v_WF and q_WF (wxyz) at the last one.
+        self._memory = self.declare_discrete_state(
+            sampled=Quantity(0.0, bounds=(0.0, 1.0)),
+            last_velocity=Quantity(np.zeros(3), "m/s"),
+            last_orientation=Quantity([1.0, 0.0, 0.0, 0.0]),
         )
         self._floating = body.is_floating_base_body() and body.has_quaternion_dofs()
         if self._floating:
@@ -100,7 +95,7 @@ class Imu(SampledSensor):
             )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        return self._sample_into(state.get_mutable_value(self._memory), context)
+        return self._sample_into(np.asarray(self._memory.mutable(state)), context)
 
     def _sample_into(self, memory: NDArray[np.float64], context: Context) -> NDArray[np.float64]:
         """Return the measurement; ``memory`` is that of the last sample, and becomes that of this one."""
@@ -108,7 +103,7 @@ class Imu(SampledSensor):
             self._motion(context),
             orientation=self._orientation,
             velocity=self._velocity,
-            mount=context.get_numeric_parameter(self._mount).value(),
+            mount=self._settings.view(context).mount,
             g_W=self._g_W,
             memory=memory,
             period=self._period,
@@ -120,16 +115,16 @@ class Imu(SampledSensor):
         now = context.get_time()
         # The time since the last sample; what is due now has not been sampled yet.
         elapsed = now - (ceil(now / self._period - 1e-6) - 1.0) * self._period
-        memory = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        self._sample_into(memory, context)
-        v_WF, R_WF = memory[1:4], RotationMatrix(Quaternion(memory[4:]))
+        memory = self._memory.mutable(context.get_mutable_discrete_state())
+        memory.sampled = 0.0
+        self._sample_into(np.asarray(memory), context)
+        R_WF = RotationMatrix(Quaternion(memory.last_orientation))
         turn = elapsed * y[:3]
         angle = float(np.linalg.norm(turn))
         if angle > 0.0:
-            memory[4:] = (R_WF @ RotationMatrix(AngleAxis(-angle, turn / angle))).ToQuaternion().wxyz()
+            memory.last_orientation = (R_WF @ RotationMatrix(AngleAxis(-angle, turn / angle))).ToQuaternion().wxyz()
             R_WF = R_WF @ RotationMatrix(AngleAxis(-angle / 2.0, turn / angle))
-        memory[1:4] = v_WF - elapsed * (R_WF @ y[3:] + self._g_W)
-        context.SetDiscreteState(self._memory, memory)
+        memory.last_velocity -= elapsed * (R_WF @ y[3:] + self._g_W)
 
     def _motion(self, context: Context) -> NDArray[np.float64]:
         """Return numbers that hold q_WB and V_WB."""

@@ -15,22 +15,17 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import (
     AbstractStateIndex,
-    BasicVector,
     Context,
     EventStatus,
-    LeafSystem,
-    NumericParameterIndex,
     State,
-    ValueProducer,
 )
 
-from vtbdrake.components.environment.haze import false_return_ranges, two_way_transmission
+from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
 from vtbdrake.components.settings import check_settings
 from vtbdrake.scan import Scan
-from vtbdrake.state import Codec, Element, discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
 if TYPE_CHECKING:
@@ -139,7 +134,7 @@ def _decode_progress(arrays: Mapping[str, np.ndarray]) -> ScanInProgress:
 _PROGRESS_CODEC = Codec(lambda progress: {"returns": progress.returns()}, _decode_progress)
 
 
-class LaserScanner(LeafSystem):
+class LaserScanner(AddressedSystem):
     r"""Measures distances along rays that it fires one after the other.
 
     .. pydrake_system::
@@ -187,8 +182,6 @@ class LaserScanner(LeafSystem):
     ``scan_columns``, ``scan_by_columns`` and ``fired`` (rays) of the present scan are state.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self,
         plant: MultibodyPlant,
@@ -227,24 +220,15 @@ class LaserScanner(LeafSystem):
         self._slice_period, self._stream = float(slice_period), random_stream(self, stream)
         self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self._velocities_port = self.DeclareAbstractInputPort("body_spatial_velocities", Value[list[SpatialVelocity]]())
-        self._haze_port = self.DeclareVectorInputPort("haze", 5)
-        self.variables = (
-            *self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors),
-            *self._declare_state(),
-        )
+        self._haze_port = self.DeclareVectorInputPort("haze", HAZE.size)
+        self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors)
+        self._declare_state()
         self.timings = ((self._slice_period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._slice_period, 0.0, self._end_slice)
 
-    def _declare_parameters(
-        self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel
-    ) -> tuple[Element, ...]:
-        values = [getattr(config, name) for name in _FIELDS] + [getattr(errors, name) for name in _ERRORS]
-        index = NumericParameterIndex(self.DeclareNumericParameter(BasicVector([*pose_to_array(X_BL), *values])))
-        settings = ValueProducer(allocate=lambda: Value(object()), calc=weakly(self, LaserScanner._calc_settings))
-        entry = self.DeclareCacheEntry("settings", settings, {self.numeric_parameter_ticket(index)})
-        self._settings = entry.cache_index()
+    def _declare_parameters(self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel) -> None:
         most = 1.0 / self._slice_period
-        described = {
+        units_and_bounds = {
             "frequency": ("Hz", (0.0, most)),
             "rays_per_second": ("1/s", (0.0, inf)),
             "azimuth": ("rad", (0.0, 2.0 * pi)),
@@ -262,26 +246,29 @@ class LaserScanner(LeafSystem):
             "dropout": ("1", (0.0, 1.0)),
             "seed": ("1", (0.0, 2.0**53)),
         }
-        return (
-            parameter("pose", index, shape=(6,), unit=POSE_UNIT),
-            *(
-                parameter(name, index, start=6 + k, unit=unit, bounds=bounds)
-                for k, (name, (unit, bounds)) in enumerate(described.items())
-            ),
+        defaults = {name: getattr(config, name) for name in _FIELDS} | {name: getattr(errors, name) for name in _ERRORS}
+        self._parameters = self.declare_parameters(
+            pose=Quantity(pose_to_array(X_BL), POSE_UNIT),
+            **{name: Quantity(default, *units_and_bounds[name]) for name, default in defaults.items()},
+        )
+        self._settings = self.declare_cache(
+            "settings", self._calc_settings, {self.numeric_parameter_ticket(self._parameters.index)}
         )
 
-    def _declare_state(self) -> tuple[Element, ...]:
+    def _declare_state(self) -> None:
         self._scan: AbstractStateIndex = self.DeclareAbstractState(Value(Scan.empty()))
         self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
         self.codecs = {int(self._progress): _PROGRESS_CODEC}
         # The state of the present scan; with 0 rows, none has begun.
-        names = dict.fromkeys(("scan_start", "scan_period"), "s")
-        names |= dict.fromkeys(("scan_rows", "scan_columns", "scan_by_columns", "fired"), "1")
-        self._present = int(self.DeclareDiscreteState(len(names)))
-        self.DeclareStateOutputPort("scan", self._scan)
-        return tuple(
-            discrete_state(name, self._present, start=k, unit=unit) for k, (name, unit) in enumerate(names.items())
+        self._present = self.declare_discrete_state(
+            scan_start=Quantity(unit="s"),
+            scan_period=Quantity(unit="s"),
+            scan_rows=Quantity(),
+            scan_columns=Quantity(),
+            scan_by_columns=Quantity(),
+            fired=Quantity(),
         )
+        self.DeclareStateOutputPort("scan", self._scan)
 
     @property
     def slice_period(self) -> float:
@@ -292,20 +279,22 @@ class LaserScanner(LeafSystem):
         """Set the last complete scan to ``scan``, and begin a new one."""
         context.SetAbstractState(self._scan, scan)
         context.SetAbstractState(self._progress, ScanInProgress())
-        context.SetDiscreteState(self._present, np.zeros(6))
+        context.SetDiscreteState(self._present.index, self._present.vector.array())
 
-    def _calc_settings(self, context: Context, output: Value) -> None:
-        values = context.get_numeric_parameter(0).value()
-        config = LaserScannerConfig(**dict(zip(_FIELDS, values[6:].tolist(), strict=False)))
+    def _calc_settings(self, context: Context) -> _Settings:
+        values = self._parameters.view(context)
+        config = LaserScannerConfig(**{name: getattr(values, name) for name in _FIELDS})
         config.check(self._slice_period)
-        errors = ErrorModel(**dict(zip(_ERRORS, values[6 + len(_FIELDS) :].tolist(), strict=True)))
-        output.set_value(_Settings(pose_from_array(values[:6]), config, errors))
+        errors = ErrorModel(**{name: getattr(values, name) for name in _ERRORS})
+        return _Settings(pose_from_array(values.pose), config, errors)
 
     def _end_slice(self, context: Context, state: State) -> EventStatus:
-        settings: _Settings = self.get_cache_entry(self._settings).Eval(context)
+        settings: _Settings = self._settings(context)
         now = context.get_time()
-        start, period, *counts = context.get_discrete_state(self._present).value().tolist()
-        rows, columns, by_columns, fired = map(int, counts)
+        present = self._present.mutable(state.get_mutable_discrete_state())
+        start, period = present.scan_start, present.scan_period
+        rows, columns, by_columns = int(present.scan_rows), int(present.scan_columns), bool(present.scan_by_columns)
+        fired = int(present.fired)
         slices = context.get_abstract_state(int(self._progress)).get_value().slices
         # No scan has begun, or the context has been set to a later time.
         if not rows or start + (fired + 0.5) * period / (rows * columns) < now - 1.5 * self._slice_period:
@@ -319,7 +308,7 @@ class LaserScanner(LeafSystem):
             due = min(rays, int((now + _ROUNDING - start) / period * rays + 0.5))
             if due > fired:
                 config = settings.config
-                rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=bool(by_columns))
+                rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=by_columns)
                 directions = rays_L[fired:due]
                 times = (np.arange(fired, due) + 0.5) * (period / rays)
                 kept, ranges = self._fire(context, settings, generator, directions, times + (start - now))
@@ -333,7 +322,9 @@ class LaserScanner(LeafSystem):
             start, slices, fired = start + period, (), 0
             period, rows, columns, by_columns = _next_scan(settings.config)
         state.get_mutable_abstract_state(int(self._progress)).set_value(ScanInProgress(slices))
-        state.get_mutable_discrete_state().set_value(self._present, [start, period, rows, columns, by_columns, fired])
+        present.scan_start, present.scan_period = start, period
+        present.scan_rows, present.scan_columns, present.scan_by_columns = rows, columns, by_columns
+        present.fired = fired
         return EventStatus.Succeeded()
 
     def _is_random(self, context: Context, settings: _Settings) -> bool:
@@ -372,12 +363,12 @@ class LaserScanner(LeafSystem):
         hits = self._caster.cast(beams, times, X_WL=X_WL, V_WL=V_WL, X_WB=X_WB, V_WB=V_WB, reach=reach)
         power, distances = hits.cosines * reach**2, hits.distances
         if self._haze_port.HasValue(context):
-            extinction, backscatter = self._haze_port.Eval(context)[:2].tolist()
-            power *= two_way_transmission(extinction, np.minimum(distances, reach))
+            haze = HAZE.view(self._haze_port.Eval(context))
+            power *= two_way_transmission(haze.extinction, np.minimum(distances, reach))
             ranges = np.where(power >= distances**2, distances, inf)
             uniform = generator.random(len(ranges))
             false = false_return_ranges(
-                uniform, extinction=extinction, backscatter=backscatter, least_range=config.min_range
+                uniform, extinction=haze.extinction, backscatter=haze.backscatter, least_range=config.min_range
             )
             ranges = np.where(false < np.minimum(distances, reach), false, ranges)
         else:

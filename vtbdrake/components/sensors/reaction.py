@@ -13,7 +13,6 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state.declarations import NO_DICT
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -42,8 +41,6 @@ class ForceTorqueSensor(SampledSensor):
     restore and the next step; copies continue exactly where the plant has ``use_sampled_output_ports=False``. Then, and
     in a continuous plant, they follow from state and actuation of the same instant.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -86,8 +83,6 @@ class JointTorqueSensors(SampledSensor):
     drive's torque, less what accelerates its rotor. Before the first sample it shows ``initial``, a scalar or one
     torque per joint. About restored contexts, see `ForceTorqueSensor`.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,

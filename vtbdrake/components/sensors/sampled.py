@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
-from vtbdrake.state import Element, discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
 
 
-class SampledSensor(LeafSystem):
+class SampledSensor(AddressedSystem):
     """A sensor that measures at t = 0, T, 2 T, ... and holds its measurement y in between.
 
     ``y = measurement + std * n(seed, stream, tick)`` with n independent and of N(0, 1). Until the first sample, y is
@@ -27,8 +26,6 @@ class SampledSensor(LeafSystem):
 
     The input ports have the names of the plant's output ports that they belong to, see `connect_to_plant`.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -63,15 +60,15 @@ class SampledSensor(LeafSystem):
             raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
         self._period = float(period)
         y0 = np.asarray(default, dtype=float)
-        self._output = int(self.DeclareDiscreteState(y0))
-        self.DeclareStateOutputPort(signal, DiscreteStateIndex(self._output))
+        reading = self.declare_discrete_state(**{signal: Quantity(y0, unit)})
+        self._output = int(reading.index)
+        self.DeclareStateOutputPort(signal, reading.index)
         if errors is not None:
             errors.check(type(self).__name__)
             if errors.noise and not noise:
                 raise ValueError(
                     f"{type(self).__name__} has no noise, but noise={errors.noise:g} is given: leave it out."
                 )
-        self.variables: tuple[Element, ...] = (discrete_state(signal, self._output, shape=y0.shape, unit=unit),)
         self._stage: ErrorStage | None = None
         if noise or errors is not None:
             self._stage = ErrorStage(
@@ -84,7 +81,6 @@ class SampledSensor(LeafSystem):
                 period=self._period,
                 unit=unit,
             )
-            self.variables += self._stage.variables
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
 
     @property
