@@ -10,7 +10,7 @@ import pytest
 from pydrake.lcm import DrakeLcm
 
 from tests.lcm.hub.clients import Client, ClientProcess, wait_until
-from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, client_name, server
+from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, HubStatistics, client_name, server
 from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.routing import ProtectedChannel
 
@@ -174,16 +174,21 @@ def test_first_publisher_owns_the_channel(long_lease) -> None:
     assert (status.refused, status.taken, status.lease_over) == (3, 0, False)
 
 
-def test_rejection_is_published_at_once() -> None:
+def test_change_of_owner_and_rejection_are_published_at_once() -> None:
     with Hub(port=0, protect=["COMMAND"], status_period=3600.0, patience=3600.0) as hub:
-        dps, intruder = Client(hub.url), Client(hub.url)
+        watcher, dps, intruder = Client(hub.url, "VTB_HUB"), Client(hub.url), Client(hub.url)
+        owner = client_name(dps.bus.fileno())
+
+        def published(refused: int) -> bool:
+            status = [HubStatistics.from_json(data).protected["COMMAND"] for data in watcher.data("VTB_HUB")]
+            return (owner, refused) in [(channel.owner, channel.refused) for channel in status]
+
+        # Each is published before the next one happens.
         dps.publish("COMMAND")
-        dps.sync()
-        intruder.publish("COMMAND")
-        intruder.sync()
-        watcher = Client(hub.url, "VTB_HUB")
-        intruder.publish("COMMAND")
-        assert watcher.wait_for_status(lambda status: status.refused == 2).protected["COMMAND"].refused == 2
+        watcher.wait(lambda: published(refused=0))
+        for refused in (1, 2, 3):
+            intruder.publish("COMMAND")
+            watcher.wait(lambda refused=refused: published(refused=refused))
 
 
 def test_unprotected_channels_have_many_publishers(long_lease) -> None:
