@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.measure import HIGHER, Benchmark, interleaved_values, spread
 from vtbdrake.rollout import RolloutResult, RolloutRunner
-from vtbdrake_diagrams.satellite.mount import BY_HAND, entries, mount_problem
+from vtbdrake_diagrams.satellite.studies.mount import BY_HAND, entries, mount_problem
 
 CANDIDATES = 50
 

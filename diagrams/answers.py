@@ -20,12 +20,12 @@ from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
 
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
-    "O1": "vtbdrake_diagrams.satellite.mount:mount",
-    "O2": "vtbdrake_diagrams.satellite.scan_frequency:frequency",
-    "O3": "vtbdrake_diagrams.satellite.lighting:lighting",
+    "O1": "vtbdrake_diagrams.satellite.studies.mount:mount",
+    "O2": "vtbdrake_diagrams.satellite.studies.scan_frequency:frequency",
+    "O3": "vtbdrake_diagrams.satellite.studies.lighting:lighting",
     "O4": "vtbdrake_diagrams.space_climber.answers:payload",
     "R1": "vtbdrake_diagrams.space_climber.answers:heading",
-    "R2": "vtbdrake_diagrams.satellite.trajectory:answer",
+    "R2": "vtbdrake_diagrams.satellite.studies.trajectory:answer",
     "C1": "vtbdrake_diagrams.manipulator.answers:control",
     "C2": "vtbdrake_diagrams.forest.studies.answers:localization",
 }

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from vtbdrake.testbed import ScenarioError
-from vtbdrake_diagrams.satellite.arm_motion import BASE, DEVIATION, PLAN, ArmMotionScenario, deviation, limits
 from vtbdrake_diagrams.satellite.plant import plant_config
-from vtbdrake_diagrams.satellite.trajectory import (
+from vtbdrake_diagrams.satellite.studies.arm_motion import BASE, DEVIATION, PLAN, ArmMotionScenario, deviation, limits
+from vtbdrake_diagrams.satellite.studies.trajectory import (
     Comparison,
     Course,
     Survey,

@@ -9,16 +9,16 @@ import pytest
 
 from vtbdrake.optimization.solvers import make_solver
 from vtbdrake.optimization.solvers.solver import SolverError
-from vtbdrake_diagrams.satellite.arm_motion import PLAN, ArmMotionScenario, free_knots
-from vtbdrake_diagrams.satellite.arm_move import REACHING, Move, MoveSpace, move_space
-from vtbdrake_diagrams.satellite.arm_planning import (
+from vtbdrake_diagrams.satellite.bodies import Servicer
+from vtbdrake_diagrams.satellite.studies.arm_motion import PLAN, ArmMotionScenario, free_knots
+from vtbdrake_diagrams.satellite.studies.arm_move import REACHING, Move, MoveSpace, move_space
+from vtbdrake_diagrams.satellite.studies.arm_planning import (
     GOOD_ENOUGH,
     MomentumDescent,
     good_enough,
     plan_by_casadi,
     plan_by_drake,
 )
-from vtbdrake_diagrams.satellite.bodies import Servicer
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from vtbdrake.rollout import SerialExecutor
 from vtbdrake_diagrams.satellite import SatelliteScenario
-from vtbdrake_diagrams.satellite.campaign import LARGEST_TUMBLE, Capture, captures, report, starts
+from vtbdrake_diagrams.satellite.studies.campaign import LARGEST_TUMBLE, Capture, captures, report, starts
 
 HELD = Capture(0.02, "hold", "the relative motion has stopped", 20.0, np.zeros(3), 1e-5, 1e-4, 0.1)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from vtbdrake.testbed import ScenarioError
-from vtbdrake_diagrams.satellite.arm_motion import ArmMotionScenario
-from vtbdrake_diagrams.satellite.arm_move import REACHING, Move, move_space
-from vtbdrake_diagrams.satellite.arm_planning import plan_by_casadi, plan_by_drake
 from vtbdrake_diagrams.satellite.bodies import Servicer
-from vtbdrake_diagrams.satellite.clearance import CLEARANCE, ArmClearance, DrakeClearance
+from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
+from vtbdrake_diagrams.satellite.studies.arm_move import REACHING, Move, move_space
+from vtbdrake_diagrams.satellite.studies.arm_planning import plan_by_casadi, plan_by_drake
+from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance, DrakeClearance
 
 # Starts and goals in rad between which a plan runs into the base, and links 5 and 7 into each other, if the planner
 # watches no more than points of the arm; the straight paths are clear.

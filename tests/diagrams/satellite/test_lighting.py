@@ -8,9 +8,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from vtbdrake.rollout import SerialExecutor
 from vtbdrake.state.systems import pose_to_array
-from vtbdrake_diagrams.satellite import lighting
 from vtbdrake_diagrams.satellite.bodies import Target
-from vtbdrake_diagrams.satellite.lighting import (
+from vtbdrake_diagrams.satellite.relative_motion import RELATIVE
+from vtbdrake_diagrams.satellite.studies import lighting
+from vtbdrake_diagrams.satellite.studies.lighting import (
     ACCURACY,
     CANDIDATES,
     CHECKED_ON,
@@ -31,7 +32,6 @@ from vtbdrake_diagrams.satellite.lighting import (
     plot_answer,
     time_to_grip,
 )
-from vtbdrake_diagrams.satellite.relative_motion import RELATIVE
 from vtbdrake_diagrams.satellite.supervisor import ABORT, GRIP, HOLD, RETREAT
 
 

@@ -12,7 +12,7 @@ from vtbdrake.rollout import MotionError, RolloutRunner
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
-from vtbdrake_diagrams.satellite.mount import (
+from vtbdrake_diagrams.satellite.studies.mount import (
     BY_HAND,
     COUNT,
     PARAMETERS,

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.satellite.bodies import Target
-from vtbdrake_diagrams.satellite.scan_frequency import (
+from vtbdrake_diagrams.satellite.studies.scan_frequency import (
     CLOSING_SPEED,
     QUANTILE,
     SETTLING,

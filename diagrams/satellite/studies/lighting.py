@@ -27,7 +27,7 @@ with them the arm asks the wheels for more than they have, and some captures are
 The choice takes minutes. So the default run takes its result `CHOICE`, and compares it with the default of the robot,
 from all starts of `CHECKED_ON`; ``--full`` repeats the choice first.
 
-``python -m vtbdrake_diagrams.satellite.lighting [--starts N] [--full]`` prints the answer and draws it.
+``python -m vtbdrake_diagrams.satellite.studies.lighting [--starts N] [--full]`` prints the answer and draws it.
 """
 
 from __future__ import annotations
@@ -414,6 +414,6 @@ def main(full: bool, starts: int, figure: str) -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.satellite.lighting import main as program
+    from vtbdrake_diagrams.satellite.studies.lighting import main as program
 
-    program(prog_name="python -m vtbdrake_diagrams.satellite.lighting")
+    program(prog_name="python -m vtbdrake_diagrams.satellite.studies.lighting")

@@ -1,7 +1,8 @@
 """Solvers of application R2: plans of the arm by gradients on the momentum model, with CasADi and with Drake.
 
-They solve the same problem, see `vtbdrake_diagrams.satellite.arm_move`, with derivatives from CasADi, and from the same
-starts: near the straight path, but not on it, since there the cost may be stationary across it (a motion in a plane).
+They solve the same problem, see `vtbdrake_diagrams.satellite.studies.arm_move`, with derivatives from CasADi, and from
+the same starts: near the straight path, but not on it, since there the cost may be stationary across it (a motion in a
+plane).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolverInterface, SolverOptions
 
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
-from vtbdrake_diagrams.satellite.arm_move import FEASIBILITY, RESTING, Move, move_space
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS
+from vtbdrake_diagrams.satellite.studies.arm_move import FEASIBILITY, RESTING, Move, move_space
 
 Array = NDArray[np.float64]
 

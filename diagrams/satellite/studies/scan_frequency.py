@@ -419,6 +419,6 @@ def main(full: bool, figure: str) -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.satellite.scan_frequency import main as program
+    from vtbdrake_diagrams.satellite.studies.scan_frequency import main as program
 
-    program(prog_name="python -m vtbdrake_diagrams.satellite.scan_frequency")
+    program(prog_name="python -m vtbdrake_diagrams.satellite.studies.scan_frequency")

@@ -1,8 +1,8 @@
 """A campaign of captures from random starts: how often they succeed, and why they fail.
 
-``python -m vtbdrake_diagrams.satellite.campaign [--captures N] [--perception P] [--wheels] [--workers W] [--seed S]``
-simulates captures from random starts (`random_start`), whose tumble rates are drawn from [0, `LARGEST_TUMBLE`], with
-camera and scanner in the loop, and prints one row per capture.
+``python -m vtbdrake_diagrams.satellite.studies.campaign [--captures N] [--perception P] [--wheels] [--workers W]
+[--seed S]`` simulates captures from random starts (`random_start`), whose tumble rates are drawn from [0,
+`LARGEST_TUMBLE`], with camera and scanner in the loop, and prints one row per capture.
 
 The criteria of success, fixed before any result was seen:
 

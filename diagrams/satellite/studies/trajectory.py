@@ -1,8 +1,8 @@
 """Application R2: which trajectory of the arm disturbs the base least, and is it so in the full testbed?
 
-``python -m vtbdrake_diagrams.satellite.trajectory [FILE]`` moves the arm from its stowed pose to that of a capture, on
-the straight path and on the plan that the DPS decides on board, and plots the deviation of the base. With ``--pairs N``
-it asks for N random pairs of start and goal instead, and prints the factors.
+``python -m vtbdrake_diagrams.satellite.studies.trajectory [FILE]`` moves the arm from its stowed pose to that of a
+capture, on the straight path and on the plan that the DPS decides on board, and plots the deviation of the base. With
+``--pairs N`` it asks for N random pairs of start and goal instead, and prints the factors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from vtbdrake.components.compiled_plant import rotation_angle
 from vtbdrake.optimization import Problem
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.answers import Answer
-from vtbdrake_diagrams.satellite.arm_motion import (
+from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Servicer
+from vtbdrake_diagrams.satellite.studies.arm_motion import (
     BASE,
     DEVIATION,
     PERIOD,
@@ -31,10 +32,9 @@ from vtbdrake_diagrams.satellite.arm_motion import (
     free_knots,
     limits,
 )
-from vtbdrake_diagrams.satellite.arm_move import REACHING
-from vtbdrake_diagrams.satellite.arm_planning import plan_by_casadi
-from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Servicer
-from vtbdrake_diagrams.satellite.clearance import DrakeClearance
+from vtbdrake_diagrams.satellite.studies.arm_move import REACHING
+from vtbdrake_diagrams.satellite.studies.arm_planning import plan_by_casadi
+from vtbdrake_diagrams.satellite.studies.clearance import DrakeClearance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -375,4 +375,4 @@ def main(figure: str, pairs: int | None, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    main(prog_name="python -m vtbdrake_diagrams.satellite.trajectory")
+    main(prog_name="python -m vtbdrake_diagrams.satellite.studies.trajectory")

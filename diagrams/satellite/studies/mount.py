@@ -13,8 +13,8 @@ The choices that influence the answer were fixed before the first placement was 
 * the light: the scenario's own;
 * the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths.
 
-``python -m vtbdrake_diagrams.satellite.mount [--full]`` prints the answer and draws it. The DPS keeps the nominal pose
-of the camera: the markers that it detects in an image do not depend on it.
+``python -m vtbdrake_diagrams.satellite.studies.mount [--full]`` prints the answer and draws it. The DPS keeps the
+nominal pose of the camera: the markers that it detects in an image do not depend on it.
 """
 
 from __future__ import annotations
@@ -403,6 +403,6 @@ def main(full: bool, figure: str) -> None:
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.satellite.mount import main as program
+    from vtbdrake_diagrams.satellite.studies.mount import main as program
 
-    program(prog_name="python -m vtbdrake_diagrams.satellite.mount")
+    program(prog_name="python -m vtbdrake_diagrams.satellite.studies.mount")

@@ -31,8 +31,8 @@ from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, Momentu
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake.spline import Spline
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, Servicer
-from vtbdrake_diagrams.satellite.clearance import CLEARANCE, ArmClearance
 from vtbdrake_diagrams.satellite.plant import add_servicer
+from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance
 
 Array = NDArray[np.float64]
 
