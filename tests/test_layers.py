@@ -35,13 +35,14 @@ BELOW: dict[str, set[str]] = {
 # travel to them, when the names of a package are imported, splines and
 # laser scans.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "child_process", "failures", "lazy", "pickling", "scan", "spline"})
+    _layers.update({"argument_checks", "child_process", "failures", "lazy", "pickling", "scan", "settings", "spline"})
 BELOW["spline"] = {"argument_checks", "spline_kernel"}
 BELOW["spline_kernel"] = {"state"}
 BELOW["scan"] = set()
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
 BELOW["argument_checks"] = set()
+BELOW["settings"] = set()
 BELOW["failures"] = set()
 BELOW["lazy"] = set()
 BELOW["visualization"] = set(BELOW)

@@ -27,6 +27,7 @@ from vtbdrake.components.world_model import GeoJsonError, WorldModel, load_geojs
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.drake_messages import image_array_map, scan_map
 from vtbdrake.scan import Scan
+from vtbdrake.settings import setting
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
 from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
@@ -94,69 +95,65 @@ class CarrierScenario(Scenario):
     landmark: ClassVar[str]
 
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
-    # Determines landmarks, ground, roads, clutter and map.
-    seed: int = 0
-    # The area is from (0, 0) to (length, width), in m.
-    length: float = 100.0
-    width: float = 100.0
-    # Acceleration of free fall in m/s^2.
-    gravity: float = 9.81
-    # Standard deviations of the heights of hills and bumps in m, see `Ground`.
-    relief: float = 0.8
-    bumps: float = 0.04
-    # The global map of the DPS: exact, accurate, remote or poor, see `MAPS`; its errors have a seed of their own.
-    map: str = "accurate"
-    map_seed: int = 0
-    # A GeoJSON file to take the global map from instead; empty for none.
-    map_file: str = ""
+    seed: int = setting(0, "Determines landmarks, ground, roads, clutter and map.", ge=0)
+    # The area is from (0, 0) to (length, width).
+    length: float = setting(100.0, unit="m")
+    width: float = setting(100.0, unit="m")
+    gravity: float = setting(9.81, "Acceleration of free fall.", unit="m/s^2", gt=0.0)
+    relief: float = setting(0.8, "Standard deviation of the heights of hills, see `Ground`.", unit="m")
+    bumps: float = setting(0.04, "Standard deviation of the heights of bumps.", unit="m")
+    map: str = setting("accurate", "The quality of the global map of the DPS, see `MAPS`.", choices=tuple(MAPS))
+    map_seed: int = setting(0, "Determines the errors of the map.", ge=0)
+    map_file: str = setting("", "A GeoJSON file to take the global map from instead; empty for none.")
     # The laser scanner, and the errors of its ranges in m.
     scanner: LaserScannerConfig = field(default_factory=scanner_config)
     scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
-    # Height of the scanner over the ground in m, its distance in front of the middle of the carrier in m, and its tilt
-    # towards the ground in deg.
-    scanner_height: float = 2.0
-    scanner_forward: float = 0.9
-    scanner_tilt_deg: float = 0.0
+    scanner_height: float = setting(
+        2.0, "Height of the scanner over the ground.", unit="m", ge=1.3, le=6.0, remedy="over the carrier's roof"
+    )
+    scanner_forward: float = setting(
+        0.9,
+        "Distance of the scanner in front of the middle of the carrier.",
+        unit="m",
+        ge=-1.25,
+        le=1.25,
+        remedy="on the carrier",
+    )
+    scanner_tilt_deg: float = setting(0.0, "Tilt of the scanner towards the ground.", unit="deg", ge=-45.0, le=45.0)
     # Errors of the IMU: noise, bias and drift are those of gyros (rad/s) and accelerometers (m/s^2) alike.
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=2e-3, bias=5e-4, drift=1e-5))
-    # Errors of the measured speed of the wheels in m/s, and its factor: measured over true speed.
+    # Errors of the measured speed of the wheels in m/s.
     odometry_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
-    odometry_scale: float = 1.01
-    # The drive: speed in m/s, the number of the first route, which is also advised at first, the distance along it in m
-    # at which the drive begins, and the number of laps after which the driver stops.
-    speed: float = 1.0
-    route: int = 0
-    start: float = 0.0
-    laps: int = 100
-    # Time from the sample of a scan in the DPS to its pose, in s.
-    localizer_latency: float = 0.1
+    odometry_scale: float = setting(1.01, "Measured over true speed of the wheels.", ge=0.5, le=2.0)
+    speed: float = setting(1.0, "Speed of the drive.", unit="m/s", ge=0.0, le=3.0)
+    route: int = setting(0, "The number of the first route, which is also advised at first.", ge=0)
+    start: float = setting(0.0, "Distance along the route at which the drive begins.", unit="m", ge=0.0)
+    laps: int = setting(100, "Number of laps after which the driver stops.", ge=1)
+    localizer_latency: float = setting(
+        0.1,
+        "Time from the sample of a scan in the DPS to its pose.",
+        unit="s",
+        ge=PERIOD,
+        remedy="the least is the period of the DPS",
+    )
 
     def validate(self) -> None:
         super().validate()
-        self.require(
-            plant_config=(self.plant_config.time_step > 0.0, "of a discrete plant, as the wheels are stepped with it"),
-            seed=(self.seed >= 0, "not negative"),
-            gravity=(self.gravity > 0.0, "positive, in m/s^2"),
-            map=(self.map in MAPS, f"one of {', '.join(MAPS)}"),
-            map_seed=(self.map_seed >= 0, "not negative"),
-            scanner_height=(1.3 <= self.scanner_height <= 6.0, "within [1.3, 6] m: over the carrier's roof"),
-            scanner_forward=(abs(self.scanner_forward) <= 1.25, "within [-1.25, 1.25] m: on the carrier"),
-            scanner_tilt_deg=(abs(self.scanner_tilt_deg) <= 45.0, "within [-45, 45] deg"),
-            odometry_scale=(0.5 <= self.odometry_scale <= 2.0, "within [0.5, 2]"),
-            speed=(0.0 <= self.speed <= 3.0, "within [0, 3] m/s"),
-            start=(self.start >= 0.0, "not negative, in m"),
-            laps=(self.laps >= 1, "at least 1"),
-            localizer_latency=(self.localizer_latency >= PERIOD, f"at least {PERIOD:g} s, the period of the DPS"),
-        )
+        if not self.plant_config.time_step > 0.0:
+            raise ScenarioError(
+                f"{type(self).__name__}.plant_config.time_step must be a number above 0 s, not "
+                f"{self.plant_config.time_step!r}: the wheels are stepped with a discrete plant"
+            )
         try:
             self.check_perception()
             self.ground()
-            for name in ("scanner_errors", "imu_errors", "odometry_errors"):
-                getattr(self, name).check(f"{type(self).__name__}.{name}")
             routes = self.routes()
         except ValueError as error:
             raise ScenarioError(f"{type(self).__name__}: {error}") from None
-        self.require(route=(0 <= self.route < len(routes), f"the number of one of {len(routes)} routes, from 0 on"))
+        if not self.route < len(routes):
+            raise ScenarioError(
+                f"{type(self).__name__}.route must be the number of one of {len(routes)} routes, not {self.route}"
+            )
 
     def ground(self) -> Ground:
         """Return the ground."""
@@ -355,28 +352,19 @@ class ForestScenario(CarrierScenario):
 
     landmark: ClassVar[str] = "tree"
 
-    # The sensor that detects trees, scanner or stereo; and the pair of cameras.
-    perception: str = "scanner"
+    perception: str = setting("scanner", "The sensor that detects trees.", choices=PERCEPTIONS)
+    # The pair of cameras.
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
-    # natural, clustered, plantation or windthrown, see `Stand`.
-    stand_kind: str = "natural"
-    # Trees per hectare, before the roads are cleared.
-    density: float = 800.0
-    # Width of the strip roads and distance between them, in m.
-    road_width: float = 4.0
-    road_spacing: float = 28.0
-    # Bushes per hectare, dead branches per tree, and the standard deviation of the inclination of trunks in rad.
-    undergrowth: float = 300.0
-    branches: float = 6.0
-    lean: float = 0.01
+    stand_kind: str = setting("natural", "The pattern of the trees, see `Stand`.", choices=KINDS)
+    density: float = setting(800.0, "Trees per area, before the roads are cleared.", unit="1/ha")
+    road_width: float = setting(4.0, "Width of the strip roads.", unit="m", ge=3.0, remedy="the carrier is 1.5 m wide")
+    road_spacing: float = setting(28.0, "Distance between the strip roads.", unit="m")
+    undergrowth: float = setting(300.0, "Bushes per area.", unit="1/ha")
+    branches: float = setting(6.0, "Dead branches per tree.")
+    lean: float = setting(0.01, "Standard deviation of the inclination of trunks.", unit="rad")
 
     def validate(self) -> None:
-        self.require(
-            perception=(self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
-            stand_kind=(self.stand_kind in KINDS, f"one of {', '.join(KINDS)}"),
-            road_width=(self.road_width >= 3.0, "at least 3 m: the carrier is 1.5 m wide"),
-        )
         super().validate()
         try:
             self.vegetation()
@@ -468,16 +456,10 @@ class PlainScenario(CarrierScenario):
     relief: float = 0.5
     bumps: float = 0.02
     scanner: LaserScannerConfig = field(default_factory=plain_scanner_config)
-    # The share of the ground that rocks cover, and the diameter of the smallest rocks in m, see `RockField`.
-    abundance: float = 0.05
-    least_diameter: float = 0.3
-    # Width of the tracks and distance between them, in m.
-    track_width: float = 4.0
-    track_spacing: float = 28.0
-
-    def validate(self) -> None:
-        self.require(track_width=(self.track_width >= 3.0, "at least 3 m: the carrier is 1.5 m wide"))
-        super().validate()
+    abundance: float = setting(0.05, "The share of the ground that rocks cover, see `RockField`.")
+    least_diameter: float = setting(0.3, "The diameter of the smallest rocks.", unit="m")
+    track_width: float = setting(4.0, "Width of the tracks.", unit="m", ge=3.0, remedy="the carrier is 1.5 m wide")
+    track_spacing: float = setting(28.0, "Distance between the tracks.", unit="m")
 
     def rock_field(self) -> RockField:
         """Return the rocks of the plain."""

@@ -13,6 +13,7 @@ from vtbdrake.components.localization.dead_reckoning import body_rotation, carri
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
+from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.multibody.tree import Frame
@@ -33,21 +34,19 @@ _R_LC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 class StereoConfig:
     """Two cameras side by side, which look along x of the frame L, and the matching of their images."""
 
-    # Pairs of images per second.
-    rate: float = 2.0
-    # The size of an image in pixels.
-    width: int = 320
-    height: int = 240
-    # The field of view from top to bottom in rad: from left to right, it is 77 deg.
-    field_of_view: float = 1.08
-    # Distance of the cameras in m.
-    baseline: float = 0.3
-    # Standard deviation of the read noise, in counts of 255.
-    noise: float = 1.5
-    # Determines the noise.
-    seed: int = 0
-    # The largest disparity in pixels, a multiple of 16: nearer objects are not detected.
-    largest_disparity: int = 32
+    rate: float = setting(2.0, "Pairs of images per second.", unit="Hz", gt=0.0)
+    # The size of an image.
+    width: int = setting(320, unit="pixels", ge=1)
+    height: int = setting(240, unit="pixels", ge=1)
+    field_of_view: float = setting(
+        1.08, "The field of view from top to bottom: from left to right, it is 77 deg.", unit="rad", gt=0.0, lt=np.pi
+    )
+    baseline: float = setting(0.3, "Distance of the cameras.", unit="m")
+    noise: float = setting(1.5, "Standard deviation of the read noise, in counts of 255.", ge=0.0)
+    seed: int = setting(0, "Determines the noise.")
+    largest_disparity: int = setting(
+        32, "The largest disparity, a multiple of 16: nearer objects are not detected.", unit="pixels"
+    )
 
     def check(self) -> None:
         """Check that all values are possible.
@@ -55,13 +54,7 @@ class StereoConfig:
         Raises:
             ValueError: A value is outside of its range.
         """
-        if not (self.rate > 0.0 and 0.0 < self.field_of_view < np.pi and self.noise >= 0.0):
-            raise ValueError(
-                "a pair of cameras has a positive rate, a field of view between 0 and pi rad and no negative noise, "
-                f"not {self.rate:g}, {self.field_of_view:g} and {self.noise:g}"
-            )
-        if min(self.width, self.height) < 1:
-            raise ValueError(f"images have at least one pixel, not {self.width} x {self.height}")
+        check_settings(self)
         self.camera()
         self.matcher()
 

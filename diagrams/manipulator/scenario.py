@@ -23,6 +23,7 @@ from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.monitoring.residuals import ResidualConfig
+from vtbdrake.settings import setting
 from vtbdrake.testbed import (
     Interface,
     Scenario,
@@ -52,22 +53,20 @@ class ManipulatorScenario(Scenario):
 
     # Discrete: reaction forces and contact of the same step.
     plant_config: MultibodyPlantConfig = field(default_factory=_plant)
-    # joint_impedance, cartesian_impedance or admittance.
-    law: str = "cartesian_impedance"
-    # The sample period of sensors, DPS and drives, in seconds.
-    period: float = 0.001
-    # Whether to compile the arithmetic of the DPS if there is a C compiler; the results are the same.
-    compile: bool = True
-    # False is free space.
-    wall: bool = False
-    # The distance of the wall's face from the world's origin along x, in m; sim.env.wall.mount.pose moves it.
-    wall_distance: float = 0.825
-    # The stiffness of the wall's face, in N/m.
-    wall_stiffness: float = 10e3
-    # The dissipation of the wall, after Hunt and Crossley, in s/m.
-    wall_dissipation: float = 5.0
-    # The static and dynamic friction coefficient of ball and wall.
-    wall_friction: float = 0.1
+    law: str = setting("cartesian_impedance", "The control law.", choices=tuple(LAWS))
+    period: float = setting(0.001, "The sample period of sensors, DPS and drives.", unit="s", gt=0.0)
+    compile: bool = setting(
+        True, "Whether to compile the arithmetic of the DPS if there is a C compiler; the results are the same."
+    )
+    wall: bool = setting(False, "Whether there is a wall; False is free space.")
+    wall_distance: float = setting(
+        0.825,
+        "The distance of the wall's face from the world's origin along x; sim.env.wall.mount.pose moves it.",
+        unit="m",
+    )
+    wall_stiffness: float = setting(10e3, "The stiffness of the wall's face.", unit="N/m", gt=0.0)
+    wall_dissipation: float = setting(5.0, "The dissipation of the wall, after Hunt and Crossley.", unit="s/m", ge=0.0)
+    wall_friction: float = setting(0.1, "The static and dynamic friction coefficient of ball and wall.", ge=0.0)
     # Errors of the sensors, exact by default; latency in periods.
     position_errors: ErrorModel = field(default_factory=ErrorModel)
     velocity_errors: ErrorModel = field(default_factory=ErrorModel)
@@ -76,21 +75,11 @@ class ManipulatorScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        self.require(
-            law=(self.law in LAWS, f"one of {', '.join(LAWS)}"),
-            period=(self.period > 0.0, "positive, in s"),
-            **{
-                "plant_config.time_step": (self.plant_config.time_step > 0.0, "positive, in s: the testbed is discrete")
-            },
-            wall_stiffness=(self.wall_stiffness > 0.0, "positive, in N/m"),
-            wall_dissipation=(self.wall_dissipation >= 0.0, "not negative"),
-            wall_friction=(self.wall_friction >= 0.0, "not negative"),
-        )
-        for name in ("position_errors", "velocity_errors", "torque_errors", "wrench_errors"):
-            try:
-                getattr(self, name).check(f"ManipulatorScenario.{name}")
-            except ValueError as error:
-                raise ScenarioError(str(error)) from None
+        if not self.plant_config.time_step > 0.0:
+            raise ScenarioError(
+                "ManipulatorScenario.plant_config.time_step must be a number above 0 s, not "
+                f"{self.plant_config.time_step!r}: the testbed is discrete"
+            )
 
     def interface(self) -> Interface:
         arm = Arm()

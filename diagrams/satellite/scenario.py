@@ -23,6 +23,7 @@ from vtbdrake.lcm.drake_messages import image_map, scan_map
 from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.scan import Scan
+from vtbdrake.settings import setting
 from vtbdrake.state.systems import pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
@@ -33,9 +34,6 @@ from vtbdrake_diagrams.satellite.supervisor import GO, STOP
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
-
-_LARGEST_TUMBLE_DEG = 30.0
-
 
 PERCEPTIONS = ("camera+scanner", "camera", "scanner", "pose_sensor")
 ONLOOKERS = ("", *PERCEPTIONS[:3])
@@ -59,35 +57,41 @@ class SatelliteScenario(Scenario):
 
     # Discrete, with the SAP solver: halving its step changes nothing that counts.
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
-    # Of the start: axis, attitude, place and drift of the target.
-    seed: int = 0
-    # The target's angular velocity, in deg/s.
-    tumble_deg: float = 1.5
-    # The distance of the target's centre from the servicer's when the target faces it, in m.
-    distance: float = 2.5
-    # What the tracker of the DPS follows: camera+scanner, camera, scanner, or pose_sensor, which stands for both.
-    perception: str = "camera+scanner"
-    # Sensors that are aboard beside those that guide, and whose data are evaluated: camera, scanner or camera+scanner.
-    onlookers: str = ""
-    # Whether camera and scanner show nothing, and cost nothing: a black image, and a scan without points.
-    blind: bool = False
-    # The docking camera: pixels, field of view from top to bottom in rad, images per second, errors in counts.
-    image_width: int = 320
-    image_height: int = 240
-    field_of_view: float = 0.9
-    camera_rate: float = 5.0
+    seed: int = setting(0, "Determines the start: axis, attitude, place and drift of the target.", ge=0)
+    tumble_deg: float = setting(1.5, "The target's angular velocity.", unit="deg/s", ge=0.0, le=30.0)
+    distance: float = setting(
+        2.5,
+        "The distance of the target's centre from the servicer's when the target faces it.",
+        unit="m",
+        ge=1.8,
+        remedy="nearer, the satellites would touch",
+    )
+    perception: str = setting(
+        "camera+scanner",
+        "What the tracker of the DPS follows; pose_sensor stands for camera and scanner.",
+        choices=PERCEPTIONS,
+    )
+    onlookers: str = setting(
+        "", "Sensors that are aboard beside those that guide, and whose data are evaluated.", choices=ONLOOKERS
+    )
+    blind: bool = setting(
+        False, "Whether camera and scanner show nothing, and cost nothing: a black image, and a scan without points."
+    )
+    image_width: int = setting(320, "Width of the images of the docking camera.", unit="pixels", gt=0)
+    image_height: int = setting(240, "Height of these images.", unit="pixels", gt=0)
+    field_of_view: float = setting(0.9, "Field of view of the camera from top to bottom.", unit="rad", gt=0.0, lt=np.pi)
+    camera_rate: float = setting(5.0, "Images per second.", unit="Hz", gt=0.0, le=0.5 / PERIOD)
+    # Errors of the images, in counts.
     camera_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1.0))
     # The laser scanner, and the errors of its ranges in m.
     scanner: LaserScannerConfig = field(default_factory=_scanner)
     scanner_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.01))
     # Sun and earth-shine.
     light: LightConfig = field(default_factory=_light)
-    # Brightness of the lamp on the camera, see `Camera`.
-    lamp: float = 0.0
+    lamp: float = setting(0.0, "Brightness of the lamp on the camera, see `Camera`.", ge=0.0)
     # How images and scans are evaluated.
     evaluation: PerceptionConfig = field(default_factory=PerceptionConfig)
-    # Whether the servicer holds its attitude by reaction wheels.
-    wheels: bool = False
+    wheels: bool = setting(False, "Whether the servicer holds its attitude by reaction wheels.")
     # Errors of the sensors, latency in periods; the IMU's noise is in rad/s (gyros) and in m/s^2 (accelerometers).
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
     joint_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
@@ -95,23 +99,13 @@ class SatelliteScenario(Scenario):
 
     def validate(self) -> None:
         super().validate()
-        self.require(
-            seed=(self.seed >= 0, "not negative"),
-            tumble_deg=(0.0 <= self.tumble_deg <= _LARGEST_TUMBLE_DEG, f"within [0, {_LARGEST_TUMBLE_DEG:g}] deg/s"),
-            distance=(self.distance >= 1.8, "at least 1.8 m: nearer, the satellites would touch"),
-            perception=(self.perception in PERCEPTIONS, f"one of {', '.join(PERCEPTIONS)}"),
-            onlookers=(self.onlookers in ONLOOKERS, f"one of {', '.join(PERCEPTIONS[:3])}, or empty"),
-            image_width=(self.image_width > 0, "positive, in pixels"),
-            image_height=(self.image_height > 0, "positive, in pixels"),
-            field_of_view=(0.0 < self.field_of_view < np.pi, "between 0 and pi rad"),
-            camera_rate=(0.0 < self.camera_rate <= 0.5 / PERIOD, f"above 0 and at most {0.5 / PERIOD:g} images/s"),
-            lamp=(self.lamp >= 0.0, "not negative"),
-            plant_config=(self.plant_config.time_step > 0.0, "of a discrete plant: servos and gripper need it"),
-        )
+        if not self.plant_config.time_step > 0.0:
+            raise ScenarioError(
+                "SatelliteScenario.plant_config.time_step must be a number above 0 s, not "
+                f"{self.plant_config.time_step!r}: servos and gripper need a discrete plant"
+            )
         try:
-            self.light.check()
-            for name in ("imu_errors", "joint_errors", "pose_errors", "camera_errors", "scanner_errors"):
-                getattr(self, name).check(f"SatelliteScenario.{name}")
+            self.light.check("SatelliteScenario.light")
         except ValueError as error:
             raise ScenarioError(str(error)) from None
 

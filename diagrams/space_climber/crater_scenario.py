@@ -14,9 +14,10 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus, LeafSystem
 
 from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.settings import setting
 from vtbdrake.state import discrete_state
 from vtbdrake.state.declarations import NO_DICT
-from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.navigation import VisualOdometer
@@ -56,27 +57,32 @@ class CraterScenario(SpaceClimberScenario):
     # from its state.
     period: float = 0.04
     payload: bool = False
-    # Clearance of the swinging feet in m: boulders and kinks that are lower do not stop the robot.
-    clearance: float = 0.1
+    clearance: float = setting(
+        0.1,
+        "Clearance of the swinging feet: boulders and kinks that are lower do not stop the robot.",
+        unit="m",
+        ge=0.0,
+        le=0.15,
+    )
     # The crater, see `Crater`.
-    seed: int = 0
+    seed: int = setting(0, ge=0)
     gullies: bool = True
     boulders: bool = True
-    waviness: float = 0.0
-    waviness_seed: int = 0
-    # A simulation ends when the robot has come no further from the axis (by `PROGRESS`) for so long, in s; 0: never.
-    patience: float = 0.0
+    waviness: float = setting(0.0, unit="m", ge=0.0, le=0.1)
+    waviness_seed: int = setting(0, ge=0)
+    patience: float = setting(
+        0.0,
+        "A simulation ends when the robot has come no further from the axis (by `PROGRESS`) for so long; 0: never.",
+        unit="s",
+        ge=0.0,
+    )
 
     def validate(self) -> None:
         super().validate()
-        self.require(
-            slope_deg=(self.slope_deg == 0.0, "0: the crater's ground has slopes of its own"),
-            clearance=(0.0 <= self.clearance <= 0.15, "within [0, 0.15] m"),
-            seed=(self.seed >= 0, "not negative"),
-            waviness=(0.0 <= self.waviness <= 0.1, "within [0, 0.1] m"),
-            waviness_seed=(self.waviness_seed >= 0, "not negative"),
-            patience=(self.patience >= 0.0, "not negative, in s"),
-        )
+        if self.slope_deg != 0.0:
+            raise ScenarioError(
+                f"CraterScenario.slope_deg must be 0, not {self.slope_deg!r}: the crater's ground has slopes of its own"
+            )
 
     @property
     def crater(self) -> Crater:

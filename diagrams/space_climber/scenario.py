@@ -17,6 +17,7 @@ from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
+from vtbdrake.settings import setting
 from vtbdrake.state.systems import pose_later
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
@@ -52,30 +53,24 @@ class SpaceClimberScenario(Scenario):
     simulator_config: SimulatorConfig = field(default_factory=_cenic)
     # Contact is between point feet and a plane. A continuous plant is for CENIC; its joints cannot be locked.
     plant_config: MultibodyPlantConfig = field(default_factory=_continuous)
-    # Acceleration of free fall in m/s^2.
-    gravity: float = LUNAR_GRAVITY
-    # The ground falls in the direction of x, in which the robot looks, by this angle; uphill it is negative.
-    slope_deg: float = 0.0
-    # Static and dynamic friction of feet and ground.
-    friction: float = DEFAULT_FRICTION
-    # tripod, ripple or wave.
-    gait: str = "tripod"
-    # Period of sensors and DPS in seconds; every sample ends a step of the integrator.
-    period: float = 0.02
-    # False leaves the attachment out.
-    payload: bool = True
-    # True stops the joints at the ends of their ranges, which the DPS's commands never exceed; half as fast.
-    joint_stops: bool = False
-
-    def validate(self) -> None:
-        super().validate()
-        self.require(
-            gravity=(self.gravity > 0.0, "positive, in m/s^2"),
-            slope_deg=(abs(self.slope_deg) <= 45.0, "within 45 deg"),
-            friction=(self.friction >= 0.0, "not negative"),
-            gait=(self.gait in GAITS, f"one of {', '.join(GAITS)}"),
-            period=(self.period > 0.0, "positive, in s"),
-        )
+    gravity: float = setting(LUNAR_GRAVITY, "Acceleration of free fall.", unit="m/s^2", gt=0.0)
+    slope_deg: float = setting(
+        0.0,
+        "The ground falls in the direction of x, in which the robot looks, by this angle; uphill it is negative.",
+        unit="deg",
+        ge=-45.0,
+        le=45.0,
+    )
+    friction: float = setting(DEFAULT_FRICTION, "Static and dynamic friction of feet and ground.", ge=0.0)
+    gait: str = setting("tripod", "The gait.", choices=tuple(GAITS))
+    period: float = setting(
+        0.02, "Period of sensors and DPS; every sample ends a step of the integrator.", unit="s", gt=0.0
+    )
+    payload: bool = setting(True, "Whether the attachment is there.")
+    joint_stops: bool = setting(
+        False,
+        "Whether the joints stop at the ends of their ranges, which the DPS's commands never exceed; half as fast.",
+    )
 
     def interface(self) -> Interface:
         m = Morphology()

@@ -301,7 +301,7 @@ def another_snapshot(folder: Path) -> Path:
         ("tests.cli.careless:CarelessScenario", (), 2, "CarelessScenario cannot run on its machine: the actuator"),
         (SERVO, ("--set", "dps.gian=1"), 2, "did you mean dps.gain"),
         (SERVO, ("--field", "rtae=1"), 2, "no field 'rtae'"),
-        (SERVO, ("--field", "rate=fast"), 2, "takes a value of type float"),
+        (SERVO, ("--field", "rate=fast"), 2, "must be a finite number"),
         (SERVO, ("--pace", "posture"), 2, "paced by a sensor signal (position, speed), not by 'posture'"),
         (SERVO, ("--period", "0"), 2, "positive"),
         (SERVO, ("--url", "tcpq://127.0.0.1:1"), 1, "no LCM bus at tcpq://127.0.0.1:1"),

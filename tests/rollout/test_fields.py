@@ -180,7 +180,7 @@ def test_what_cannot_be_built_is_a_failed_rollout(make):
     ("point", "message"),
     [
         ({"scenario.stifness": 1.0}, "no field 'stifness' .*did you mean stiffness"),
-        ({STIFFNESS: "high"}, "takes a value of type float, not 'high'"),
+        ({STIFFNESS: "high"}, "must be a finite number, not 'high'"),
         ({STIFFNESS: -1.0}, "must not be negative, not -1.0"),
     ],
 )

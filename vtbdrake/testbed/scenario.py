@@ -9,10 +9,9 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from importlib.metadata import version
 from inspect import get_annotations
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -20,6 +19,7 @@ from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import System
 
 from vtbdrake.argument_checks import suggestion
+from vtbdrake.settings import check_settings, check_value, field_types, plain_types
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
@@ -112,13 +112,10 @@ class Scenario(ABC):
             plain = list(get_annotations(kind)) if "__dataclass_fields__" not in vars(kind) else []
             if plain and issubclass(kind, Scenario):
                 raise ScenarioError(f"{kind.__name__}.{plain[0]} is no field: decorate {kind.__name__} with @dataclass")
-        for key, owner, kinds in _scalar_fields(self):
-            value = getattr(owner, key.rpartition(".")[2])
-            if value is not None:  # A field that may be None has a type like float | None.
-                _scalar(value, kinds, f"{name}.{key}")
-        for key, value in _flat(self):
+        check_settings(self, error=ScenarioError)
+        for key, value in _flat(self):  # Arrays, too.
             if isinstance(value, float) and not math.isfinite(value):
-                raise ScenarioError(f"{name}.{key} must be finite, not {value}")
+                raise ScenarioError(f"{name}.{key} must be a finite number, not {value}")
         config = self.simulator_config
         if not isinstance(config, SimulatorConfig):
             raise ScenarioError(f"{name}.simulator_config is a SimulatorConfig of Drake, not {config!r}")
@@ -143,21 +140,6 @@ class Scenario(ABC):
                 f"{name}.simulator_config.start_time must be 0, not {config.start_time} s: a simulation starts at the "
                 "time of its Context, which you can set"
             )
-
-    def require(self, **checks: tuple[bool, str]) -> None:
-        """Check fields in `validate` of a subclass.
-
-        Args:
-            checks: Field -> (whether its value is valid, a phrase for the valid values). Nested fields have dotted
-                names.
-
-        Raises:
-            ScenarioError: A value is not valid; the message has field, phrase and value.
-        """
-        for name, (good, expected) in checks.items():
-            if not good:
-                value = attrgetter(name)(self)
-                raise ScenarioError(f"{type(self).__name__}.{name} must be {expected}, not {value!r}")
 
     def build(self, *, mode: str = "sim", meshcat: Meshcat | None = None, prefix: str = "") -> VirtualTestbed:
         """Build a new testbed.
@@ -259,13 +241,19 @@ class Scenario(ABC):
             ScenarioError: There is no such field, the value has another type, or the scenario rejects it.
         """
         changed = copy.deepcopy(self)
-        known = {name: (owner, kinds) for name, owner, kinds in _scalar_fields(changed)}
+        owners = {name: (owner, annotation) for name, owner, annotation in _plain_fields(changed)}
         for name, value in values.items():
-            if name not in known:
-                near = suggestion(name, known)
+            if name not in owners:
+                near = suggestion(name, owners)
                 raise ScenarioError(f"{type(self).__name__} has no field {name!r} of a plain type{near}")
-            owner, kinds = known[name]
-            setattr(owner, name.rpartition(".")[2], _scalar(value, kinds, f"{type(self).__name__}.{name}"))
+            owner, annotation = owners[name]
+            types = plain_types(annotation)
+            check_value(f"{type(self).__name__}.{name}", value, " | ".join(types), error=ScenarioError)
+            if isinstance(value, np.generic | np.ndarray):
+                value = value.item()
+            if type(value) is int and "int" not in types:
+                value = float(value)
+            setattr(owner, name.rpartition(".")[2], value)
         changed.validate()
         return changed
 
@@ -285,12 +273,6 @@ def check_is_scenario(value: Any) -> None:
 def class_name(scenario: type[Scenario]) -> str:
     """Return ``package.module:Class``, where the module is the one that defines the class."""
     return f"{scenario.__module__}:{scenario.__qualname__}"
-
-
-def field_types(owner: Any) -> dict[str, Any]:
-    """Return the types of the fields of a dataclass or of one of Drake's configs, by name; empty for anything else."""
-    items = fields(owner) if is_dataclass(owner) else getattr(owner, "__fields__", ())
-    return {item.name: item.type for item in items}
 
 
 def _values(owner: Any) -> dict[str, Any]:
@@ -359,30 +341,10 @@ def _make_config(kind: type, values: Mapping[str, Any]) -> Any:
     return config
 
 
-_SCALARS: dict[str, type] = {"bool": bool, "int": int, "float": float, "str": str}
-
-
-def _scalar_fields(owner: Any, prefix: str = "") -> Iterator[tuple[str, Any, tuple[type, ...]]]:
-    """Yield (dotted name, owner, types) of every field of a plain type, in ``owner`` and in its nested dataclasses."""
-    for name, declared in field_types(owner).items():
-        value = getattr(owner, name)
-        if field_types(value):
-            yield from _scalar_fields(value, f"{prefix}{name}.")
-            continue
-        # By their names: in another process, those of a class from a notebook cannot be looked up.
-        kind = declared.__name__ if isinstance(declared, type) else str(declared)
-        names = [part.strip() for part in kind.split("|")]
-        kinds = tuple(_SCALARS[part] for part in names if part in _SCALARS)
-        if kinds:
-            yield f"{prefix}{name}", owner, kinds
-
-
-def _scalar(value: Any, kinds: tuple[type, ...], name: str) -> Any:
-    if isinstance(value, np.generic | np.ndarray) and np.ndim(value) == 0:
-        value = value.item()
-    if type(value) is int and int not in kinds and float in kinds:
-        value = float(value)
-    if type(value) not in kinds:
-        expected = " or ".join(kind.__name__ for kind in kinds)
-        raise ScenarioError(f"{name} takes a value of type {expected}, not {value!r} of type {type(value).__name__}")
-    return value
+def _plain_fields(owner: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (dotted name, owner, type) of every field of a plain type, in ``owner`` and in its nested dataclasses."""
+    for name, annotation in field_types(owner).items():
+        if field_types(value := getattr(owner, name)):
+            yield from _plain_fields(value, f"{prefix}{name}.")
+        elif plain_types(annotation):
+            yield f"{prefix}{name}", owner, annotation

@@ -16,7 +16,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
-from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name, field_types
+from vtbdrake.settings import field_types
+from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name
 
 _LARGEST_FILE = 1 << 22  # bytes
 _MOST_NODES = 100_000

@@ -36,6 +36,7 @@ from vtbdrake.cli.output import table
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
+from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import Track, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
@@ -91,7 +92,11 @@ class RouteScenario(ForestScenario):
 
     def validate(self) -> None:
         super().validate()
-        self.require(map_file=(not self.map_file, "empty: what the carrier imagines is grown from the seed"))
+        if self.map_file:
+            raise ScenarioError(
+                f"RouteScenario.map_file must be empty, not {self.map_file!r}: what the carrier imagines is grown from "
+                "the seed"
+            )
 
     def mental(self) -> RouteScenario:
         """Return the scenario that the carrier simulates when it reasons."""

@@ -28,6 +28,7 @@ from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScannerConfig, connect_laser_scanner
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.scan import Scan
+from vtbdrake.settings import setting
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.visualization.plots import Picture, finish
@@ -81,26 +82,21 @@ class ApproachScenario(Scenario):
 
     # Discrete, as in a capture, with the same step.
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
-    # Of the tumble's axis and the target's attitude.
-    seed: int = 0
-    # The target's angular velocity, in deg/s.
-    tumble_deg: float = 2.0
-    # The speed at which it comes closer, in m/s.
-    closing_speed: float = CLOSING_SPEED
-    # Whether scans are corrected by the estimated motion of the target.
-    deskew: bool = True
+    seed: int = setting(0, "Determines the tumble's axis and the target's attitude.", ge=0)
+    tumble_deg: float = setting(
+        2.0,
+        "The target's angular velocity.",
+        unit="deg/s",
+        ge=0.0,
+        le=4.5,
+        remedy="beyond, the first scan sees no front",
+    )
+    closing_speed: float = setting(CLOSING_SPEED, "The speed at which it comes closer.", unit="m/s", ge=0.0, le=0.5)
+    deskew: bool = setting(True, "Whether scans are corrected by the estimated motion of the target.")
     scanner: LaserScannerConfig = field(default_factory=lambda: LaserScannerConfig(**vars(SCANNER)))
     scan_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=RANGE_NOISE))
     # Its noise is in rad/s (gyros) and in m/s^2 (accelerometers).
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1e-4))
-
-    def validate(self) -> None:
-        super().validate()
-        self.require(
-            seed=(self.seed >= 0, "not negative"),
-            tumble_deg=(0.0 <= self.tumble_deg <= 4.5, "within [0, 4.5] deg/s: beyond, the first scan sees no front"),
-            closing_speed=(0.0 <= self.closing_speed <= 0.5, "within [0, 0.5] m/s"),
-        )
 
     def interface(self) -> Interface:
         return Interface(

@@ -55,11 +55,11 @@ def test_values_out_of_range_are_refused(name: str, allowed: object, refused: ob
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"direction": [0.0, 0.0, 0.0]}, "direction is a vector of three finite numbers, not zero"),
-        ({"earth_direction": [1.0, 0.0]}, "earth_direction is a vector of three"),
-        ({"intensity": -1.0}, "intensity is finite and not negative"),
-        ({"earth_shine": float("inf")}, "earth_shine is finite"),
-        ({"color": [1.0, 1.0, 1.1]}, "color is red, green and blue between 0 and 1"),
+        ({"direction": [0.0, 0.0, 0.0]}, "LightConfig.direction must be three numbers, and not zero"),
+        ({"earth_direction": [1.0, 0.0]}, "earth_direction must be three numbers"),
+        ({"intensity": -1.0}, "intensity must be a finite number of at least 0, not -1.0"),
+        ({"earth_shine": float("inf")}, "earth_shine must be a finite number"),
+        ({"color": [1.0, 1.0, 1.1]}, r"color.2. must be a number from 0 to 1, not 1.1"),
     ],
 )
 def test_impossible_configs_are_refused(changes: dict[str, object], reason: str) -> None:

@@ -113,5 +113,5 @@ def test_ground_alone_has_no_rocks():
 def test_bad_input_is_rejected():
     with pytest.raises(ValueError, match="finite numbers"):
         detect_rocks(np.full((3, 3), np.inf), RockDetector(), p_HoLo_H=EYE)
-    with pytest.raises(ValueError, match="least_points must be at least 2, not 1"):
+    with pytest.raises(ValueError, match="least_points must be a whole number of at least 2, not 1"):
         RockDetector(least_points=1)

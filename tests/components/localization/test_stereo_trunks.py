@@ -200,10 +200,10 @@ def test_rendered_trunks_are_found_within_their_covariances() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"heights": (1.0, -1.0)}, "heights must be in m, two heights above the camera"),
-        ({"extent": 3.0}, "extent must be in m, positive and less than"),
+        ({"heights": (1.0, -1.0)}, "heights must be the lower one, then the upper one"),
+        ({"extent": 3.0}, "extent must be below the height of the slice, 2.8 m, not 3.0"),
         ({"largest_diameter": 0.01}, "least_diameter must be"),
-        ({"disparity_deviation": 0.0}, "disparity_deviation must be in pixels, positive, not 0.0"),
+        ({"disparity_deviation": 0.0}, "disparity_deviation must be a finite number above 0 pixels, not 0.0"),
     ],
 )
 def test_impossible_detectors_are_refused(values: dict[str, object], message: str) -> None:

@@ -220,11 +220,11 @@ def test_bad_input_is_rejected():
         detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
     with pytest.raises(ValueError, match="shape"):
         detect_trunks(np.ones((3, 2)), TrunkDetector(), p_HoLo_H=EYE)
-    with pytest.raises(ValueError, match="range_noise must be in m, positive, not 0"):
+    with pytest.raises(ValueError, match="TrunkDetector.range_noise must be a finite number above 0 m, not 0"):
         TrunkDetector(range_noise=0.0)
-    with pytest.raises(ValueError, match="two positive heights"):
+    with pytest.raises(ValueError, match="heights must be the lower one, then the upper one"):
         TrunkDetector(heights=(2.0, 1.0))
-    with pytest.raises(ValueError, match="cell must be in m, at least a 2000th of the reach, not 0.01"):
+    with pytest.raises(ValueError, match="cell must be at least 0.02 m, a 2000th of the reach, not 0.01"):
         TrunkDetector(reach=40.0, cell=0.01)
 
 

@@ -383,7 +383,10 @@ def test_camera_inside_a_body_is_refused() -> None:
         ({"photon_noise": -1.0}, "standard deviation"),
         ({"supersampling": 0}, "whole number of points"),
         ({"errors": ErrorModel(bias=1.0)}, "no bias"),
-        ({"errors": ErrorModel(latency=-1)}, "whole number of periods"),
+        (
+            {"errors": ErrorModel(latency=-1)},
+            "latency must be a whole number of at least 0 periods, not -1",
+        ),
     ],
 )
 def test_impossible_cameras_are_refused(wrong: dict, match: str) -> None:

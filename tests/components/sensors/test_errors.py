@@ -204,7 +204,7 @@ def test_channels_of_a_stream_are_independent() -> None:
     ],
 )
 def test_impossible_errors_are_refused(errors: ErrorModel) -> None:
-    with pytest.raises(ValueError, match=r"Ramp: \w+ must be"):
+    with pytest.raises(ValueError, match=r"Ramp.errors.\w+ must be"):
         Ramp(errors)
 
 

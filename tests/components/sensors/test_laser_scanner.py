@@ -384,14 +384,14 @@ def test_before_the_first_scan_there_are_no_returns() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"frequency": 0.0}, "frequency must be in scans per s, above 0 and at most 50, one per slice, not 0.0"),
-        ({"frequency": 60.0}, "at most 50, one per slice, not 60.0"),
-        ({"azimuth": 0.0}, "azimuth must be in rad, above 0"),
-        ({"elevation": -0.1}, "elevation must be in rad, between 0 and pi"),
-        ({"min_range": -1.0}, "min_range must be in m, positive"),
-        ({"max_range": 0.1}, "max_range must be in m, finite and above min_range"),
+        ({"frequency": 0.0}, "frequency must be a finite number above 0 Hz, not 0.0"),
+        ({"frequency": 60.0}, "frequency must be at most 50 Hz, one scan per slice, not 60.0"),
+        ({"azimuth": 0.0}, "azimuth must be a number above 0 and at most 6.28319 rad"),
+        ({"elevation": -0.1}, "elevation must be a number from 0 to 3.14159 rad"),
+        ({"min_range": -1.0}, "min_range must be a finite number above 0 m"),
+        ({"max_range": 0.1}, "max_range must be above the min_range, 0.2 m, not 0.1"),
         ({"rays_per_second": 1.0}, "at least one ray per scan"),
-        ({"divergence": -1.0}, "divergence must be in rad"),
+        ({"divergence": -1.0}, "divergence must be a number from 0 to below 0.5 rad"),
     ],
 )
 def test_impossible_scanners_are_refused(changed: dict[str, float], message: str) -> None:

@@ -167,11 +167,11 @@ def test_it_can_run_on_its_machine() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"period": 0.0}, "period must be positive"),
-        ({"force_limit": -1.0}, "force_limit must be positive"),
+        ({"period": 0.0}, "period must be a finite number above 0 s"),
+        ({"force_limit": -1.0}, "force_limit must be a finite number above 0 N"),
         ({"order": "quintic"}, "one of zero, linear, cubic, bspline"),
         ({"knots": 1}, "at least 2 knots, not 1"),
-        ({"position_errors": ErrorModel(dropout=2.0)}, "position_errors: dropout must be"),
+        ({"position_errors": ErrorModel(dropout=2.0)}, "position_errors.dropout must be a number from 0 to 1, not 2.0"),
     ],
 )
 def test_bad_fields_are_refused(fields: dict, message: str) -> None:

@@ -44,10 +44,10 @@ def start(testbed: VirtualTestbed, motion: int) -> Context:
     ("fields", "message"),
     [
         ({"law": "magic"}, "law must be one of joint_impedance, cartesian_impedance, admittance"),
-        ({"period": 0.0}, "period must be positive"),
-        ({"wall_stiffness": -1.0}, "wall_stiffness must be positive"),
-        ({"plant_config": MultibodyPlantConfig(time_step=0.0)}, "time_step must be positive"),
-        ({"position_errors": ErrorModel(dropout=2.0)}, "position_errors: dropout must be"),
+        ({"period": 0.0}, "period must be a finite number above 0 s"),
+        ({"wall_stiffness": -1.0}, "wall_stiffness must be a finite number above 0 N/m"),
+        ({"plant_config": MultibodyPlantConfig(time_step=0.0)}, "time_step must be a number above 0 s"),
+        ({"position_errors": ErrorModel(dropout=2.0)}, "ManipulatorScenario.position_errors.dropout must be"),
     ],
 )
 def test_bad_fields_are_refused(fields: dict, message: str) -> None:

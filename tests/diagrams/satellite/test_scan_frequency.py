@@ -106,5 +106,5 @@ def test_every_printed_claim_can_be_refuted() -> None:
 
 
 def test_tumbles_that_hide_the_front_are_refused() -> None:
-    with pytest.raises(ScenarioError, match="tumble_deg must be within"):
+    with pytest.raises(ScenarioError, match="tumble_deg must be a number from 0 to 4.5 deg/s"):
         ApproachScenario(tumble_deg=10.0).build()

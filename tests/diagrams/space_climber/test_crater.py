@@ -214,9 +214,9 @@ def test_the_believed_elevation_is_that_of_the_map(mental: VirtualTestbed) -> No
     ("fields", "message"),
     [
         ({"slope_deg": 5.0}, "slope_deg must be 0"),
-        ({"clearance": 0.3}, "clearance must be within"),
-        ({"waviness": -0.01}, "waviness must be within"),
-        ({"seed": -1}, "seed must be not negative"),
+        ({"clearance": 0.3}, "clearance must be a number from 0 to 0.15 m"),
+        ({"waviness": -0.01}, "waviness must be a number from 0 to 0.1 m"),
+        ({"seed": -1}, "seed must be a whole number of at least 0"),
     ],
 )
 def test_a_crater_that_makes_no_sense_is_refused(fields: dict[str, float], message: str) -> None:

@@ -112,11 +112,11 @@ def test_the_simulated_world_starts_from_what_the_robot_believes() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"gravity": -1.62}, "gravity must be positive"),
+        ({"gravity": -1.62}, "gravity must be a finite number above 0 m/s"),
         ({"gait": "gallop"}, "gait must be one of tripod, ripple, wave, not 'gallop'"),
-        ({"slope_deg": 60.0}, "slope_deg must be within 45 deg"),
-        ({"friction": -0.1}, "friction must be not negative"),
-        ({"period": 0.0}, "period must be positive"),
+        ({"slope_deg": 60.0}, "slope_deg must be a number from -45 to 45 deg"),
+        ({"friction": -0.1}, "friction must be a finite number of at least 0"),
+        ({"period": 0.0}, "period must be a finite number above 0 s"),
     ],
 )
 def test_a_world_that_makes_no_sense_is_refused(fields, message) -> None:

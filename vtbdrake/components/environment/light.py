@@ -8,14 +8,15 @@ full scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from math import inf, isfinite, sqrt
+from dataclasses import dataclass
+from math import hypot, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.components.environment.conditions import Conditions
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import NamedVector, Quantity
 
 if TYPE_CHECKING:
@@ -45,38 +46,44 @@ def earth_shine(altitude: float) -> float:
 class LightConfig:
     """The light of a scene."""
 
-    # Direction in which the sunlight travels, in W; of any length. By default from straight above.
-    direction: list[float] = field(default_factory=lambda: [0.0, 0.0, -1.0])
-    # Brightness of a white surface that faces the sun.
-    intensity: float = 1.0
-    # Red, green and blue of the sunlight, between 0 and 1.
-    color: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    # Direction in which light from the Earth travels, in W; of any length.
-    earth_direction: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])
-    # Brightness of a white surface that faces the Earth, see `earth_shine`.
-    earth_shine: float = 0.0
-    # Red, green and blue of what is seen where nothing is, between 0 and 1.
-    background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    # Whether bodies shade each other from the sun.
-    shadows: bool = True
+    direction: list[float] = setting(
+        default_factory=lambda: [0.0, 0.0, -1.0],
+        doc="Direction in which the sunlight travels, in W; of any length. By default from straight above.",
+    )
+    intensity: float = setting(1.0, "Brightness of a white surface that faces the sun.", ge=0.0)
+    color: list[float] = setting(
+        default_factory=lambda: [1.0, 1.0, 1.0], doc="Red, green and blue of the sunlight.", ge=0.0, le=1.0
+    )
+    earth_direction: list[float] = setting(
+        default_factory=lambda: [0.0, 0.0, 1.0],
+        doc="Direction in which light from the Earth travels, in W; of any length.",
+    )
+    earth_shine: float = setting(0.0, "Brightness of a white surface that faces the Earth, see `earth_shine`.", ge=0.0)
+    background: list[float] = setting(
+        default_factory=lambda: [0.0, 0.0, 0.0],
+        doc="Red, green and blue of what is seen where nothing is.",
+        ge=0.0,
+        le=1.0,
+    )
+    shadows: bool = setting(True, "Whether bodies shade each other from the sun.")
 
-    def check(self) -> None:
-        """Raise a ValueError if a value is impossible.
+    def check(self, name: str = "LightConfig") -> None:
+        """Raise a ValueError if no light can have such values.
+
+        Args:
+            name: The name of the configuration in messages.
 
         Raises:
             ValueError: A value that no light can have.
         """
-        for name in ("direction", "earth_direction"):
-            value = getattr(self, name)
-            if len(value) != 3 or not 0.0 < sqrt(sum(x * x for x in value)) < inf:
-                raise ValueError(f"Light: {name} is a vector of three finite numbers, not zero, not {value!r}")
-        for name in ("intensity", "earth_shine"):
-            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(f"Light: {name} is finite and not negative, not {getattr(self, name)!r}")
-        for name in ("color", "background"):
-            value = getattr(self, name)
-            if len(value) != 3 or not all(0.0 <= x <= 1.0 for x in value):
-                raise ValueError(f"Light: {name} is red, green and blue between 0 and 1, not {value!r}")
+        check_settings(self, name=name)
+        for key in ("direction", "earth_direction"):
+            value = getattr(self, key)
+            if len(value) != 3 or not 0.0 < hypot(*value) < inf:
+                raise ValueError(f"{name}.{key} must be three numbers, and not zero, not {value!r}")
+        for key in ("color", "background"):
+            if len(getattr(self, key)) != 3:
+                raise ValueError(f"{name}.{key} must be red, green and blue, not {getattr(self, key)!r}")
 
 
 class Light(Conditions):

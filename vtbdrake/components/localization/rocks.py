@@ -12,7 +12,7 @@ little more than the top, so that a rock may be wider on the ground by about the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, pi
+from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
 from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetector, Scene
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import setting
 
 Array = NDArray[np.float64]
 
@@ -29,39 +29,38 @@ Array = NDArray[np.float64]
 class RockDetector(ScanDetector):
     """Settings of the detector of rocks, beside those of `ScanDetector`.
 
-    Attributes:
-        least_height: The least height over the ground of a point of a rock, in m; more than that of waves of the ground
-            that are too short for `fit_ground` to follow.
-        least_roundness: The least bulge of the visible outline, as a share of that of a circle of the same width.
-        least_width: The least width of a rock in m.
-        largest_width: The largest width of a rock in m.
-        least_points: The least number of points of a rock.
-        cell: Edge length in m of the cells into which points are sorted; two rocks closer than this become one.
-        elongation: Standard deviation of the diameters of a rock's outline, as a share of their mean.
-
     Raises:
         ValueError: A setting is outside of its range.
     """
 
-    least_height: float = 0.06
-    least_roundness: float = 0.4
-    least_width: float = 0.2
-    largest_width: float = 3.0
-    least_points: int = 3
-    cell: float = 0.2
-    elongation: float = 0.25
+    least_height: float = setting(
+        0.06,
+        "The least height over the ground of a point of a rock; more than that of waves of the ground that "
+        "are too short for `fit_ground` to follow.",
+        unit="m",
+        gt=0.0,
+    )
+    least_roundness: float = setting(
+        0.4, "The least bulge of the visible outline, as a share of that of a circle of the same width.", ge=0.0, lt=1.0
+    )
+    least_width: float = setting(0.2, "The least width of a rock.", unit="m", gt=0.0)
+    largest_width: float = setting(3.0, "The largest width of a rock.", unit="m", gt=0.0)
+    least_points: int = setting(3, "The least number of points of a rock.", ge=2)
+    cell: float = setting(
+        0.2,
+        "Edge length of the cells into which points are sorted; two rocks closer than this become one.",
+        unit="m",
+        gt=0.0,
+    )
+    elongation: float = setting(
+        0.25, "Standard deviation of the diameters of a rock's outline, as a share of their mean.", ge=0.0, lt=1.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks = {
-            "least_height": (0.0 < self.least_height < inf, "in m, positive"),
-            "least_roundness": (0.0 <= self.least_roundness < 1.0, "a share from 0 to below 1"),
-            "least_width": (0.0 < self.least_width < self.largest_width, "in m, below the largest_width"),
-            "largest_width": (self.largest_width < inf, "in m, finite"),
-            "least_points": (self.least_points >= 2, "at least 2"),
-            "elongation": (0.0 <= self.elongation < 1.0, "a share from 0 to below 1"),
-        }
-        check_settings("RockDetector", self, checks)
+        if not self.least_width < self.largest_width:
+            most = f"below the largest_width, {self.largest_width:g} m"
+            raise ValueError(f"RockDetector.least_width must be {most}, not {self.least_width!r}")
 
 
 def detect_rocks(points_H: ArrayLike, detector: RockDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
 from vtbdrake.components.localization.ground import fit_ground
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import check_settings, setting
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -28,35 +28,30 @@ _ON_GROUND, _GROUND_SHARE = 0.2, 0.15
 class ScanDetector:
     """Settings that all detectors of landmarks in scans have; angles and noise must be those of the scanner.
 
-    Attributes:
-        azimuth_step: Angle between neighbouring rays of a row of the scanner in rad.
-        elevation_step: Angle between neighbouring rows of the scanner in rad.
-        range_noise: Standard deviation of the ranges in m.
-        reach: The largest distance in m from the scanner at which landmarks are searched for.
-        ground_height: The z in H of the ground under the scanner in m: 0 if the origin of B is on the ground.
-        cell: Edge length in m of the cells into which points are sorted.
-
     Raises:
         ValueError: A setting is outside of its range.
     """
 
-    azimuth_step: float = 2.0 * pi / 1250
-    elevation_step: float = pi / 6.0 / 16
-    range_noise: float = 0.02
-    reach: float = 25.0
-    ground_height: float = 0.0
-    cell: float = 0.15
+    azimuth_step: float = setting(
+        2.0 * pi / 1250, "Angle between neighbouring rays of a row of the scanner.", unit="rad", gt=0.0, lt=0.1
+    )
+    elevation_step: float = setting(
+        pi / 6.0 / 16, "Angle between neighbouring rows of the scanner.", unit="rad", gt=0.0, lt=0.5
+    )
+    range_noise: float = setting(0.02, "Standard deviation of the ranges.", unit="m", gt=0.0)
+    reach: float = setting(
+        25.0, "The largest distance from the scanner at which landmarks are searched for.", unit="m", gt=0.0, le=200.0
+    )
+    ground_height: float = setting(
+        0.0, "The z in H of the ground under the scanner: 0 if the origin of B is on the ground.", unit="m"
+    )
+    cell: float = setting(0.15, "Edge length of the cells into which points are sorted.", unit="m", gt=0.0)
 
     def __post_init__(self) -> None:
-        checks = {
-            "azimuth_step": (0.0 < self.azimuth_step < 0.1, "in rad, above 0 and below 0.1"),
-            "elevation_step": (0.0 < self.elevation_step < 0.5, "in rad, above 0 and below 0.5"),
-            "range_noise": (0.0 < self.range_noise < inf, "in m, positive"),
-            "reach": (0.0 < self.reach <= 200.0, "in m, positive and at most 200"),
-            "ground_height": (-inf < self.ground_height < inf, "in m, finite"),
-            "cell": (self.reach / 2000.0 <= self.cell < inf, "in m, at least a 2000th of the reach"),
-        }
-        check_settings(type(self).__name__, self, checks)
+        check_settings(self)
+        if self.cell < self.reach / 2000.0:
+            least = f"{self.reach / 2000.0:g} m, a 2000th of the reach"
+            raise ValueError(f"{type(self).__name__}.cell must be at least {least}, not {self.cell!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from scipy.ndimage import convolve1d, find_objects, label
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.perception.stereo import StereoCamera
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import check_settings, setting
 
 Array = NDArray[np.float64]
 
@@ -40,51 +40,55 @@ _FACE = pi / 4.0
 class StereoTrunkDetector:
     """Settings of the detector of trunks in disparities.
 
-    Attributes:
-        heights: The lower and the upper end of the slice that is searched, in m above the camera.
-        extent: The least height in m of the part of an object that is seen within the slice.
-        reach: The largest distance in m at which trunks are searched for.
-        least_diameter: The least diameter of a trunk in m.
-        largest_diameter: The largest diameter of a trunk in m.
-        disparity_deviation: Standard deviation of the mean disparity of a trunk, in pixels.
-        disparity_bias: Standard deviation of the common error of all disparities, in pixels: cameras are misaligned.
-        middle_deviation: Standard deviation of the column of the middle of a trunk, in pixels.
-        width_deviation: Standard deviation of the width of a trunk, in pixels.
-        fattening: Number of pixels by which trunks appear too wide, as matching widens near objects.
-        floor: Standard deviation in m added to positions, per axis, and diameters: trunks are not round, nor upright.
-
     Raises:
         ValueError: A setting is outside of its range.
     """
 
-    heights: tuple[float, float] = (-1.3, 1.5)
-    extent: float = 1.8
-    reach: float = 16.0
-    least_diameter: float = 0.04
-    largest_diameter: float = 0.7
-    disparity_deviation: float = 0.2
-    disparity_bias: float = 0.05
-    middle_deviation: float = 1.2
-    width_deviation: float = 3.0
-    fattening: float = 1.0
-    floor: float = 0.02
+    heights: tuple[float, float] = setting(
+        (-1.3, 1.5), "The lower and the upper end of the slice that is searched, above the camera.", unit="m"
+    )
+    extent: float = setting(
+        1.8, "The least height of the part of an object that is seen within the slice.", unit="m", gt=0.0
+    )
+    reach: float = setting(16.0, "The largest distance at which trunks are searched for.", unit="m", gt=0.0)
+    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", ge=0.0)
+    largest_diameter: float = setting(0.7, "The largest diameter of a trunk.", unit="m", gt=0.0)
+    disparity_deviation: float = setting(
+        0.2, "Standard deviation of the mean disparity of a trunk.", unit="pixels", gt=0.0
+    )
+    disparity_bias: float = setting(
+        0.05,
+        "Standard deviation of the common error of all disparities: cameras are misaligned.",
+        unit="pixels",
+        ge=0.0,
+    )
+    middle_deviation: float = setting(
+        1.2, "Standard deviation of the column of the middle of a trunk.", unit="pixels", gt=0.0
+    )
+    width_deviation: float = setting(3.0, "Standard deviation of the width of a trunk.", unit="pixels", gt=0.0)
+    fattening: float = setting(
+        1.0, "Number of pixels by which trunks appear too wide, as matching widens near objects.", unit="pixels", ge=0.0
+    )
+    floor: float = setting(
+        0.02,
+        "Standard deviation that is added to positions, per axis, and diameters: trunks are not round, nor upright.",
+        unit="m",
+        ge=0.0,
+    )
 
     def __post_init__(self) -> None:
+        check_settings(self)
         low, high = self.heights
-        checks = {
-            "heights": (-inf < low < high < inf, "in m, two heights above the camera, the lower one first"),
-            "extent": (0.0 < self.extent < high - low, "in m, positive and less than the slice is high"),
-            "reach": (0.0 < self.reach < inf, "in m, positive"),
-            "least_diameter": (0.0 <= self.least_diameter < self.largest_diameter, "in m, below the largest_diameter"),
-            "largest_diameter": (self.largest_diameter < inf, "in m, finite"),
-            "disparity_deviation": (0.0 < self.disparity_deviation < inf, "in pixels, positive"),
-            "disparity_bias": (0.0 <= self.disparity_bias < inf, "in pixels, at least 0"),
-            "middle_deviation": (0.0 < self.middle_deviation < inf, "in pixels, positive"),
-            "width_deviation": (0.0 < self.width_deviation < inf, "in pixels, positive"),
-            "fattening": (0.0 <= self.fattening < inf, "in pixels, at least 0"),
-            "floor": (0.0 <= self.floor < inf, "in m, at least 0"),
-        }
-        check_settings("StereoTrunkDetector", self, checks)
+        if not low < high:
+            raise ValueError(
+                f"StereoTrunkDetector.heights must be the lower one, then the upper one, not {self.heights!r}"
+            )
+        if not self.extent < high - low:
+            most = f"below the height of the slice, {high - low:g} m"
+            raise ValueError(f"StereoTrunkDetector.extent must be {most}, not {self.extent!r}")
+        if not self.least_diameter < self.largest_diameter:
+            most = f"below the largest_diameter, {self.largest_diameter:g} m"
+            raise ValueError(f"StereoTrunkDetector.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
 def detect_stereo_trunks(

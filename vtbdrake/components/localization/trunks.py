@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
 from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetector, Scene
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import setting
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -59,56 +59,54 @@ class TrunkDetector(ScanDetector):
 
     Trunks whose bark is less than two cells apart become one object, which is mostly rejected.
 
-    Attributes:
-        roughness: Standard deviation of the surface of a trunk from a cylinder in m: bark, ovality.
-        heights: The lower and the upper end of the slice over the ground in m.
-        reference_height: Height over the ground in m of the point of the axis that is the position of the landmark.
-        least_diameter: The least diameter of a trunk in m.
-        largest_diameter: The largest diameter of a trunk in m.
-        upright_share: The least share of the rows of rays passing a place that a trunk there returns.
-        typical_diameter: Mean of the prior of the diameters in m.
-        diameter_spread: Standard deviation of the prior of the diameters in m.
-        lean: Standard deviation of the prior of the lean in rad, per axis.
-        largest_misfit: The largest mean square of the weighted errors of the ranges, in units of their variance.
-        position_floor: Standard deviation in m, per axis, that is added to that of the fit: the axis is not straight,
-            and the foot of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad.
-        diameter_floor: Standard deviation in m that is added to that of the fitted diameter, for taper and ovality.
-
     Raises:
         ValueError: A setting is outside of its range.
     """
 
-    roughness: float = 0.005
-    heights: tuple[float, float] = (0.7, 2.7)
-    reference_height: float = 1.3
-    least_diameter: float = 0.04
-    largest_diameter: float = 0.7
-    upright_share: float = 0.5
-    typical_diameter: float = 0.2
-    diameter_spread: float = 0.15
-    lean: float = 0.03
-    largest_misfit: float = 2.0
-    position_floor: float = 0.015
-    diameter_floor: float = 0.01
+    roughness: float = setting(
+        0.005, "Standard deviation of the surface of a trunk from a cylinder: bark, ovality.", unit="m", ge=0.0
+    )
+    heights: tuple[float, float] = setting(
+        (0.7, 2.7), "The lower and the upper end of the slice over the ground.", unit="m", gt=0.0
+    )
+    reference_height: float = setting(
+        1.3, "Height over the ground of the point of the axis that is the position of the landmark.", unit="m", ge=0.0
+    )
+    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", gt=0.0)
+    largest_diameter: float = setting(0.7, "The largest diameter of a trunk.", unit="m", gt=0.0)
+    upright_share: float = setting(
+        0.5, "The least share of the rows of rays passing a place that a trunk there returns.", ge=0.0, le=1.0
+    )
+    typical_diameter: float = setting(0.2, "Mean of the prior of the diameters.", unit="m", gt=0.0)
+    diameter_spread: float = setting(0.15, "Standard deviation of the prior of the diameters.", unit="m", gt=0.0)
+    lean: float = setting(0.03, "Standard deviation of the prior of the lean, per axis.", unit="rad", gt=0.0, lt=0.5)
+    largest_misfit: float = setting(
+        2.0,
+        "The largest mean square of the weighted errors of the ranges, in units of their variance.",
+        gt=0.0,
+        finite=False,
+    )
+    position_floor: float = setting(
+        0.015,
+        "Standard deviation, per axis, that is added to that of the fit: the axis is not straight, and the "
+        "foot of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad.",
+        unit="m",
+        ge=0.0,
+    )
+    diameter_floor: float = setting(
+        0.01,
+        "Standard deviation that is added to that of the fitted diameter, for taper and ovality.",
+        unit="m",
+        ge=0.0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self.heights
-        checks = {
-            "roughness": (0.0 <= self.roughness < inf, "in m, at least 0"),
-            "heights": (0.0 < low < high < inf, "in m, two positive heights, the lower one first"),
-            "reference_height": (0.0 <= self.reference_height < inf, "in m, at least 0"),
-            "least_diameter": (0.0 < self.least_diameter < self.largest_diameter, "in m, below the largest_diameter"),
-            "largest_diameter": (self.largest_diameter < inf, "in m, finite"),
-            "upright_share": (0.0 <= self.upright_share <= 1.0, "a share from 0 to 1"),
-            "typical_diameter": (0.0 < self.typical_diameter < inf, "in m, positive"),
-            "diameter_spread": (0.0 < self.diameter_spread < inf, "in m, positive"),
-            "lean": (0.0 < self.lean < 0.5, "in rad, above 0 and below 0.5"),
-            "largest_misfit": (self.largest_misfit > 0.0, "positive"),
-            "position_floor": (0.0 <= self.position_floor < inf, "in m, at least 0"),
-            "diameter_floor": (0.0 <= self.diameter_floor < inf, "in m, at least 0"),
-        }
-        check_settings("TrunkDetector", self, checks)
+        if not self.heights[0] < self.heights[1]:
+            raise ValueError(f"TrunkDetector.heights must be the lower one, then the upper one, not {self.heights!r}")
+        if not self.least_diameter < self.largest_diameter:
+            most = f"below the largest_diameter, {self.largest_diameter:g} m"
+            raise ValueError(f"TrunkDetector.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
 def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:

@@ -35,6 +35,7 @@ from vtbdrake.components.rendering import FILL, SUN, Illumination, RenderedScene
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream, uniform_noise
 from vtbdrake.components.shadows import sunlit
+from vtbdrake.settings import check_settings
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
@@ -158,7 +159,7 @@ class Camera(AddressedSystem):
         """
         super().__init__()
         errors = errors or ErrorModel()
-        errors.check("Camera")
+        check_settings(errors, name="Camera.errors")
         for name in ("bias", "drift", "quantization", "outlier_probability", "outlier_size"):
             if getattr(errors, name):
                 raise ValueError(f"Camera: images have no {name}; leave it out of the errors")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import inf, isfinite, sqrt
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.noise import normal_noise, random_stream, uniform_noise
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
 
 # Channels of a sensor's stream; 0 is its white noise.
@@ -36,53 +36,31 @@ class ErrorModel:
     The values hold for all entries of the sensor; by address, they can be set entry by entry, and changed at any time.
     """
 
-    # Standard deviation of white noise, in the unit of the signal.
-    noise: float = 0.0
-    # Constant offset, in the unit of the signal.
-    bias: float = 0.0
-    # Standard deviation of the random walk after one second, in the signal's unit per root second.
-    drift: float = 0.0
-    # Resolution of the sensor; 0 is infinitely fine.
-    quantization: float = 0.0
-    # Age of a sample when it is shown, in whole periods.
-    latency: int = 0
-    # The largest latency that can be set by address; at least `latency`.
-    max_latency: int = 0
-    # Probability that a sample does not arrive.
-    dropout: float = 0.0
-    # Probability that a sample is an outlier, in all its entries.
-    outlier_probability: float = 0.0
-    # Standard deviation of the error of an outlier, in the unit of the signal.
-    outlier_size: float = 0.0
-    # Seed of all random numbers. Sensors of one seed are independent: each has a stream of random numbers of its own.
-    seed: int = 0
+    noise: float = setting(0.0, "Standard deviation of white noise, in the unit of the signal.", ge=0.0)
+    bias: float = setting(0.0, "Constant offset, in the unit of the signal.")
+    drift: float = setting(
+        0.0, "Standard deviation of the random walk after one second, in the signal's unit per root second.", ge=0.0
+    )
+    quantization: float = setting(0.0, "Resolution of the sensor; 0 is infinitely fine.", ge=0.0)
+    latency: int = setting(0, "Age of a sample when it is shown, in whole periods.", unit="periods", ge=0)
+    max_latency: int = setting(0, "The largest latency that can be set by address; at least `latency`.", ge=0)
+    dropout: float = setting(0.0, "Probability that a sample does not arrive.", ge=0.0, le=1.0)
+    outlier_probability: float = setting(
+        0.0, "Probability that a sample is an outlier, in all its entries.", ge=0.0, le=1.0
+    )
+    outlier_size: float = setting(
+        0.0, "Standard deviation of the error of an outlier, in the unit of the signal.", ge=0.0
+    )
+    seed: int = setting(
+        0,
+        "Seed of all random numbers. Sensors of one seed are independent: each has a stream of random numbers.",
+        ge=0,
+        le=2**53,
+    )
 
     def without_chance(self) -> ErrorModel:
         """Return the model without its random errors, as predictions need it."""
         return replace(self, noise=0.0, drift=0.0, dropout=0.0, outlier_probability=0.0)
-
-    def check(self, owner: str) -> None:
-        """Raise a ValueError if no sensor can have such errors.
-
-        Raises:
-            ValueError: No sensor can have such a value.
-        """
-        checks = {
-            "noise": (0.0 <= self.noise < inf, "a standard deviation, finite and not negative"),
-            "bias": (isfinite(self.bias), "finite"),
-            "drift": (0.0 <= self.drift < inf, "finite and not negative"),
-            "quantization": (0.0 <= self.quantization < inf, "a step, finite and not negative"),
-            "latency": (self.latency >= 0 and self.latency == int(self.latency), "a whole number of periods"),
-            "max_latency": (
-                self.max_latency >= 0 and self.max_latency == int(self.max_latency),
-                "a whole number of periods",
-            ),
-            "dropout": (0.0 <= self.dropout <= 1.0, "a probability, between 0 and 1"),
-            "outlier_probability": (0.0 <= self.outlier_probability <= 1.0, "a probability, between 0 and 1"),
-            "outlier_size": (0.0 <= self.outlier_size < inf, "a standard deviation, finite and not negative"),
-            "seed": (0 <= self.seed <= 2**53 and self.seed == int(self.seed), "a whole number between 0 and 2^53"),
-        }
-        check_settings(owner, self, checks)
 
 
 @dataclass(frozen=True)

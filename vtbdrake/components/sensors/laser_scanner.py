@@ -23,8 +23,8 @@ from pydrake.systems.framework import (
 from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
-from vtbdrake.components.settings import check_settings
 from vtbdrake.scan import Scan
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
@@ -50,26 +50,34 @@ _CHANNEL = 0
 class LaserScannerConfig:
     """The configuration of a laser scanner. All values are parameters of the Context, too."""
 
-    # Scans per second.
-    frequency: float = 10.0
-    # Rays per second; a scan has rays / frequency, rounded to whole rows.
-    rays_per_second: float = 20_000.0
-    # Width of the field of view about z_L, in rad.
-    azimuth: float = 0.7
-    # Height of the field of view, in rad; 0 scans one row.
-    elevation: float = 0.5
-    # Number of beams, one above the other, that turn together about z_L, as those of a spinning scanner; 0 for rows and
-    # columns at about equal angular distances, which are scanned row by row.
-    rows: int = 0
-    # Measured distance below which nothing is reported, in m.
-    min_range: float = 0.2
-    # Distance at which a white, perpendicular surface is just detected in clear space, in m. Above it nothing is
-    # reported.
-    max_range: float = 50.0
-    # Share of the light that all surfaces reflect, diffusely.
-    reflectivity: float = 0.5
-    # Full angle of the beam's divergence, where its intensity has fallen to 1/e^2, in rad.
-    divergence: float = 0.0
+    frequency: float = setting(10.0, "Scans per second.", unit="Hz", gt=0.0)
+    rays_per_second: float = setting(
+        20_000.0, "Rays per second; a scan has rays / frequency, rounded to whole rows.", unit="1/s", gt=0.0
+    )
+    azimuth: float = setting(0.7, "Width of the field of view about z_L.", unit="rad", gt=0.0, le=2.0 * pi)
+    elevation: float = setting(0.5, "Height of the field of view; 0 scans one row.", unit="rad", ge=0.0, le=pi)
+    rows: int = setting(
+        0,
+        "Number of beams, one above the other, that turn together about z_L, as those of a spinning scanner; 0 for "
+        "rows and columns at about equal angular distances, which are scanned row by row.",
+        ge=0,
+    )
+    min_range: float = setting(0.2, "Measured distance below which nothing is reported.", unit="m", gt=0.0)
+    max_range: float = setting(
+        50.0,
+        "Distance at which a white, perpendicular surface is just detected in clear space; above it nothing is "
+        "reported.",
+        unit="m",
+        gt=0.0,
+    )
+    reflectivity: float = setting(0.5, "Share of the light that all surfaces reflect, diffusely.", ge=0.0, le=1.0)
+    divergence: float = setting(
+        0.0,
+        "Full angle of the beam's divergence, where its intensity has fallen to 1/e^2.",
+        unit="rad",
+        ge=0.0,
+        lt=0.5,
+    )
 
     def check(self, slice_period: float) -> None:
         """Check that all values are possible.
@@ -80,22 +88,17 @@ class LaserScannerConfig:
         Raises:
             ValueError: A value is outside of its range.
         """
+        check_settings(self)
         most = 1.0 / slice_period + _ROUNDING
-        checks = {
-            "frequency": (0.0 < self.frequency <= most, f"in scans per s, above 0 and at most {most:g}, one per slice"),
-            "rays_per_second": (self.frequency <= self.rays_per_second < inf, "finite, and at least one ray per scan"),
-            "azimuth": (0.0 < self.azimuth <= 2.0 * pi, "in rad, above 0 and at most 2 pi"),
-            "elevation": (0.0 <= self.elevation <= pi, "in rad, between 0 and pi"),
-            "rows": (
-                0.0 <= self.rows * self.frequency <= self.rays_per_second and self.rows % 1 == 0,
-                "a whole number of beams, at most that of the rays of a scan",
-            ),
-            "min_range": (0.0 < self.min_range < inf, "in m, positive and finite"),
-            "max_range": (self.min_range < self.max_range < inf, "in m, finite and above min_range"),
-            "reflectivity": (0.0 <= self.reflectivity <= 1.0, "a share between 0 and 1"),
-            "divergence": (0.0 <= self.divergence < 0.5, "in rad, between 0 and 0.5"),
-        }
-        check_settings("LaserScanner", self, checks)
+        rays = self.rays_per_second / self.frequency
+        for name, is_possible, expected in (
+            ("frequency", self.frequency <= most, f"at most {most:g} Hz, one scan per slice"),
+            ("rays_per_second", rays >= 1.0, f"at least one ray per scan, {self.frequency:g} 1/s"),
+            ("rows", self.rows <= rays, f"at most the {rays:g} rays of a scan"),
+            ("max_range", self.max_range > self.min_range, f"above the min_range, {self.min_range:g} m"),
+        ):
+            if not is_possible:
+                raise ValueError(f"LaserScannerConfig.{name} must be {expected}, not {getattr(self, name)!r}")
 
 
 _FIELDS = tuple(field.name for field in fields(LaserScannerConfig))
@@ -212,7 +215,7 @@ class LaserScanner(AddressedSystem):
         if not 0.0 < slice_period < inf:
             raise ValueError(f"LaserScanner: the slice_period is positive, in s, not {slice_period!r}")
         config.check(slice_period)
-        errors.check("LaserScanner")
+        check_settings(errors, name="LaserScanner.errors")
         for name in ("drift", "latency", "max_latency"):
             if getattr(errors, name):
                 raise ValueError(f"LaserScanner: scans have no {name}; leave it out of the errors")
@@ -284,6 +287,8 @@ class LaserScanner(AddressedSystem):
     def _calc_settings(self, context: Context) -> _Settings:
         values = self._parameters.view(context)
         config = LaserScannerConfig(**{name: getattr(values, name) for name in _FIELDS})
+        if float(config.rows).is_integer():
+            config.rows = int(config.rows)
         config.check(self._slice_period)
         errors = ErrorModel(**{name: getattr(values, name) for name in _ERRORS})
         return _Settings(pose_from_array(values.pose), config, errors)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel, ErrorStage
+from vtbdrake.settings import check_settings
 from vtbdrake.state import AddressedSystem, Quantity
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class SampledSensor(AddressedSystem):
         self._output = int(reading.index)
         self.DeclareStateOutputPort(signal, reading.index)
         if errors is not None:
-            errors.check(type(self).__name__)
+            check_settings(errors, name=f"{type(self).__name__}.errors")
             if errors.noise and not noise:
                 raise ValueError(
                     f"{type(self).__name__} has no noise, but noise={errors.noise:g} is given: leave it out."

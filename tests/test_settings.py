@@ -1,0 +1,130 @@
+"""Settings: one declaration of type, range and unit, and one wording of what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from vtbdrake.settings import check_settings, declared_settings, schema, setting
+
+
+@dataclass
+class Lens:
+    """A lens."""
+
+    focus: float = setting(0.1, "Focal length.", unit="m", gt=0.0, remedy="it collects light")
+
+
+@dataclass
+class Eye:
+    """An eye.
+
+    It sees.
+    """
+
+    rate: float = setting(10.0, "Images per second.", unit="Hz", gt=0.0, le=50.0)
+    pixels: int = setting(8, ge=1)
+    share: float = setting(0.5, ge=0.0, lt=1.0)
+    shift: float = setting(0.0, unit="m")
+    reach: float = setting(inf, unit="m", ge=0.0, finite=False)
+    kind: str = setting("round", choices=("round", "oval", ""))
+    window: tuple[float, float] = setting((0.0, 1.0), "Near and far.", unit="m", ge=0.0)
+    names: Sequence[str | int] = ()
+    gains: Mapping[str, float] = setting(default_factory=dict, ge=0.0)
+    timeout: float | None = setting(None, unit="s", gt=0.0)
+    is_open: bool = True
+    lens: Lens = field(default_factory=Lens)
+    lenses: list[Lens] = field(default_factory=list)
+    anything: object = None
+
+
+@dataclass
+class SlowEye(Eye):
+    rate: float = 2.0
+
+
+def test_possible_values_are_accepted() -> None:
+    check_settings(Eye(rate=50.0, pixels=np.int32(4), shift=np.float64(-1e9), window=[2, 3], names=["a", 1], timeout=3))
+    check_settings(Eye(gains={"a": 0.0}, timeout=0.1, kind="", lenses=[Lens()], anything=nan, names={"a"}))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rate": 0.0}, "Eye.rate must be a number above 0 and at most 50 Hz, not 0.0"),
+        ({"rate": 51}, "Eye.rate must be a number above 0 and at most 50 Hz, not 51"),
+        ({"rate": nan}, "Eye.rate must be a number above 0 and at most 50 Hz, not nan"),
+        ({"rate": True}, "Eye.rate must be a number above 0 and at most 50 Hz, not True"),
+        ({"rate": "9"}, "Eye.rate must be a number above 0 and at most 50 Hz, not '9'"),
+        ({"rate": None}, "Eye.rate must be a number above 0 and at most 50 Hz, not None"),
+        ({"rate": [9.0]}, "Eye.rate must be a number above 0 and at most 50 Hz, not [9.0]"),
+        ({"pixels": 0}, "Eye.pixels must be a whole number of at least 1, not 0"),
+        ({"pixels": 2.0}, "Eye.pixels must be a whole number of at least 1, not 2.0"),
+        ({"share": 1.0}, "Eye.share must be a number from 0 to below 1, not 1.0"),
+        ({"shift": -inf}, "Eye.shift must be a finite number in m, not -inf"),
+        ({"reach": nan}, "Eye.reach must be a number of at least 0 m, not nan"),
+        ({"kind": "flat"}, "Eye.kind must be one of round, oval, empty, not 'flat'"),
+        ({"kind": 3}, "Eye.kind must be one of round, oval, empty, not 3"),
+        ({"window": (0.0, 1.0, 2.0)}, "Eye.window must be a list of 2 entries, not (0.0, 1.0, 2.0)"),
+        ({"window": (0.0, -1.0)}, "Eye.window[1] must be a finite number of at least 0 m, not -1.0"),
+        ({"names": "ab"}, "Eye.names must be a list, such as ['ab'], not 'ab'"),
+        ({"names": ["a", 1.5]}, "Eye.names[1] must be a text or a whole number, not 1.5"),
+        ({"gains": [1.0]}, "Eye.gains must be a mapping, not [1.0]"),
+        ({"gains": {"left": -1.0}}, "Eye.gains[left] must be a finite number of at least 0, not -1.0"),
+        ({"timeout": 0.0}, "Eye.timeout must be a finite number above 0 s or None, not 0.0"),
+        ({"is_open": 1}, "Eye.is_open must be True or False, not 1"),
+        ({"lens": Lens(-1.0)}, "Eye.lens.focus must be a finite number above 0 m, not -1.0: it collects light"),
+        (
+            {"lenses": [Lens(), Lens(inf)]},
+            "Eye.lenses[1].focus must be a finite number above 0 m, not inf: it collects",
+        ),
+    ],
+)
+def test_impossible_values_are_refused(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError) as refusal:
+        check_settings(Eye(**values))
+    assert str(refusal.value).startswith(message)
+
+
+def test_another_default_keeps_the_range() -> None:
+    assert declared_settings(SlowEye)["rate"] == declared_settings(Eye)["rate"]
+    with pytest.raises(ValueError, match="SlowEye.rate must be a number above 0"):
+        check_settings(SlowEye(rate=-1.0))
+
+
+def test_name_and_error_are_those_of_the_caller() -> None:
+    class EyeError(ValueError):
+        pass
+
+    with pytest.raises(EyeError, match="robot.eye.lens.focus must be"):
+        check_settings(Eye(lens=Lens(0.0)), name="robot.eye", error=EyeError)
+
+
+def test_schema_says_what_is_checked() -> None:
+    described = json.loads(json.dumps(schema(SlowEye), allow_nan=False))
+    assert (described["title"], described["type"], described["additionalProperties"]) == ("SlowEye", "object", False)
+    properties = described["properties"]
+    assert properties["rate"] == {
+        "description": "Images per second.",
+        "unit": "Hz",
+        "type": "number",
+        "exclusiveMinimum": 0.0,
+        "maximum": 50.0,
+        "default": 2.0,
+    }
+    assert properties["pixels"] == {"type": "integer", "minimum": 1, "default": 8}
+    assert properties["reach"] == {"unit": "m", "type": "number", "minimum": 0.0}
+    assert properties["kind"] == {"type": "string", "enum": ["round", "oval", ""], "default": "round"}
+    assert properties["window"]["items"] == {"type": "number", "minimum": 0.0}
+    assert (properties["window"]["minItems"], properties["window"]["maxItems"]) == (2, 2)
+    assert properties["names"]["items"] == {"type": ["string", "integer"]}
+    assert properties["gains"]["additionalProperties"] == {"type": "number", "minimum": 0.0}
+    assert properties["timeout"] == {"unit": "s", "type": ["number", "null"], "exclusiveMinimum": 0.0}
+    assert properties["lens"]["description"] == "A lens."
+    assert properties["lens"]["properties"]["focus"]["default"] == 0.1
+    assert properties["anything"] == {}

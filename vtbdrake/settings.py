@@ -1,0 +1,312 @@
+"""Settings: the range and the unit of a configuration's field, declared beside its default, for all who need them.
+
+For example::
+
+    @dataclass
+    class ScannerConfig:
+        frequency: float = setting(10.0, "Scans per second.", unit="Hz", gt=0.0, le=50.0)
+
+`check_settings` checks the values, `schema` describes them as a JSON Schema, the command line makes options of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from inspect import getdoc
+from math import isfinite
+from numbers import Integral, Real
+from typing import Any, NamedTuple
+
+_KEY = "setting"
+# By the name of a type in an annotation: the types of its values, and what messages and JSON Schema call it.
+_TYPES: dict[str, tuple[type, str, str]] = {
+    "bool": (bool, "True or False", "boolean"),
+    "int": (Integral, "a whole number", "integer"),
+    "float": (Real, "a number", "number"),
+    "str": (str, "a text", "string"),
+    "None": (type(None), "None", "null"),
+    **dict.fromkeys(("list", "tuple", "Sequence"), (Collection, "a list", "array")),
+    **dict.fromkeys(("dict", "Mapping"), (Mapping, "a mapping", "object")),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """The possible values of a field; of a list or a mapping, those of its entries.
+
+    Attributes:
+        doc: A sentence that says what the field is.
+        unit: The unit of the values; empty if they have none.
+        gt: A bound that all values are above.
+        ge: The least value.
+        lt: A bound that all values are below.
+        le: The largest value.
+        choices: The only values; empty for all in the range.
+        finite: Whether infinity is excluded.
+        remedy: The reason for the range, or what to do, for error messages.
+    """
+
+    doc: str = ""
+    unit: str = ""
+    gt: float | None = None
+    ge: float | None = None
+    lt: float | None = None
+    le: float | None = None
+    choices: tuple[Any, ...] = ()
+    finite: bool = True
+    remedy: str = ""
+
+    def contains(self, value: Any) -> bool:
+        """Return whether a value of the right type is possible."""
+        if self.choices:
+            return value in self.choices
+        if not isinstance(value, int | float):
+            return True
+        return (
+            (isfinite(value) or (value == value and not self.finite))
+            and (self.gt is None or value > self.gt)
+            and (self.ge is None or value >= self.ge)
+            and (self.lt is None or value < self.lt)
+            and (self.le is None or value <= self.le)
+        )
+
+    @property
+    def range(self) -> str:
+        """The range in words, with the unit, such as "from 0 to 3 m/s"; empty without both."""
+        above, least, below, most = map(_text, (self.gt, self.ge, self.lt, self.le))
+        if least and (below or most):
+            words = f"from {least} to {f'below {below}' if below else most}"
+        else:
+            lower = f"above {above}" if above else f"at least {least}" if least else ""
+            upper = f"below {below}" if below else f"at most {most}" if most else ""
+            words = " and ".join(bound for bound in (lower, upper) if bound)
+        if self.unit:
+            words = f"{words or 'in'} {self.unit}"
+        return words
+
+
+def _text(bound: float | None) -> str:
+    return "" if bound is None else f"{bound:g}" if isinstance(bound, float) else str(bound)
+
+
+_ANY = Setting()
+
+
+def setting(default: Any = MISSING, doc: str = "", *, default_factory: Any = MISSING, **limits: Any) -> Any:
+    """Return a field of a dataclass, as `dataclasses.field` does, with a `Setting`.
+
+    A subclass that only gives another default keeps the range.
+
+    Args:
+        default: The default value.
+        doc: A sentence that says what the field is.
+        default_factory: A function that makes the default value.
+        limits: The other attributes of the `Setting`.
+    """
+    return field(default=default, default_factory=default_factory, metadata={_KEY: Setting(doc=doc, **limits)})
+
+
+def declared_settings(kind: type) -> dict[str, Setting]:
+    """Return the settings that a dataclass and its bases declare, by field."""
+    items = [item for base in reversed(kind.__mro__) for item in vars(base).get("__dataclass_fields__", {}).values()]
+    return {item.name: item.metadata[_KEY] for item in items if _KEY in item.metadata}
+
+
+def field_types(owner: Any) -> dict[str, Any]:
+    """Return the types of the fields of a dataclass or of one of Drake's configs, by name; empty for anything else."""
+    items = fields(owner) if is_dataclass(owner) else getattr(owner, "__fields__", ())
+    return {item.name: item.type for item in items}
+
+
+class _Type(NamedTuple):
+    """One of the alternatives of a field's type: its name, and the types of its entries as texts."""
+
+    name: str
+    entries: tuple[str, ...]
+
+    @property
+    def is_sized(self) -> bool:
+        """Whether the type tells the number of entries."""
+        return self.name == "tuple" and bool(self.entries) and "..." not in self.entries
+
+    def entry(self, index: int) -> str:
+        """Return the type of an entry."""
+        if not self.entries:
+            return ""
+        if self.name in ("dict", "Mapping"):
+            return self.entries[-1]
+        return self.entries[index if self.is_sized else 0]
+
+    def accepts(self, value: Any) -> bool:
+        """Return whether a value is of this type, without a look at its entries."""
+        python_type: Any
+        python_type, _, kind = _TYPES[self.name]
+        if isinstance(value, bool) or (kind == "array" and isinstance(value, str | bytes | Mapping)):
+            return python_type is bool
+        return isinstance(value, python_type) and (not self.is_sized or len(value) == len(self.entries))
+
+
+# At a separator that is not inside of brackets.
+_BETWEEN_TYPES, _BETWEEN_ENTRIES = re.compile(r"\s*\|\s*(?![^\[]*\])"), re.compile(r",\s*(?![^\[]*\])")
+
+
+def _alternatives(annotation: Any) -> list[_Type]:
+    """Return the alternatives of the type of a field."""
+    # By their names: in another process, the types of a class from a notebook cannot be looked up.
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    parts = [part.partition("[") for part in _BETWEEN_TYPES.split(text)]
+    return [
+        _Type(name.rpartition(".")[2], tuple(_BETWEEN_ENTRIES.split(inner.removesuffix("]"))) if inner else ())
+        for name, _, inner in parts
+    ]
+
+
+def _known(types: list[_Type]) -> list[_Type]:
+    """Return the types, or none if one of them is not among `_TYPES`: the values can be anything then."""
+    return types if all(each.name in _TYPES for each in types) else []
+
+
+def plain_types(annotation: Any) -> tuple[str, ...]:
+    """Return the plain types among the alternatives of the type of a field: "float" for ``float | None``."""
+    return tuple(each.name for each in _alternatives(annotation) if each.name in ("bool", "int", "float", "str"))
+
+
+def check_settings(config: Any, *, name: str = "", error: type[ValueError] = ValueError) -> None:
+    """Check the fields of a configuration, and those of the configurations in it.
+
+    Numbers, texts, True and False, and lists and mappings of them, have the type of their field; numbers are finite;
+    values are in the range of the `setting`. Fields of other types are not checked.
+
+    Args:
+        config: A dataclass.
+        name: The name of the configuration in messages; by default its class.
+        error: The class of the error.
+
+    Raises:
+        ValueError: A value is not possible; the message has the field, the possible values and their unit.
+    """
+    settings = declared_settings(type(config))
+    for key, annotation in field_types(config).items():
+        path = f"{name or type(config).__name__}.{key}"
+        check_value(path, getattr(config, key), annotation, settings.get(key), error=error)
+
+
+def check_value(
+    name: str, value: Any, annotation: Any, limits: Setting | None = None, *, error: type[ValueError] = ValueError
+) -> None:
+    """Check one value as `check_settings` does.
+
+    Args:
+        name: The name of the value in messages.
+        value: The value.
+        annotation: The type of the field.
+        limits: The setting of the field, if it has one.
+        error: The class of the error.
+
+    Raises:
+        ValueError: The value is not possible.
+    """
+    if field_types(value):
+        check_settings(value, name=name, error=error)
+        return
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    types = _known(_alternatives(annotation))
+    matches = [each for each in types if each.accepts(value)]
+    entries: Iterable[tuple[Any, Any]] | None = None
+    if isinstance(value, Collection) and not isinstance(value, str | bytes):
+        entries = value.items() if isinstance(value, Mapping) else enumerate(value)
+    is_limited = (types or limits) and entries is None and value is not None
+    if (types and not matches) or (is_limited and not (limits or _ANY).contains(value)):
+        raise error(f"{name} must be {_expected(types, limits or _ANY, value)}, not {value!r}{_because(limits)}")
+    for index, (key, entry) in enumerate(entries or ()):
+        check_value(f"{name}[{key}]", entry, matches[0].entry(index) if matches else "", limits, error=error)
+
+
+def _because(limits: Setting | None) -> str:
+    return f": {limits.remedy}" if limits and limits.remedy else ""
+
+
+def _expected(types: Sequence[_Type], limits: Setting, value: Any) -> str:
+    """Return the possible values in words."""
+    if limits.choices:
+        return f"one of {', '.join(str(choice) or 'empty' for choice in limits.choices)}"
+    words = []
+    for each in types:
+        noun = _TYPES[each.name][1]
+        if each.name in ("int", "float"):
+            is_open = each.name == "float" and limits.finite and limits.lt is limits.le is None
+            noun = f"a {'finite ' if is_open else ''}{noun.removeprefix('a ')}"
+            preposition = " of " if limits.range.startswith("at ") else " " if limits.range else ""
+            noun = f"{noun}{preposition}{limits.range}"
+        elif each.is_sized:
+            noun = f"{noun} of {len(each.entries)} entries"
+        elif _TYPES[each.name][2] == "array" and isinstance(value, str):
+            noun = f"{noun}, such as [{value!r}]"
+        words.append(noun)
+    return " or ".join(dict.fromkeys(words)) or limits.range
+
+
+def schema(kind: type) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a configuration, with types, ranges, defaults and descriptions.
+
+    The unit of a field is its keyword "unit".
+
+    Args:
+        kind: A dataclass whose fields have defaults, or one of Drake's configs.
+    """
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_object_schema(kind())}
+
+
+def _object_schema(config: Any) -> dict[str, Any]:
+    settings = declared_settings(type(config))
+    properties = {
+        key: _schema(annotation, settings.get(key, _ANY), getattr(config, key))
+        for key, annotation in field_types(config).items()
+    }
+    title, text = type(config).__name__, getdoc(type(config)) or ""
+    return {
+        "title": title,
+        # A dataclass without a docstring gets its signature as one.
+        "description": "" if text.startswith(f"{title}(") else text.split("\n\n")[0].replace("\n", " "),
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+    }
+
+
+def _schema(annotation: Any, limits: Setting, default: Any) -> dict[str, Any]:
+    about = {"description": limits.doc, "unit": limits.unit}
+    if field_types(default):
+        return {**_object_schema(default), **{key: text for key, text in about.items() if text}}
+    types = _known(_alternatives(annotation))
+    names = list(dict.fromkeys(_TYPES[each.name][2] for each in types))
+    described: dict[str, Any] = {**about, "type": names[0] if len(names) == 1 else names}
+    for each in types:
+        # Ranges and choices are those of the entries.
+        kind, inner = _TYPES[each.name][2], replace(limits, doc="", unit="")
+        if kind == "array":
+            described["items"] = _schema(each.entry(0), inner, None)
+            if each.is_sized:
+                described |= {"minItems": len(each.entries), "maxItems": len(each.entries)}
+        elif kind == "object":
+            described["additionalProperties"] = _schema(each.entry(0), inner, None)
+        elif kind in ("integer", "number"):
+            described |= {"exclusiveMinimum": limits.gt, "minimum": limits.ge}
+            described |= {"exclusiveMaximum": limits.lt, "maximum": limits.le}
+        if kind not in ("array", "object"):
+            described["enum"] = list(limits.choices)
+    if types and _is_json(default):
+        described["default"] = default
+    return {key: entry for key, entry in described.items() if entry not in (None, "", [])}
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return False
+    return value is not None
