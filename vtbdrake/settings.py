@@ -116,9 +116,10 @@ def declared_settings(kind: type) -> dict[str, Setting]:
 
 
 def field_types(owner: Any) -> dict[str, Any]:
-    """Return the types of the fields of a dataclass or of one of Drake's configs, by name; empty for anything else."""
-    items = fields(owner) if is_dataclass(owner) else getattr(owner, "__fields__", ())
-    return {item.name: item.type for item in items}
+    """Return the types of the fields that a dataclass or one of Drake's configs is made of, by name; else nothing."""
+    if is_dataclass(owner):
+        return {item.name: item.type for item in fields(owner) if item.init}
+    return {item.name: item.type for item in getattr(owner, "__fields__", ())}
 
 
 class _Type(NamedTuple):

@@ -511,14 +511,14 @@ def test_the_state_stays_small_and_is_a_value():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gate": 1.0}, "gate must be a share between 0 and 1, not 1.0"),
-        ({"first_gate": 0.0}, "first_gate must be a share between 0 and 1, not 0.0"),
-        ({"correlation": -1.0}, "correlation must be in m, at least 0"),
-        ({"scan_deviation": -0.1}, "scan_deviation must be in m, at least 0"),
-        ({"least_deviation": np.nan}, "least_deviation must be in m, at least 0, not nan"),
-        ({"field_of_view": 7.0}, "field_of_view must be in rad, within"),
-        ({"most": 0}, "most must be at least 1"),
-        ({"correlated_share": 1.0}, "correlated_share must be a share from 0 to below 1"),
+        ({"gate": 1.0}, "Tracker.gate must be a number above 0 and below 1, not 1.0"),
+        ({"first_gate": 0.0}, "first_gate must be a number above 0 and below 1, not 0.0"),
+        ({"correlation": -1.0}, "correlation must be a finite number of at least 0 m"),
+        ({"scan_deviation": -0.1}, "scan_deviation must be a finite number of at least 0 m"),
+        ({"least_deviation": np.nan}, "least_deviation must be a finite number of at least 0 m, not nan"),
+        ({"field_of_view": 7.0}, "field_of_view must be a number above 0 and at most 6.28319 rad"),
+        ({"most": 0}, "most must be a whole number of at least 1"),
+        ({"correlated_share": 1.0}, "correlated_share must be a number from 0 to below 1"),
     ],
 )
 def test_impossible_settings_are_refused(settings, message):

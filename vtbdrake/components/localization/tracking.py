@@ -39,7 +39,7 @@ may be used in `vtbdrake.components.localization.health`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import inf, pi
+from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +51,7 @@ from vtbdrake.components.localization.association import Association, ExpectedDe
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState
-from vtbdrake.components.settings import check_settings
+from vtbdrake.settings import check_settings, setting
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -98,81 +98,84 @@ class Tracker:
 
     Attributes:
         landmarks: The map, in W.
-        sensor: The position s = p_HoLo_H of the scanner in the plane, in m.
-        field_of_view: The horizontal field of view in rad, for the density of detections.
-        bias_deviation: Standard deviation of the range bias, in m; assumed.
-        odometry_deviation: Standard deviation of e; assumed.
-        odometry_length: The distance in m over which e loses two thirds of its correlation; assumed.
-        rate_deviation: Standard deviation of g, the residual bias of the gyros in dead reckoning, in rad/s; assumed.
-        rate_walk: Random walk of g in rad/s per root second; assumed.
-        least_deviation: Standard deviation in m that is added to those of detections, per axis; calibrated with
-            simulated scans of `vtbdrake_diagrams.forest` and an exact map.
-        scan_deviation: Standard deviation in m, per axis, of the common displacement of all detections of a scan;
-            assumed.
-        correlation: Correlation length L of the map's errors in m; 0 if they are independent.
-        correlated_share: The share c of the variance of the map that is correlated; assumed.
-        gate: The share of right pairs that the gate lets pass.
-        first_gate: The same of first matches, whose gate is narrower: on the map, another landmark may be near.
-        horizon: Distance from the carrier in m beyond which landmarks are marginalized.
-        most: The largest number of landmarks in the state; the farthest are marginalized.
-        patience: The number of failures in succession after which the track is lost.
-        credit: The upper limit of the evidence.
-        first_credit: The evidence at the start; it is less than ``credit``, so that a wrong start ends sooner.
-        largest_deviation: The largest standard deviation of the position in m, per axis, with which a track goes on.
-        distortion_gate: The share of right maps that are not doubtful in one test of the distortion.
 
     Raises:
         ValueError: The map is empty, or a setting is outside of its range.
     """
 
     landmarks: Landmarks
-    sensor: tuple[float, float] = (0.0, 0.0)
-    field_of_view: float = 2.0 * pi
-    bias_deviation: float = 0.03
-    odometry_deviation: float = 0.02
-    odometry_length: float = 20.0
-    rate_deviation: float = 5e-4
-    rate_walk: float = 2e-5
-    least_deviation: float = 0.005
-    scan_deviation: float = 0.0
-    correlation: float = 0.0
-    correlated_share: float = 0.98
-    gate: float = 0.997
-    first_gate: float = 0.95
-    horizon: float = 100.0
-    most: int = 400
-    patience: int = 3
-    credit: float = 12.0
-    first_credit: float = 6.0
-    largest_deviation: float = 2.0
-    distortion_gate: float = 0.99999
+    sensor: tuple[float, float] = setting(
+        (0.0, 0.0), "The position s = p_HoLo_H of the scanner in the plane.", unit="m"
+    )
+    field_of_view: float = setting(
+        2.0 * pi, "The horizontal field of view, for the density of detections.", unit="rad", gt=0.0, le=2.0 * pi
+    )
+    bias_deviation: float = setting(0.03, "Standard deviation of the range bias; assumed.", unit="m", ge=0.0)
+    odometry_deviation: float = setting(0.02, "Standard deviation of e; assumed.", ge=0.0)
+    odometry_length: float = setting(
+        20.0, "The distance over which e loses two thirds of its correlation; assumed.", unit="m", gt=0.0, finite=False
+    )
+    rate_deviation: float = setting(
+        5e-4,
+        "Standard deviation of g, the residual bias of the gyros in dead reckoning; assumed.",
+        unit="rad/s",
+        ge=0.0,
+    )
+    rate_walk: float = setting(2e-5, "Random walk of g; assumed.", unit="rad/s^1.5", ge=0.0)
+    least_deviation: float = setting(
+        0.005,
+        "Standard deviation that is added to those of detections, per axis; calibrated with simulated scans "
+        "of `vtbdrake_diagrams.forest` and an exact map.",
+        unit="m",
+        ge=0.0,
+    )
+    scan_deviation: float = setting(
+        0.0,
+        "Standard deviation, per axis, of the common displacement of all detections of a scan; assumed.",
+        unit="m",
+        ge=0.0,
+    )
+    correlation: float = setting(
+        0.0, "Correlation length L of the map's errors; 0 if they are independent.", unit="m", ge=0.0
+    )
+    correlated_share: float = setting(
+        0.98, "The share c of the variance of the map that is correlated; assumed.", ge=0.0, lt=1.0
+    )
+    gate: float = setting(0.997, "The share of right pairs that the gate lets pass.", gt=0.0, lt=1.0)
+    first_gate: float = setting(
+        0.95,
+        "The same of first matches, whose gate is narrower: on the map, another landmark may be near.",
+        gt=0.0,
+        lt=1.0,
+    )
+    horizon: float = setting(
+        100.0, "Distance from the carrier beyond which landmarks are marginalized.", unit="m", gt=0.0, finite=False
+    )
+    most: int = setting(400, "The largest number of landmarks in the state; the farthest are marginalized.", ge=1)
+    patience: int = setting(3, "The number of failures in succession after which the track is lost.", ge=1)
+    credit: float = setting(12.0, "The upper limit of the evidence.", gt=0.0, finite=False)
+    first_credit: float = setting(
+        6.0,
+        "The evidence at the start; it is less than ``credit``, so that a wrong start ends sooner.",
+        gt=0.0,
+        finite=False,
+    )
+    largest_deviation: float = setting(
+        2.0,
+        "The largest standard deviation of the position, per axis, with which a track goes on.",
+        unit="m",
+        gt=0.0,
+        finite=False,
+    )
+    distortion_gate: float = setting(
+        0.99999, "The share of right maps that are not doubtful in one test of the distortion.", gt=0.0, lt=1.0
+    )
     _association: Association = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not len(self.landmarks):
             raise ValueError("the map of a tracker is empty: localization needs landmarks")
-        checks = {
-            "field_of_view": (0.0 < self.field_of_view <= 2.0 * pi, "in rad, within (0, 2 pi]"),
-            "bias_deviation": (0.0 <= self.bias_deviation < inf, "in m, at least 0"),
-            "odometry_deviation": (0.0 <= self.odometry_deviation < inf, "a share, at least 0"),
-            "odometry_length": (self.odometry_length > 0.0, "in m, positive"),
-            "rate_deviation": (0.0 <= self.rate_deviation < inf, "in rad/s, at least 0"),
-            "rate_walk": (0.0 <= self.rate_walk < inf, "in rad/s per root second, at least 0"),
-            "least_deviation": (0.0 <= self.least_deviation < inf, "in m, at least 0"),
-            "scan_deviation": (0.0 <= self.scan_deviation < inf, "in m, at least 0"),
-            "correlation": (0.0 <= self.correlation < inf, "in m, at least 0"),
-            "correlated_share": (0.0 <= self.correlated_share < 1.0, "a share from 0 to below 1"),
-            "gate": (0.0 < self.gate < 1.0, "a share between 0 and 1"),
-            "first_gate": (0.0 < self.first_gate < 1.0, "a share between 0 and 1"),
-            "horizon": (self.horizon > 0.0, "in m, positive"),
-            "most": (self.most >= 1, "at least 1"),
-            "patience": (self.patience >= 1, "at least 1"),
-            "credit": (self.credit > 0.0, "positive"),
-            "first_credit": (self.first_credit > 0.0, "positive"),
-            "largest_deviation": (self.largest_deviation > 0.0, "in m, positive"),
-            "distortion_gate": (0.0 < self.distortion_gate < 1.0, "a share between 0 and 1"),
-        }
-        check_settings("Tracker", self, checks)
+        check_settings(self)
         variances = np.linalg.eigvalsh(self.landmarks.covariances)[:, -1]
         usable = np.flatnonzero(variances <= self.largest_deviation**2)
         if not len(usable):
