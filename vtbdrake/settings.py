@@ -16,7 +16,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from inspect import getdoc
-from math import isfinite
+from math import inf, isfinite
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -72,6 +72,12 @@ class Setting:
             and (self.lt is None or value < self.lt)
             and (self.le is None or value <= self.le)
         )
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The ends of the range, infinite where it is open."""
+        lower, upper = self.gt if self.ge is None else self.ge, self.lt if self.le is None else self.le
+        return -inf if lower is None else float(lower), inf if upper is None else float(upper)
 
     @property
     def range(self) -> str:

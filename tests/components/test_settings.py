@@ -14,6 +14,7 @@ from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetector
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
+from vtbdrake.settings import check_settings
 
 pytestmark = pytest.mark.one_python
 
@@ -37,8 +38,6 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "gate": "(0, 1)",
             "first_gate": "(0, 1)",
             "horizon": "(0, inf]",
-            "most": "[1, inf]",
-            "patience": "[1, inf]",
             "credit": "(0, inf]",
             "first_credit": "(0, inf]",
             "distortion_gate": "(0, 1)",
@@ -73,7 +72,6 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "least_roundness": "[0, 1)",
             "least_width": "(0, 3)",  # the largest width
             "largest_width": "(0.2, inf)",  # the least width
-            "least_points": "[2, inf]",
             "elongation": "[0, 1)",
         },
     ),
@@ -93,7 +91,7 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
         },
     ),
     "ErrorModel": (
-        lambda **settings: ErrorModel(**settings).check("sensor"),
+        lambda **settings: check_settings(ErrorModel(**settings)),
         {
             "noise": "[0, inf)",
             "bias": "(-inf, inf)",
@@ -136,4 +134,25 @@ def test_setting_is_accepted_within_its_interval_and_refused_beyond(
         make(**{name: value})
     for value in bad:
         with pytest.raises(ValueError, match=name):
+            make(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "least"),
+    [
+        ("Tracker", "most", 1),
+        ("Tracker", "patience", 1),
+        ("RockDetector", "least_points", 2),
+        ("ErrorModel", "latency", 0),
+        ("ErrorModel", "max_latency", 0),
+        ("ErrorModel", "seed", 0),
+        ("LaserScannerConfig", "rows", 0),
+    ],
+)
+def test_whole_number_is_accepted_from_its_least_on(owner: str, name: str, least: int) -> None:
+    make, _ = INTERVALS[owner]
+    for value in (least, least + 1):
+        make(**{name: value})
+    for value in (least - 1, least + 0.5, inf, nan):
+        with pytest.raises(ValueError, match=f"{name} must be a whole number"):
             make(**{name: value})

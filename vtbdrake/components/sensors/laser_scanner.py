@@ -24,7 +24,7 @@ from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
 from vtbdrake.scan import Scan
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.settings import check_settings, declared_settings, setting
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
@@ -230,29 +230,14 @@ class LaserScanner(AddressedSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._slice_period, 0.0, self._end_slice)
 
     def _declare_parameters(self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel) -> None:
-        most = 1.0 / self._slice_period
-        units_and_bounds = {
-            "frequency": ("Hz", (0.0, most)),
-            "rays_per_second": ("1/s", (0.0, inf)),
-            "azimuth": ("rad", (0.0, 2.0 * pi)),
-            "elevation": ("rad", (0.0, pi)),
-            "rows": ("1", (0.0, inf)),
-            "min_range": ("m", (0.0, inf)),
-            "max_range": ("m", (0.0, inf)),
-            "reflectivity": ("1", (0.0, 1.0)),
-            "divergence": ("rad", (0.0, 0.5)),
-            "noise": ("m", (0.0, inf)),
-            "outlier_probability": ("1", (0.0, 1.0)),
-            "outlier_size": ("m", (0.0, inf)),
-            "bias": ("m", (-inf, inf)),
-            "quantization": ("m", (0.0, inf)),
-            "dropout": ("1", (0.0, 1.0)),
-            "seed": ("1", (0.0, 2.0**53)),
-        }
+        settings = declared_settings(ErrorModel) | declared_settings(LaserScannerConfig)
+        units = {name: settings[name].unit or "1" for name in (*_FIELDS, *_ERRORS)}
+        units |= dict.fromkeys(("noise", "outlier_size", "bias", "quantization"), "m")  # as the ranges
+        bounds = {name: settings[name].bounds for name in units} | {"frequency": (0.0, 1.0 / self._slice_period)}
         defaults = {name: getattr(config, name) for name in _FIELDS} | {name: getattr(errors, name) for name in _ERRORS}
         self._parameters = self.declare_parameters(
             pose=Quantity(pose_to_array(X_BL), POSE_UNIT),
-            **{name: Quantity(default, *units_and_bounds[name]) for name, default in defaults.items()},
+            **{name: Quantity(default, units[name], bounds[name]) for name, default in defaults.items()},
         )
         self._settings = self.declare_cache(
             "settings", self._calc_settings, {self.numeric_parameter_ticket(self._parameters.index)}
