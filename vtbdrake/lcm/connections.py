@@ -28,7 +28,6 @@ from vtbdrake.lcm.hub.tcpq import (
     RecordType,
     TcpqError,
     address_name,
-    connect_shortcut,
 )
 
 Handler = Callable[[str, bytes], None]
@@ -119,7 +118,7 @@ class LibraryConnection(Connection):
 
 
 class TcpqConnection(Connection):
-    """A connection to a tcpq hub: by the hub's shortcut if there is one, else by TCP.
+    """A connection to a tcpq hub.
 
     liblcm's client is not used because it blocks: it sends a message in five parts, waits in the middle of a message
     for as long as the hub does, and reconnects (and waits) in any call after a loss, even in its destructor. It also
@@ -129,7 +128,7 @@ class TcpqConnection(Connection):
         url: ``tcpq://host:port``; both have defaults.
         handlers: By channel, what takes its messages.
         timeout: Seconds to wait for the hub.
-        stamped: Whether the kernel shall stamp what arrives; it does so for TCP only.
+        stamped: Whether the kernel shall stamp what arrives.
 
     Raises:
         OSError: There is no hub.
@@ -143,16 +142,9 @@ class TcpqConnection(Connection):
         self._stamped = stamped
         parts = urlsplit(url)
         address = parts.hostname or "127.0.0.1", _DEFAULT_PORT if parts.port is None else parts.port
-        # The kernel does not time-stamp data from a Unix socket.
-        shortcut = None if stamped else connect_shortcut(*address)
-        self._socket = shortcut or socket.create_connection(address, timeout)
-        if shortcut is None and not stamped and (shortcut := connect_shortcut(*address, quiet=True)):
-            # The hub, which opens its shortcut first, has started between the two attempts.
-            self._socket.close()
-            self._socket = shortcut
+        self._socket = socket.create_connection(address, timeout)
         try:
-            if shortcut is None:
-                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.settimeout(timeout)
             self.name = address_name(self._socket.getsockname())
             self._greet()

@@ -15,7 +15,6 @@ from pathlib import Path
 import lcm
 
 from vtbdrake.lcm.hub import Hub, HubStatistics
-from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
 TIMEOUT = 30.0
 MEBIBYTE = 1024 * 1024
@@ -135,11 +134,9 @@ def address(url: str) -> tuple[str, int]:
 
 
 @contextlib.contextmanager
-def raw_client(url: str, greeting: bytes = GREETING, *, unix: bool = False) -> Iterator[socket.socket]:
-    """Connect a socket, by TCP or by the shortcut, on which the test speaks tcpq itself."""
-    sock = connect_shortcut(*address(url)) if unix else socket.create_connection(address(url))
-    assert sock is not None
-    with sock:
+def raw_client(url: str, greeting: bytes = GREETING) -> Iterator[socket.socket]:
+    """Connect a socket on which the test speaks tcpq itself."""
+    with socket.create_connection(address(url)) as sock:
         sock.settimeout(TIMEOUT)
         if greeting:  # Sending nothing fails, too, once the hub has closed the connection.
             sock.sendall(greeting)

@@ -42,7 +42,6 @@ from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, clients, server
 from vtbdrake.lcm.hub.clients import SLICE
 from vtbdrake.lcm.hub.reader import TcpqReader
-from vtbdrake.lcm.hub.tcpq import connect_shortcut
 
 pytestmark = pytest.mark.one_python
 
@@ -94,8 +93,8 @@ def test_reading_goes_on_within_a_message_only(
     assert [turn for turn in reads if turn] == turns
 
 
-def test_client_that_never_reads_is_disconnected(connect) -> None:
-    with Hub(port=0, max_message=MEBIBYTE, max_queue=4 * MEBIBYTE, patience=0.5) as hub, connect(hub.url) as slow:
+def test_client_that_never_reads_is_disconnected() -> None:
+    with Hub(port=0, max_message=MEBIBYTE, max_queue=4 * MEBIBYTE, patience=0.5) as hub, raw_client(hub.url) as slow:
         slow.sendall(record(2, b"IMAGE"))
         client = Client(hub.url, "IMAGE")
         for _ in range(40):
@@ -108,8 +107,8 @@ def test_client_that_never_reads_is_disconnected(connect) -> None:
         assert hub.statistics().clients == 1
 
 
-def test_slow_client_loses_only_its_oldest_messages(connect) -> None:
-    with Hub(port=0, max_message=MEBIBYTE, max_queue=4 * MEBIBYTE, patience=60.0) as hub, connect(hub.url) as slow:
+def test_slow_client_loses_only_its_oldest_messages() -> None:
+    with Hub(port=0, max_message=MEBIBYTE, max_queue=4 * MEBIBYTE, patience=60.0) as hub, raw_client(hub.url) as slow:
         slow.sendall(record(2, b"N"))
         client = Client(hub.url)
         numbers = [bytes([i]) * (MEBIBYTE // 4) for i in range(200)]
@@ -156,29 +155,29 @@ def test_channel_names_do_not_accumulate(hub) -> None:
         assert resident(hub.pid) - before < 8 * MEBIBYTE
 
 
-def test_client_without_greeting_is_disconnected(connect) -> None:
-    with Hub(port=0, patience=0.2) as hub, connect(hub.url, greeting=GREETING[:2]) as sock:
+def test_client_without_greeting_is_disconnected() -> None:
+    with Hub(port=0, patience=0.2) as hub, raw_client(hub.url, greeting=GREETING[:2]) as sock:
         assert is_disconnected(sock)
         assert hub.statistics().disconnected == {"greeting": 1}
 
 
-def test_max_clients_rejects_one_more_client(connect) -> None:
+def test_max_clients_rejects_one_more_client() -> None:
     with Hub(port=0, max_clients=2) as hub:
         clients = [Client(hub.url, "A") for _ in range(2)]
-        with connect(hub.url, greeting=b"") as sock:
+        with raw_client(hub.url, greeting=b"") as sock:
             assert is_disconnected(sock)
         clients[0].publish("A")
         clients[1].wait(lambda: bool(clients[1].received))
         assert hub.statistics().disconnected == {"too many": 1}
 
 
-def test_next_client_waits_for_file_descriptors(hub, connect) -> None:
+def test_next_client_waits_for_file_descriptors(hub) -> None:
     client = Client(hub.url, "A")
     allowed = resource.prlimit(hub.pid, resource.RLIMIT_NOFILE)
     used = {int(fileno.name) for fileno in Path(f"/proc/{hub.pid}/fd").iterdir()}
     lowest_free = min(set(range(len(used) + 1)) - used)
     resource.prlimit(hub.pid, resource.RLIMIT_NOFILE, (lowest_free, allowed[1]))
-    with connect(hub.url) as waiting:
+    with raw_client(hub.url) as waiting:
         client.publish("A", b"as before")
         client.wait(lambda: bool(client.received))
         assert hub.statistics().clients == 1
@@ -398,10 +397,7 @@ host, port, kind, n, user = sys.argv[1], int(sys.argv[2]), sys.argv[3], int(sys.
 os.setuid(user)
 kept = []
 for _ in range(n):
-    if kind == "unix":
-        sock = socket.socket(socket.AF_UNIX)
-        sock.connect(f"\\0vtbdrake-hub/{host}:{port}")
-    elif kind == "ipv6":
+    if kind == "ipv6":
         sock = socket.socket(socket.AF_INET6)
         sock.connect((f"::ffff:{host}", port))
     else:
@@ -434,7 +430,7 @@ def other_user(
 
 
 @as_root
-@pytest.mark.parametrize("kind", ["tcp", "ipv6", "unix"])
+@pytest.mark.parametrize("kind", ["tcp", "ipv6"])
 def test_other_user_is_rejected_with_a_reason(hub, kind: str) -> None:
     with other_user(hub.url, kind) as [(magic, text)]:
         assert magic == REJECTED
@@ -445,7 +441,7 @@ def test_other_user_is_rejected_with_a_reason(hub, kind: str) -> None:
 
 
 @as_root
-@pytest.mark.parametrize("kind", ["tcp", "ipv6", "unix"])
+@pytest.mark.parametrize("kind", ["tcp", "ipv6"])
 @pytest.mark.parametrize("fields", [{"users": [OTHER_USER]}, {"users": ["nobody"]}, {"all_users": True}])
 def test_configured_user_is_admitted(kind: str, fields: dict[str, object]) -> None:
     with Hub(port=0, **fields) as hub, other_user(hub.url, kind) as [(magic, _)]:
@@ -548,7 +544,6 @@ def test_incomplete_rejection_is_no_hub(answer: bytes) -> None:
         thread = threading.Thread(target=serve)
         thread.start()
         port = listener.getsockname()[1]
-        assert connect_shortcut("127.0.0.1", port) is None
         with pytest.raises(BridgeError, match="no LCM bus"):
             LcmLink(f"tcpq://127.0.0.1:{port}", {}, connect_timeout=30.0).open()
         thread.join()
@@ -582,7 +577,7 @@ def test_config_out_of_range_is_an_error(fields, message: str) -> None:
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize("stamped", [False, True], ids=["shortcut", "tcp"])
+@pytest.mark.parametrize("stamped", [False, True], ids=["plain", "stamped"])
 def test_last_message_before_closing_arrives(hub: Hub, stamped: bool) -> None:
     listener, flooder = Client(hub.url, "LAST"), Client(hub.url)
     expected = [b"%d" % number for number in range(200)]

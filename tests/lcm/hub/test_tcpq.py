@@ -1,9 +1,8 @@
-"""The protocol, and the shortcut by a Unix socket."""
+"""The protocol, and this package's own client."""
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import random
 import select
@@ -11,7 +10,7 @@ import socket
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -31,7 +30,7 @@ from tests.lcm.hub.clients import (
 )
 from vtbdrake.lcm.connections import LcmLink, TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
-from vtbdrake.lcm.hub.tcpq import address_name, peer_user, shortcut_name
+from vtbdrake.lcm.hub.tcpq import peer_user
 
 pytestmark = pytest.mark.one_python
 
@@ -58,10 +57,10 @@ U32 = struct.Struct(">I").pack
         (GREETING + b"".join(record(2, b"A%d" % i) for i in range(1025)), "malformed"),
     ],
 )
-def test_protocol_violation_ends_the_connection(hub, connect, sent: bytes, reason: str) -> None:
+def test_protocol_violation_ends_the_connection(hub, sent: bytes, reason: str) -> None:
     client = Client(hub.url, ".*")
     client.received.clear()
-    with connect(hub.url, greeting=sent) as sock:
+    with raw_client(hub.url, greeting=sent) as sock:
         assert is_disconnected(sock)
     assert hub.statistics().disconnected == {reason: 1}
     client.publish("STILL_HERE")
@@ -175,27 +174,6 @@ class Own:
         self.connection.close()
 
 
-@contextlib.contextmanager
-def holder(port: int, *, user: int | None = None) -> Iterator[None]:
-    """Let another process listen on the name of the shortcut, as this or another user."""
-    code = f"""
-import os, socket, sys
-if {user!r} is not None:
-    os.setuid({user!r})
-sock = socket.socket(socket.AF_UNIX)
-sock.bind({shortcut_name("127.0.0.1", port)!r})
-sock.listen()
-print("ready", flush=True)
-sys.stdin.read()
-"""
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        try:
-            assert process.stdout is not None and process.stdout.readline() == b"ready\n"
-            yield
-        finally:
-            process.kill()
-
-
 def relayed(own: Own, client: Client) -> bool:
     """Let both clients receive; return whether the second one has received anything."""
     own.connection.take(1)
@@ -208,56 +186,21 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def is_local(name: str | None) -> bool:
-    assert name is not None
-    return name.startswith("local:")
-
-
-@pytest.mark.parametrize(
-    ("host", "name"),
-    [
-        ("127.0.0.1", b"\0vtbdrake-hub/127.0.0.1:7700"),
-        ("localhost", b"\0vtbdrake-hub/127.0.0.1:7700"),
-        ("127.0.0.2", b"\0vtbdrake-hub/127.0.0.2:7700"),
-        ("0.0.0.0", None),
-        ("192.168.0.1", None),
-        ("robot", None),
-    ],
-)
-def test_shortcut_exists_on_loopback_only(host: str, name: bytes | None) -> None:
-    assert shortcut_name(host, 7700) == name
-
-
-def test_hub_beyond_loopback_has_no_shortcut() -> None:
-    with Hub(host="0.0.0.0", port=0) as hub:
-        port = address(hub.url)[1]
-        assert f":{port}" not in Path("/proc/net/unix").read_text()
-        with Own(f"tcpq://127.0.0.1:{port}", "A") as own:
-            assert not is_local(own.name)
-
-
-def test_shortcut_and_tcp_clients_exchange_messages(hub) -> None:
+def test_own_client_and_liblcm_exchange_messages(hub) -> None:
     client = Client(hub.url, "A")
     with Own(hub.url, "A", "B") as own:
-        assert is_local(own.name)
-        client.publish("A", b"by TCP")
+        client.publish("A", b"by liblcm")
         client.sync()
-        own.publish("A", b"by the shortcut")
+        own.publish("A", b"by the own client")
         own.publish("B", b"to itself")
         own.sync()
         client.sync()
-        assert client.received == [("A", b"by TCP"), ("A", b"by the shortcut")]
+        assert client.received == [("A", b"by liblcm"), ("A", b"by the own client")]
         assert own.received == [*client.received, ("B", b"to itself")]
 
 
-def test_localhost_uses_the_shortcut(hub) -> None:
-    with Own(f"tcpq://localhost:{address(hub.url)[1]}") as own:
-        assert is_local(own.name)
-
-
-def test_time_stamps_need_tcp(hub) -> None:
+def test_arrivals_are_stamped(hub) -> None:
     with Own(hub.url, "A", stamped=True) as own:
-        assert own.name is not None and own.name.startswith("127.0.0.1:")
 
         def is_stamped() -> bool:  # The kernel enables time stamps a little later.
             own.publish("A")
@@ -267,7 +210,7 @@ def test_time_stamps_need_tcp(hub) -> None:
         wait_until(is_stamped)
 
 
-def test_ownership_covers_tcp_and_shortcut_clients() -> None:
+def test_ownership_covers_own_clients_and_liblcm() -> None:
     with Hub(port=0, protect=["COMMAND"], lease=0.05) as hub:
         robot, other = Client(hub.url, "COMMAND"), Client(hub.url)
         other_name = client_name(other.bus.fileno())
@@ -298,15 +241,8 @@ def test_ownership_covers_tcp_and_shortcut_clients() -> None:
         assert robot.data("COMMAND") == [b"own", b"other", b"third"]
 
 
-def test_unusual_names_are_escaped() -> None:
-    assert address_name(b"\x0000a3f") == "local:00a3f"
-    assert address_name(b"\0a\n\xff") == "local:a\\n\\xff"
-    assert address_name("/tmp/it's") == "local:/tmp/it's"
-    assert address_name("") == "local:"
-
-
 @pytest.mark.parametrize("size", [1, 256 * 1024 - 13, 3 * MEBIBYTE, 16 * MEBIBYTE])
-def test_large_messages_use_the_shortcut(hub, size: int) -> None:
+def test_large_messages_arrive_unchanged(hub, size: int) -> None:
     data = random.Random(size).randbytes(size)
     client = Client(hub.url, "UP")
     with Own(hub.url, "DOWN") as own, ClientProcess(hub.url) as process:
@@ -347,9 +283,8 @@ def test_waiting_link_sends_its_rest(hub) -> None:
 def test_client_killed_within_a_message_is_removed(hub) -> None:
     port = address(hub.url)[1]
     code = f"""
-import sys
-from vtbdrake.lcm.hub.tcpq import connect_shortcut
-sock = connect_shortcut("127.0.0.1", {port})
+import socket, sys
+sock = socket.create_connection(("127.0.0.1", {port}))
 sock.sendall({GREETING + record(1, b"A", b"whole") + record(1, b"A", bytes(1000))[:-1]!r})
 print("ready", flush=True)
 sys.stdin.read()
@@ -368,52 +303,7 @@ sys.stdin.read()
     assert client.received == [("A", b"whole")]
 
 
-def test_hub_without_its_socket_name_serves_tcp(caplog: pytest.LogCaptureFixture) -> None:
-    port = free_port()
-    with holder(port), Hub(port=port) as hub:
-        client = Client(hub.url, "A")
-        client.publish("A")
-        client.sync()
-        assert client.received == [("A", b"")]
-    (warning,) = caplog.records
-    assert "by TCP only" in warning.getMessage() and "in use" in warning.getMessage()
-
-
-def test_own_users_socket_is_trusted() -> None:
-    """This user could as well take the port."""
-    port = free_port()
-    with holder(port), Hub(port=port) as hub, pytest.raises(TimeoutError):
-        TcpqConnection(hub.url, {}, 0.05)
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
-def test_other_users_socket_is_not_trusted(caplog: pytest.LogCaptureFixture) -> None:
-    port, stranger = free_port(), 65534
-    with holder(port, user=stranger), Hub(port=port) as hub:
-        caplog.clear()
-        with Own(hub.url) as own:
-            assert not is_local(own.name)
-            own.sync()
-    (warning,) = caplog.records
-    assert warning.levelno == logging.WARNING
-    assert f"belongs to user {stranger}" in warning.getMessage()
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
-def test_hub_of_root_is_trusted() -> None:
-    with Hub(port=0, users=[65534]) as hub:
-        code = f"""
-import os, sys
-sys.path[:] = {sys.path!r}
-from vtbdrake.lcm.connections import TcpqConnection
-os.setuid(65534)
-print(TcpqConnection({hub.url!r}, {{}}, {TIMEOUT}).name)
-"""
-        output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert is_local(output)
-
-
-def test_restarted_hub_is_found_by_the_shortcut() -> None:
+def test_restarted_hub_is_found() -> None:
     port = free_port()
     with closing(LcmLink(f"tcpq://127.0.0.1:{port}", {}, connect_timeout=TIMEOUT)) as link:
         for losses in range(3):
@@ -422,7 +312,6 @@ def test_restarted_hub_is_found_by_the_shortcut() -> None:
                     wait_until(lambda: bool(link.take(0.1, 1)) or link.connected)
                 else:
                     link.open()
-                assert is_local(link.name)
                 os.kill(hub.pid, 9)
             wait_until(lambda: not link.connected or bool(link.take(0.1, 100)))
             assert link.losses == losses + 1
@@ -438,6 +327,3 @@ def test_kernel_reports_users_of_open_sockets() -> None:
                 assert peer_user(accepted) == os.geteuid()
                 client.close()
                 assert peer_user(accepted) is None
-    one, other = socket.socketpair()
-    with one, other:
-        assert peer_user(one) == os.geteuid()

@@ -36,10 +36,8 @@ default.
 
   Delays of the hub itself extend the leases.
 * **Status.** The hub publishes its `HubStatistics` as JSON on ``VTB_HUB`` every ``status_period`` seconds, and within
-  10 ms after a change of an owner or a rejection. Clients are named after their sockets, ``127.0.0.1:41234`` or
-  ``local:00a3f``; `client_name` returns the name of a client. Clients cannot publish on ``VTB_HUB``.
-* **Shortcut.** On loopback the hub also listens on a Unix socket, which makes messages cheaper; this package's clients
-  use it automatically.
+  10 ms after a change of an owner or a rejection. Clients are named after their sockets, ``127.0.0.1:41234``;
+  `client_name` returns the name of a client. Clients cannot publish on ``VTB_HUB``.
 * **Next to a control loop** the hub works best on the loop's own processor (``cpus``) at a lower ``priority``. On
   another processor, every actuator command must wake that processor; at a higher priority, the hub interrupts the
   sending cycle.

@@ -45,13 +45,11 @@ class ClientConnection:
         self._max_queue = max_queue
         self._queue: deque[bytes | bytearray] = deque()
         self._offset = 0  # bytes of the first queued message that have been sent
-        self._is_tcp = sock.family == socket.AF_INET
         sock.setblocking(False)
-        if self._is_tcp:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            for option, value in _KEEP_ALIVE.items():
-                sock.setsockopt(socket.IPPROTO_TCP, option, value)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in _KEEP_ALIVE.items():
+            sock.setsockopt(socket.IPPROTO_TCP, option, value)
 
     @property
     def idle(self) -> bool:
@@ -69,8 +67,7 @@ class ClientConnection:
         liblcm writes a message in five pieces with Nagle's algorithm, which holds back the second piece until the
         first is acknowledged (40 ms later by default). The kernel resets the option, so every piece needs a call.
         """
-        if self._is_tcp:
-            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def send(self, messages: list[bytes | bytearray], now: float) -> int:
         """Send messages, and queue what cannot be sent at once.

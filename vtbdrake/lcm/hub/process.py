@@ -52,10 +52,10 @@ class Hub(ChildService):
             HubError: Its process does not start.
         """
         with contextlib.ExitStack() as stack:
-            listeners = [stack.enter_context(listener) for listener in listen(self.config)]
-            self._url = f"tcpq://{address_name(listeners[0].getsockname())}"
+            listener = stack.enter_context(listen(self.config))
+            self._url = f"tcpq://{address_name(listener.getsockname())}"
             self.name = f"the hub at {self._url}"
-            self._start(_serve_child, self.config, sockets=listeners)
+            self._start(_serve_child, self.config, sockets=[listener])
 
     @property
     def url(self) -> str:
@@ -100,8 +100,8 @@ def serve(server: HubServer, ready: Callable[[], None] = lambda: None) -> None:
         server.serve_forever()
 
 
-def _serve_child(connection: socket.socket, config: HubConfig, *listeners: socket.socket) -> None:
+def _serve_child(connection: socket.socket, config: HubConfig, listener: socket.socket) -> None:
     """Run the child process of a `Hub`."""
     logging.basicConfig(format="hub: %(message)s")
-    server = HubServer(config, listeners=listeners, control=connection)
+    server = HubServer(config, listener=listener, control=connection)
     serve(server, ready=lambda: report_ready(connection))

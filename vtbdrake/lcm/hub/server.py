@@ -11,7 +11,6 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from math import inf
 
 from vtbdrake.lcm.hub import tcpq
@@ -132,32 +131,26 @@ class HubAddressError(ValueError):
     """The hub cannot listen at its address."""
 
 
-def listen(config: HubConfig) -> list[socket.socket]:
-    """Return sockets that listen at the address of the config: TCP, and on loopback the shortcut.
+def listen(config: HubConfig) -> socket.socket:
+    """Return a socket that listens at the address of the config.
 
     Raises:
         HubAddressError: The hub cannot listen there.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listeners = [sock]
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((config.host, config.port))
-        # The shortcut opens first: a client that does not find it uses TCP from then on.
-        shortcut = tcpq.listen_shortcut(*sock.getsockname())
-        if shortcut is not None:
-            listeners.append(shortcut)
         sock.listen()
     except OSError as error:
-        for listener in listeners:
-            listener.close()
+        sock.close()
         raise HubAddressError(
             f"the hub cannot listen on {config.host}:{config.port} ({error.strerror}); choose an IPv4 address of this "
             "machine, and a free port (0: any) that you may use"
         ) from error
     if not sock.getsockname()[0].startswith(LOOPBACK):
         _log.warning("listening on %s, beyond loopback: every machine that reaches it can connect", config.host)
-    return listeners
+    return sock
 
 
 class HubServer:
@@ -168,7 +161,7 @@ class HubServer:
 
     Args:
         config: Address, protected channels and limits.
-        listeners: Sockets returned by `listen`, which the hub owns from now on; by default it calls `listen`.
+        listener: Socket returned by `listen`, which the hub owns from now on; by default it calls `listen`.
         control: Connected socket, which the hub owns from now on. For every byte received there, the hub sends its
             statistics as a line of JSON; when the other end closes, the hub stops.
 
@@ -183,20 +176,21 @@ class HubServer:
         self,
         config: HubConfig,
         *,
-        listeners: Sequence[socket.socket] | None = None,
+        listener: socket.socket | None = None,
         control: socket.socket | None = None,
     ) -> None:
         self.config = config
-        self._listeners = listen(config) if listeners is None else listeners
-        host_port = self._listeners[0].getsockname()
+        self._listener = listener or listen(config)
+        host_port = self._listener.getsockname()
         self.url = f"tcpq://{tcpq.address_name(host_port)}"
         self._control = control
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._epoll = select.epoll()
-        self._callbacks: dict[int, Callable[[], None]] = {self._wake: self._stop}
-        for listener in self._listeners:
-            listener.setblocking(False)
-            self._callbacks[listener.fileno()] = partial(self._accept, listener)
+        self._listener.setblocking(False)
+        self._callbacks: dict[int, Callable[[], None]] = {
+            self._wake: self._stop,
+            self._listener.fileno(): self._accept,
+        }
         if control is not None:
             control.setblocking(False)
             self._callbacks[control.fileno()] = self._answer
@@ -253,8 +247,7 @@ class HubServer:
         self._unfinished.clear()
         if not self._epoll.closed:
             self._epoll.close()
-            for listener in self._listeners:
-                listener.close()
+            self._listener.close()
             os.close(self._wake)
             if self._control is not None:
                 self._control.close()
@@ -283,16 +276,15 @@ class HubServer:
         if not request:
             self._running = False
 
-    def _accept(self, listener: socket.socket) -> None:
+    def _accept(self) -> None:
         try:
-            sock, _ = listener.accept()
+            sock, _ = self._listener.accept()
         except (BlockingIOError, ConnectionError):
             return
         except OSError as error:
             # Such as no free file descriptor: the pending connection would wake the hub again and again.
             _log.warning("accepting no clients for %g s: %s", _ACCEPT_PAUSE, error)
-            for listener in self._listeners:
-                self._epoll.unregister(listener.fileno())
+            self._epoll.unregister(self._listener.fileno())
             self._accept_paused_at = self._now
             return
         limits = {"max_message": self.config.max_message, "max_queue": self.config.max_queue}
@@ -314,7 +306,7 @@ class HubServer:
     def _admit(self, sock: socket.socket) -> int | None:
         """Return the user of a new client; if the hub is full, an idle client is disconnected to make room."""
         config, clients = self.config, self._clients.values()
-        if sock.family == socket.AF_UNIX or self._on_loopback:
+        if self._on_loopback:
             user = tcpq.peer_user(sock)
             if not config.all_users and user not in {*self._own_users, *config.users}:
                 name = "unknown user" if user is None else f"user {user}"
@@ -458,5 +450,4 @@ class HubServer:
                     self._disconnect(client, "incomplete", message)
         if self._accept_paused_at is not None and now >= self._accept_paused_at + _ACCEPT_PAUSE:
             self._accept_paused_at = None
-            for listener in self._listeners:
-                self._epoll.register(listener.fileno(), select.EPOLLIN)
+            self._epoll.register(self._listener.fileno(), select.EPOLLIN)
