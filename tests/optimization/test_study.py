@@ -252,14 +252,6 @@ def test_points_given_between_two_budgets_are_told(tmp_path):
     assert [t.number for t in study.trials if t.origin == "user"] == [24]
 
 
-def test_irreproducible_solver_ends_with_spent_budget():
-    conditions = [{DAMPING: damping} for damping in np.linspace(0.0, 1.0, 24)]
-    study = pendulum_problem(conditions=conditions).study(solver="GN_CRS2_LM")
-    for rollouts in (100, 110, 120):
-        assert study.run(rollouts=rollouts, executor="serial", progress=False).reason == "budget"
-        assert len(study) == rollouts
-
-
 def test_a_study_that_is_complete_runs_nothing_more(tmp_path):
     path = tmp_path / "a.db"
     pendulum_problem().study(path, solver="sobol").run(rollouts=16, executor="serial", progress=False).close()

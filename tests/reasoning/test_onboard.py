@@ -223,12 +223,6 @@ def test_mental_copy_that_reasons_itself_is_refused():
         simulator.AdvanceTo(1.0)
 
 
-def test_method_that_cannot_be_repeated_is_refused():
-    _, simulator, _ = asked(PusherScenario(method="GN_ESCH"))
-    with pytest.raises(ValueError, match="GN_ESCH takes its random numbers from the clock"):
-        simulator.AdvanceTo(1.0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -535,11 +535,6 @@ def test_a_world_without_a_plant_has_no_motion(mass):
         reasoner.motion(decision, 1)
 
 
-def test_a_method_of_random_numbers_from_the_clock_says_so():
-    assert make(method="CEM").reproducible
-    assert not make(method="GN_ESCH").reproducible
-
-
 def test_a_quality_that_ignores_the_decision_is_reported(mass):
     decision = decide(make(horizon=0.01, sample_period=0.01, budget=Budget(rollouts=6)), mass)
     assert decision.keeps_plan

@@ -125,7 +125,7 @@ class StudyRun:
     def _batches(self) -> tuple[str, str]:
         if self._told < self._new_from:
             self._roll_out_queue()
-        batch, silent = self._resume(), 0
+        batch, silent = 0, 0
         while silent < _KNOWN_BATCHES:
             before = len(self._known)
             if not self._one_batch(batch):
@@ -186,16 +186,6 @@ class StudyRun:
         if points is None:
             raise _RunEnd(TIME, f"the time is over, before {self._solver.name} asked for more points")
         return points
-
-    def _resume(self) -> int:
-        """Return the first batch: 0, or the next one of the study if its solver cannot be told again."""
-        if self._solver.reproducible or not self._told:
-            return 0
-        # Points that racing has dropped would take further rollouts.
-        points = list(dict.fromkeys(trial.point for trial in self._file.trials() if trial.exact))
-        self._solver.tell(self._evaluator.evaluate(points))
-        self._show_best()
-        return self._told
 
     def _end_of_solver(self) -> tuple[str, str]:
         left, point = self._limit - len(self._known), len(self._problem.conditions)

@@ -254,11 +254,6 @@ class _Decider:
         ((path, part),) = parts.items()
         self._variables = {element.name: testbed.variables()[f"{path}.{element.name}"] for element in part.variables}
         self._places = {name: testbed.dps_layout.slice_of(variable) for name, variable in self._variables.items()}
-        if not reasoner.reproducible:
-            raise ValueError(
-                f"{self._arguments['search'].method} takes its random numbers from the clock, so that a run could not "
-                "be repeated: take CEM, for example"
-            )
         for element in self._arguments["decision"]:
             if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
                 raise ValueError(f"a reasoner on board decides {path}.{_CANDIDATE}, not {element.address}")

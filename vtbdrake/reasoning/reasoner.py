@@ -99,8 +99,6 @@ class Reasoner:
         space: The decided elements.
         budget: How much a decision may take.
         samples: Number of samples of the belief from which each candidate is simulated.
-        reproducible: Whether a decision can be repeated; false with the few methods that take their random numbers from
-            the clock.
 
     Raises:
         ValueError: An address is not part of the DPS, the mental scenario has other commands, the budget does not
@@ -155,9 +153,7 @@ class Reasoner:
         self._seed = as_whole("a seed", seed)
         # A method that cannot decide this is refused here. Candidate 0 does not count: the method does not propose it.
         affordable = None if budget.rollouts is None else max(budget.rollouts // self.samples - 1, 1)
-        solver = self.solver(0.0, budget=affordable)
-        solver.close()
-        self.reproducible = solver.reproducible
+        self.solver(0.0, budget=affordable).close()
         self._workers = checked_workers(search.workers)
         self._owned = not isinstance(search.executor, Executor)
         self.executor = _make_executor(search, self.problem, budget)

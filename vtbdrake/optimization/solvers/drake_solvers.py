@@ -1,11 +1,20 @@
-"""SNOPT, IPOPT and the algorithms of NLopt, as Drake provides them.
+"""SNOPT, IPOPT and eight algorithms of NLopt, as Drake provides them.
 
 NLopt's names: the first letter says global or local, the second whether the algorithm uses derivatives (D) or not (N).
-Not offered, though Drake lists them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which it omits;
-those that need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which Drake cannot name: they
-return at once with x = nan; LN_NEWUOA_BOUND, which can compute for ever without a call of the function while it holds
-Python's lock (LN_BOBYQA is its successor); and GN_ORIG_DIRECT and GN_ORIG_DIRECT_L, which crash the process with drake
-1.58 (GN_DIRECT and GN_DIRECT_L are the same methods).
+Drake lists more, which are not offered because
+
+* they cannot be repeated, as Drake cannot seed NLopt's random numbers: GN_CRS2_LM, GN_DIRECT_L_RAND (and
+  ..._RAND_NOSCAL), GN_ESCH, GN_ISRES, GN_MLSL, GD_MLSL, GD_STOGO_RAND, LN_PRAXIS;
+* they do not survive an exception in their callback, by which a solver is closed: GD_STOGO, LN_NEWUOA (LN_BOBYQA is its
+  successor); or compute for ever without a call of the function: LN_NEWUOA_BOUND; or crash: GN_ORIG_DIRECT(_L);
+* they are another one in the unit cube and without equality constraints: GN_DIRECT_NOSCAL and GN_DIRECT_L_NOSCAL
+  (GN_DIRECT_L), LN_AUGLAG_EQ (LN_COBYLA), LD_AUGLAG_EQ (LD_MMA); or that one with slower constraints: LN_AUGLAG,
+  LD_AUGLAG;
+* they report success far from the optimum under a linear constraint: LD_MMA (LD_CCSAQ is its successor);
+* they end at once with more than ten parameters: GN_AGS;
+* they are hardly ever better than the others on the functions of `benchmarks/auto_regret.py`: GN_MLSL_LDS, GD_MLSL_LDS;
+* Drake cannot run them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which it omits, and those that
+  need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which it cannot name.
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
 """
@@ -14,7 +23,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
@@ -28,59 +37,20 @@ from pydrake.solvers import (
     SolverOptions,
 )
 
-from vtbdrake.optimization.solvers.blocking import BlockingSolver, Stopped
+from vtbdrake.optimization.solvers.blocking import BlockingSolver
 from vtbdrake.optimization.solvers.solver import Search, SolverError
 
-
-class Algorithm(NamedTuple):
-    """The properties of an algorithm of NLopt."""
-
-    # Whether the algorithm takes constraints. LD_MMA, and LD_AUGLAG_EQ, which uses it, would take them, but report
-    # success far from the optimum on smooth functions of two variables under a linear constraint.
-    constraints: bool = False
-    # Whether it needs at least two parameters: PRAXIS does not end with one, and NEWUOA refuses one.
-    several: bool = False
-    # Whether its random numbers are seeded from the clock: Drake cannot seed those of NLopt.
-    clock: bool = False
-    # Whether it ends only at a number of evaluations, and reports success there.
-    until_limit: bool = False
-    # Whether it does not survive an exception in its callback: it never ends, or crashes the process. Once closed, it
-    # gets the same value everywhere instead, and runs to its end or to its limit of calls: the budget, or `LIMIT`.
-    fragile: bool = False
-
-
+# NLopt's algorithms: whether each takes constraints.
 ALGORITHMS = {
-    "GN_AGS": Algorithm(constraints=True),
-    "GN_CRS2_LM": Algorithm(clock=True),
-    "GN_DIRECT": Algorithm(),
-    "GN_DIRECT_L": Algorithm(),
-    "GN_DIRECT_L_NOSCAL": Algorithm(),
-    "GN_DIRECT_L_RAND": Algorithm(clock=True),
-    "GN_DIRECT_L_RAND_NOSCAL": Algorithm(clock=True),
-    "GN_DIRECT_NOSCAL": Algorithm(),
-    "GN_ESCH": Algorithm(clock=True),
-    "GN_ISRES": Algorithm(constraints=True, clock=True),
-    "GN_MLSL": Algorithm(clock=True),
-    "GN_MLSL_LDS": Algorithm(),
-    "LN_AUGLAG": Algorithm(constraints=True),
-    "LN_AUGLAG_EQ": Algorithm(constraints=True),
-    "LN_BOBYQA": Algorithm(),
-    "LN_COBYLA": Algorithm(constraints=True),
-    "LN_NELDERMEAD": Algorithm(),
-    "LN_NEWUOA": Algorithm(several=True, fragile=True),
-    "LN_PRAXIS": Algorithm(several=True, clock=True),
-    "LN_SBPLX": Algorithm(),
-    "GD_MLSL": Algorithm(clock=True),
-    "GD_MLSL_LDS": Algorithm(),
-    "GD_STOGO": Algorithm(until_limit=True, fragile=True),
-    "GD_STOGO_RAND": Algorithm(clock=True, until_limit=True, fragile=True),
-    "LD_AUGLAG": Algorithm(constraints=True),
-    "LD_AUGLAG_EQ": Algorithm(),
-    "LD_CCSAQ": Algorithm(constraints=True),
-    "LD_MMA": Algorithm(),
-    "LD_SLSQP": Algorithm(constraints=True),
+    "GN_DIRECT": False,
+    "GN_DIRECT_L": False,
+    "LN_BOBYQA": False,
+    "LN_COBYLA": True,
+    "LN_NELDERMEAD": False,
+    "LN_SBPLX": False,
+    "LD_CCSAQ": True,
+    "LD_SLSQP": True,
 }
-LIMIT = 5_000
 
 # The names of NLopt's return codes.
 RESULTS = {
@@ -155,11 +125,9 @@ class ProgramSolver(BlockingSolver):
             raise SolverError(f"constraints need gradient='central': {AUTODIFF} gives the objective's only")
         if step is not None and (gradient == AUTODIFF or not 0.0 < step <= 0.25):
             raise SolverError(f"step is of differences, a part of the range in (0, 0.25], not {step} of {gradient}")
-        search.require(name, continuous=True, one_objective=True, not_wide=True)
-        self._algorithm = ALGORITHMS.get(name, Algorithm(constraints=True))
-        search.require(name, no_constraints=not self._algorithm.constraints, several=self._algorithm.several)
+        no_constraints = not ALGORITHMS.get(name, True)
+        search.require(name, continuous=True, one_objective=True, not_wide=True, no_constraints=no_constraints)
         super().__init__(search, name=name)
-        self.reproducible = not self._algorithm.clock
         self.wants_gradient = gradient == AUTODIFF
         self._gradient = gradient
         self._step = STEPS[gradient] if step is None else step
@@ -209,7 +177,7 @@ class ProgramSolver(BlockingSolver):
             return False, status
         if not self._at(np.clip(x, 0.0, 1.0))[0].usable:
             return False, f"{status}, but at a point where the simulation fails"
-        return not self._algorithm.until_limit, status
+        return True, status
 
     def _functions(self, x: np.ndarray) -> np.ndarray:
         """Return (c, g) at ``x``, shape (1 + constraints,): numbers, or AutoDiffXd if ``x`` is of AutoDiffXd."""
@@ -218,13 +186,7 @@ class ProgramSolver(BlockingSolver):
             _, cost, violations = self._at(np.array(x, dtype=float))
             return np.concatenate([[cost], violations])
         u = np.array(ExtractValue(x), dtype=float).ravel()
-        try:
-            self._prepare(u)
-        except Stopped:
-            if not self._algorithm.fragile:
-                raise
-            count = 1 + self.search.constraints
-            return InitializeAutoDiff(np.zeros(count), np.zeros((count, self.search.size))).ravel()
+        self._prepare(u)
         _, cost, violations = self._at(u)
         values = np.concatenate([[cost], violations])
         if not self._uses_derivatives:
@@ -318,7 +280,7 @@ class Nlopt(ProgramSolver):
             NloptSolver.XAbsoluteToleranceName(): self._tolerance,
             NloptSolver.ConstraintToleranceName(): self._feasibility,
             # 0: no limit. Drake's is 1000, and the budget is counted by us.
-            NloptSolver.MaxEvalName(): (self.search.budget or LIMIT) if self._algorithm.fragile else 0,
+            NloptSolver.MaxEvalName(): 0,
         }
 
     def _status(self, result: MathematicalProgramResult) -> str:

@@ -204,7 +204,6 @@ class Search:
         one_objective: bool = False,
         no_constraints: bool = False,
         no_start: bool = False,
-        several: bool = False,
         not_wide: bool = False,
     ) -> None:
         """Check that a method can perform this search.
@@ -216,7 +215,6 @@ class Search:
             one_objective: Whether it takes one objective only.
             no_constraints: Whether it takes no constraints.
             no_start: Whether it does not start at a point.
-            several: Whether it needs at least two parameters.
             not_wide: Whether it chooses each point by the last one, so that its batches cannot be widened.
 
         Raises:
@@ -236,8 +234,6 @@ class Search:
             raise SolverError(f"{name} takes one objective, not {self.objectives}; NSGA-II can do that")
         if no_constraints and self.constraints:
             raise SolverError(f"{name} takes no constraints, and there are {self.constraints}; CMA-ES can do that")
-        if several and self.size < 2:
-            raise SolverError(f"{name} needs at least two parameters, and there is one; LN_COBYLA can do that")
         if not_wide and self.is_wide:
             raise SolverError(
                 f"{name} chooses each point by the last one, and cannot evaluate {self.parallel} side by side; leave "
@@ -265,14 +261,12 @@ class Solver(ABC):
         search: The search to perform.
         wants_gradient: Whether the solver needs `Evaluation.gradient`.
         takes_start: Whether the solver starts at a point (`Search.start`).
-        reproducible: False for the few algorithms whose library seeds its random numbers from the clock.
         success: Whether the solver ended by its own criterion (converged, or its design is complete); None before.
         message: How the solver ended.
     """
 
     wants_gradient: bool = False
     takes_start: bool = True
-    reproducible: bool = True
 
     def __init__(self, search: Search, *, name: str) -> None:
         self.name = name
