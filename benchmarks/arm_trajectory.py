@@ -73,8 +73,8 @@ def arm_trajectory(repeats: int = 10, searched: int = 60) -> list[Benchmark]:
             history.append((time.perf_counter() - begin, trial.value))
 
     study.run(rollouts=searched, executor="serial", callbacks=[look], progress=False)
-    found = Plan(move.straight, history[-1][1], tuple(history), "")
-    rows.append(_row("cma_es_testbed", found, time.perf_counter() - begin, straight))
+    plan = Plan(move.straight, history[-1][1], tuple(history), "")
+    rows.append(_row("cma_es_testbed", plan, time.perf_counter() - begin, straight))
     return rows
 
 

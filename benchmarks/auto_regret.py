@@ -384,8 +384,8 @@ def _optuna(sampler: str, record: _Record, case: Case, seed: int, budget: int) -
         distributions = {p.address: distribution(p, optuna) for p in case.space}
         for _ in range(budget):
             trial = study.ask(distributions)
-            found = [trial.params[name] for name in names]
-            point = tuple(p.options[x] if isinstance(p, Choice) else x for p, x in zip(case.space, found, strict=True))
+            values = [trial.params[name] for name in names]
+            point = tuple(p.options[x] if isinstance(p, Choice) else x for p, x in zip(case.space, values, strict=True))
             study.tell(trial, record(point))
 
 
@@ -437,12 +437,12 @@ def auto_regret() -> list[Benchmark]:
     solvers = {name: [AUTO, *(RIVALS_OF_TWO if case().corner else RIVALS)] for name, case in CASES.items()}
     tasks = [(name, solver, seed) for name, names in solvers.items() for solver in names for seed in SEEDS]
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        found = dict(zip(tasks, pool.map(gaps, tasks), strict=True))
+        gaps_by_task = dict(zip(tasks, pool.map(gaps, tasks), strict=True))
     rows = []
     for name, names in solvers.items():
         scale = _typical_gap(CASES[name]())
         for i, budget in enumerate(BUDGETS):
-            medians = {s: float(np.median([found[name, s, seed][i] for seed in SEEDS])) / scale for s in names}
+            medians = {s: float(np.median([gaps_by_task[name, s, seed][i] for seed in SEEDS])) / scale for s in names}
             rows.append(_row(f"auto_regret_{name}_{budget}", medians))
     ratios = [row.value for row in rows]
     worst = [row.name for row in rows if "the worst" in row.note]
@@ -463,17 +463,17 @@ def auto_regret() -> list[Benchmark]:
 def _row(name: str, medians: Mapping[str, float]) -> Benchmark:
     """One function and budget."""
     counted = {solver: max(gap, SOLVED) for solver, gap in medians.items()}
-    own = counted.pop(AUTO)
+    auto = counted.pop(AUTO)
     best = min(counted, key=lambda solver: counted[solver])
-    verdict = ", the worst" if own > max(counted.values()) else ""
+    verdict = ", the worst" if auto > max(counted.values()) else ""
     return Benchmark(
         name=name,
-        value=own / counted[best],
+        value=auto / counted[best],
         unit="1",
         goal=None,
         better=LOWER,
         against=best,
-        note=f"auto {own:.2g}{verdict}; " + ", ".join(f"{solver} {gap:.2g}" for solver, gap in counted.items()),
+        note=f"auto {auto:.2g}{verdict}; " + ", ".join(f"{solver} {gap:.2g}" for solver, gap in counted.items()),
     )
 
 

@@ -28,7 +28,7 @@ def casadi_system(repeats: int = 11, ticks: int = 1000) -> list[Benchmark]:
         ("casadi_system_impedance", "controller", NumpyImpedance, casadi_impedance, _controlling),
     )
     results = []
-    for name, what, by_hand, ours, simulator in cases:
+    for name, system, by_hand, ours, simulator in cases:
         for suffix, compile in (("", False), ("_compiled", True)):
             a, b = simulator(ours(compile=compile)), simulator(by_hand())
             difference = _largest_difference(a, b, ticks)
@@ -43,7 +43,7 @@ def casadi_system(repeats: int = 11, ticks: int = 1000) -> list[Benchmark]:
                     unit="1",
                     goal=None if results else 0.5,
                     better=LOWER,
-                    against=f"the same {what} in numpy",
+                    against=f"the same {system} in numpy",
                     note=f"{micros[0]} and {micros[1]} us per tick, n = {repeats}; results {difference:.1g} apart",
                 )
             )

@@ -84,12 +84,12 @@ def _rollout_time(executor: DaskExecutor, task: RolloutTask, rollouts: int) -> t
 
 def _transfer(executor: DaskExecutor, task: RolloutTask, rollouts: int) -> np.ndarray:
     """Round trips of rollouts that are alone, less their wall times, in seconds."""
-    found = []
+    transfers = []
     for _ in range(rollouts):
         begin = time.perf_counter()
         ((_, result),) = executor.run(task, [{MASS: 0.0}])
-        found.append(time.perf_counter() - begin - result.wall_time)
-    return np.array(found)
+        transfers.append(time.perf_counter() - begin - result.wall_time)
+    return np.array(transfers)
 
 
 def _overhead(cluster: DaskCluster, executor: DaskExecutor, task: RolloutTask, tasks: int) -> tuple[float, float]:

@@ -52,7 +52,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
         budget=Budget(rollouts=ROLLOUTS),
         search=SearchConfig(method="random", executor="processes", workers=WORKERS),
     )
-    overheads, taken, bare, own = [], [], [], []
+    overheads, taken, bare, processor_times = [], [], [], []
     with reasoner:
         for k in range(decisions + 3):
             simulator.AdvanceTo(1.01 + (k + 1) * scenario.period)
@@ -63,12 +63,12 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
             if k >= 3:  # The first ones build the testbeds of the workers.
                 overheads.append(elapsed - max(min(first, second) + third, first, second))
                 taken.append(elapsed)
-                own.append(used)
+                processor_times.append(used)
                 bare.append(_begin_in_workers(reasoner, testbed, context))
     runner = RolloutRunner(reasoner.task)
     belief_to_start = BeliefToStart(runner.testbed)
     belief = Belief.of(testbed, context)
-    one, other = belief_to_start.start(belief), belief_to_start.start(belief)
+    first_start, second_start = belief_to_start.start(belief), belief_to_start.start(belief)
 
     def begin_at(*starts: object) -> None:
         for start in starts:
@@ -77,11 +77,11 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
     ours = np.array(overheads) * 1e3
     anew, again = (
         1e3 * np.median([seconds(partial(begin_at, *starts)) for _ in range(decisions)]) / 2
-        for starts in ((one, other), (one, one))
+        for starts in ((first_start, second_start), (first_start, first_start))
     )
     ours += 2 * max(float(anew - again), 0.0)
     parts = {"the belief": lambda: Belief.of(testbed, context), "its start": lambda: belief_to_start.start(belief)}
-    told = ", ".join(f"{name} {1e3 * np.median([seconds(f) for _ in range(200)]):.2f} ms" for name, f in parts.items())
+    costs = ", ".join(f"{name} {1e3 * np.median([seconds(f) for _ in range(200)]):.2f} ms" for name, f in parts.items())
     return Benchmark(
         name="decision_overhead",
         value=float(np.median(ours)),
@@ -90,7 +90,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
         better=LOWER,
         against="the rollouts of the same decisions",
         note=f"{spread(ours, unit='ms')}, of which {1e3 * np.median(bare):.2f} ms without the method and its choice; "
-        f"{1e3 * np.median(own):.2f} ms of processor time in the process that decides; "
-        f"a decision takes {1e3 * np.median(taken):.3g} ms, with {ROLLOUTS} rollouts on {WORKERS} workers; {told}, "
+        f"{1e3 * np.median(processor_times):.2f} ms of processor time in the process that decides; "
+        f"a decision takes {1e3 * np.median(taken):.3g} ms, with {ROLLOUTS} rollouts on {WORKERS} workers; {costs}, "
         f"{anew - again:.2f} ms to begin elsewhere in a worker",
     )

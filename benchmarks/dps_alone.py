@@ -88,6 +88,6 @@ def _start(command: Sequence[str], url: str) -> tuple[float, float]:
 
 def resident(pid: int) -> float:
     """Resident memory of a process, in megabytes."""
-    found = re.search(r"^VmRSS:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
-    assert found is not None
-    return int(found[1]) * 1024 / 1e6
+    match = re.search(r"^VmRSS:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    assert match is not None
+    return int(match[1]) * 1024 / 1e6

@@ -70,13 +70,15 @@ def time_to_target(seeds: int = 10) -> list[Benchmark]:
     simulates it to the horizon, pausing at the same sample times, so that both see the same values at the same points;
     it is stopped at the first value that reaches the target. They run in turns, seed by seed.
     """
-    found: dict[str, list[Search]] = {"auto": [], "serial": [], "rebuild": []}
+    searches_by_kind: dict[str, list[Search]] = {"auto": [], "serial": [], "rebuild": []}
     for seed in range(seeds):
-        turns = [*found][seed % 3 :] + [*found][: seed % 3]
+        turns = [*searches_by_kind][seed % 3 :] + [*searches_by_kind][: seed % 3]
         for which in turns:
-            found[which].append(_differential_evolution(seed) if which == "rebuild" else _study(seed, which))
-    times = {which: np.array([search.seconds for search in searches]) for which, searches in found.items()}
-    counts = {which: np.array([float(search.rollouts) for search in searches]) for which, searches in found.items()}
+            searches_by_kind[which].append(_differential_evolution(seed) if which == "rebuild" else _study(seed, which))
+    times = {which: np.array([search.seconds for search in searches]) for which, searches in searches_by_kind.items()}
+    counts = {
+        which: np.array([float(search.rollouts) for search in searches]) for which, searches in searches_by_kind.items()
+    }
     names = {"auto": "study", "serial": "serial study", "rebuild": "rebuild and differential evolution"}
     note = "; ".join(
         f"{name}: {spread(times[which])}, rollouts {spread(counts[which], unit='')}" for which, name in names.items()

@@ -53,8 +53,8 @@ def timed(statement: str) -> float:
 
 def pydrake_modules() -> list[str]:
     """The modules of pydrake that are loaded with all public names of vtbdrake."""
-    found = _run(f"{EVERYTHING}; import sys; print(sorted(m for m in sys.modules if m.split('.')[0] == 'pydrake'))")
-    modules: list[str] = ast.literal_eval(found)
+    printed = _run(f"{EVERYTHING}; import sys; print(sorted(m for m in sys.modules if m.split('.')[0] == 'pydrake'))")
+    modules: list[str] = ast.literal_eval(printed)
     return [module for module in modules if not any(part.startswith("_") for part in module.split("."))]
 
 

@@ -34,16 +34,18 @@ class CartPole(Task):
 
 def main() -> None:
     """Time the plans."""
-    given = json.load(sys.stdin)
+    settings = json.load(sys.stdin)
     with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
-        file.write(given["model"])
+        file.write(settings["model"])
         file.flush()
         task = CartPole(file.name)
-    config = PredictiveSamplingConfig(num_rollouts=given["candidates"], num_nodes=given["knots"], sigma=given["spread"])
-    controller = Controller(ControllerConfig(horizon=given["horizon"]), task, PredictiveSampling(config, task.nu))
-    controller.current_state = np.array(given["state"])
+    config = PredictiveSamplingConfig(
+        num_rollouts=settings["candidates"], num_nodes=settings["knots"], sigma=settings["spread"]
+    )
+    controller = Controller(ControllerConfig(horizon=settings["horizon"]), task, PredictiveSampling(config, task.nu))
+    controller.current_state = np.array(settings["state"])
     seconds = []
-    for _ in range(given["repeats"]):
+    for _ in range(settings["repeats"]):
         controller.reset()
         begin = time.perf_counter()
         controller.update_action()

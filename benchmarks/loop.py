@@ -46,16 +46,16 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
             states: it would measure less time than the controller needs.
     """
     states, echoes = Histogram(), []
-    answered, told = 0, 0
+    answered, sent = 0, 0
     with loop_rig() as rig, _echo(rig.hub.url) as bus:
         runtime = rig.runtime(DpsAlone(rig.scenario), pace=PACE)
         granted = rig.granted()
         for _ in range(rounds):
             rig.run(runtime, cycles // rounds)
-            found = rig.machine.statistics()
-            states.merge(found.state_to_command)
-            answered += found.state_to_command.count
-            told += found.loop.cycles
+            statistics = rig.machine.statistics()
+            states.merge(statistics.state_to_command)
+            answered += statistics.state_to_command.count
+            sent += statistics.loop.cycles
             echoes += _echoed(bus, cycles // rounds)
     needed = runtime.statistics.histograms["cycle"].percentile(50.0)
     if states.percentile(50.0) < needed:
@@ -64,7 +64,7 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
             f"{1e6 * needed:.0f} us: answers come more than a period late; measure on a machine with less load"
         )
     note = (
-        f"{percentiles(states)}; {answered} answers to {told} states; echo: {percentiles(histogram(echoes))}; {granted}"
+        f"{percentiles(states)}; {answered} answers to {sent} states; echo: {percentiles(histogram(echoes))}; {granted}"
     )
     echo = dict(zip((50, 99), np.percentile(echoes, (50, 99)), strict=True))
     return [

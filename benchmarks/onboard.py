@@ -85,9 +85,9 @@ def loop_p99_beside_reasoner(cycles: int = 10_000, rounds: int = 5) -> Benchmark
             for name, runtime in runtimes.items():
                 rig.run(runtime, cycles // rounds)
                 late[name] += runtime.lateness
-        (found,) = reasoning.slow_parts.statistics.values()
+        (statistics,) = reasoning.slow_parts.statistics.values()
         granted = rig.granted()
-    busy = found.took.mean / EVERY
+    busy = statistics.took.mean / EVERY
     if busy < 0.5:
         raise RuntimeError(f"the reasoner was at work for {busy:.0%} of the time: measure on a machine with less load")
     with_, without = (float(np.percentile(late[name], 99.0)) for name in ("with", "without"))
@@ -100,5 +100,5 @@ def loop_p99_beside_reasoner(cycles: int = 10_000, rounds: int = 5) -> Benchmark
         better=LOWER,
         against=f"the loop alone: {1e6 * with_:.0f} to {1e6 * without:.0f} us",
         note=f"from the deadline to the end: {punctuality}; the reasoner was at work for {busy:.0%} of the time, with "
-        f"{found.results} decisions, {found.missed} missing; {granted}",
+        f"{statistics.results} decisions, {statistics.missed} missing; {granted}",
     )

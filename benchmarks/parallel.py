@@ -81,12 +81,12 @@ def _efficiency(name: str, task: RolloutTask, rollouts: int, repeats: int) -> Be
         for repeat in range(repeats):
             order = list(runs) if repeat % 2 == 0 else list(reversed(runs))
             for pair in zip(order[::2], order[1::2], strict=True):
-                found = {kind: seconds(lambda kind=kind: runs[kind](task, points)) for kind in pair}
+                elapsed_by_kind = {kind: seconds(lambda kind=kind: runs[kind](task, points)) for kind in pair}
                 alone.append(seconds(lambda: serial(task, points)))
-                for kind, elapsed in found.items():
+                for kind, elapsed in elapsed_by_kind.items():
                     times.setdefault(kind, []).append(elapsed)
                     ratios.setdefault(kind, []).append(np.mean(alone[-2:]) / (CORES * elapsed))
-    efficiency = {kind: float(np.median(found)) for kind, found in ratios.items()}
+    efficiency = {kind: float(np.median(values)) for kind, values in ratios.items()}
     ceiling = efficiency.pop(CEILING)
     best = max(efficiency, key=lambda kind: efficiency[kind])
     table = "; ".join(

@@ -54,8 +54,8 @@ def predictive_sampling(repeats: int = 200, seeds: int = 8) -> list[Benchmark]:
     if not apart <= TOLERANCE:
         raise ArithmeticError(f"the costs of the two engines are {apart:.2g} apart")
     times = {name: interleaved(_planning(ours), _planning(p), repeats=repeats, warm_up=5) for name, p in theirs.items()}
-    fastest, (own, other) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
-    budget = float(np.median(other))
+    fastest, (planner_times, mujoco_times) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
+    budget = float(np.median(mujoco_times))
     swings = {
         name: [swing_up(step, planner, budget, seed=seed) for seed in range(seeds)]
         for name, planner in (("compiled", ours), ("MuJoCo", theirs[fastest]))
@@ -66,13 +66,13 @@ def predictive_sampling(repeats: int = 200, seeds: int = 8) -> list[Benchmark]:
     return [
         Benchmark(
             name="predictive_sampling",
-            value=ratio(other, own),
+            value=ratio(mujoco_times, planner_times),
             unit="1",
             goal=5.0,
             better=HIGHER,
             against=f"plans per second of mujoco.rollout {mujoco.__version__}, {fastest}",
-            note=f"us per plan of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e6 * np.median(own):.0f}, MuJoCo "
-            f"{micros}, {judo(repeats)}; costs {apart:.1g} apart; n = {repeats}",
+            note=f"us per plan of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e6 * np.median(planner_times):.0f}, "
+            f"MuJoCo {micros}, {judo(repeats)}; costs {apart:.1g} apart; n = {repeats}",
         ),
         Benchmark(
             name="predictive_sampling_quality",
@@ -99,16 +99,17 @@ def predictive_sampling_testbed(repeats: int = 40) -> Benchmark:
             for name, planner in mujoco_planners().items()
         }
         sample_period = reasoner.task.sample_period
-    fastest, (own, other) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
+    fastest, (planner_times, mujoco_times) = min(times.items(), key=lambda item: float(np.median(item[1][1])))
     return Benchmark(
         name="predictive_sampling_testbed",
-        value=ratio(other, own),
+        value=ratio(mujoco_times, planner_times),
         unit="1",
         goal=0.1,
         better=HIGHER,
         against=f"plans per second of mujoco.rollout {mujoco.__version__}, {fastest}",
-        note=f"ms per decision of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e3 * np.median(own):.1f}, MuJoCo "
-        f"{1e3 * np.median(other):.2f}; the quality is sampled every {1e3 * sample_period:.0f} ms; n = {repeats}",
+        note=f"ms per decision of {CANDIDATES} rollouts of {STEPS * STEP:g} s: {1e3 * np.median(planner_times):.1f}, "
+        f"MuJoCo {1e3 * np.median(mujoco_times):.2f}; "
+        f"the quality is sampled every {1e3 * sample_period:.0f} ms; n = {repeats}",
     )
 
 
@@ -155,7 +156,7 @@ def mujoco_model() -> str:
 def judo(repeats: int) -> str:
     """Say how long a plan of judo takes, installed in an environment of its own, or why it does not run here."""
     python = JUDO_ENVIRONMENT / "bin" / "python"
-    given = {
+    settings = {
         "model": mujoco_model(),
         "candidates": CANDIDATES,
         "knots": PLAN.knots,
@@ -169,15 +170,15 @@ def judo(repeats: int) -> str:
         if not python.exists():
             run([sys.executable, "-m", "venv", str(JUDO_ENVIRONMENT)])
         run([str(python), "-m", "pip", "install", "--quiet", JUDO])
-        done = run([str(python), str(Path(__file__).with_name("judo_plans.py"))], input=json.dumps(given))
+        done = run([str(python), str(Path(__file__).with_name("judo_plans.py"))], input=json.dumps(settings))
     except (OSError, subprocess.SubprocessError) as error:
         reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
         return f"no {JUDO} here ({reason[-1]})"
-    told = json.loads(done.stdout.splitlines()[-1])
+    answer = json.loads(done.stdout.splitlines()[-1])
     expected = float(mujoco_planner(1)(HANGING, np.zeros((1, PLAN.knots)))[0])
     # It leaves out the cost of the present state.
-    apart = abs(told["cost"] + STEP * cost(HANGING) - expected) / expected
-    return f"{JUDO} {1e6 * np.median(told['seconds']):.0f} (cost of a plan without force {apart:.1g} apart)"
+    apart = abs(answer["cost"] + STEP * cost(HANGING) - expected) / expected
+    return f"{JUDO} {1e6 * np.median(answer['seconds']):.0f} (cost of a plan without force {apart:.1g} apart)"
 
 
 def mujoco_planners() -> dict[str, Planner]:

@@ -69,9 +69,9 @@ def benchmark_all(
     results: list[Benchmark | Crash] = []
     for name in chosen(registry, only):
         begin = time.monotonic()
-        found = run(registry, name)
+        outcome = run(registry, name)
         echo(f"{name}: measured in {time.monotonic() - begin:.0f} s")
-        results += found if isinstance(found, list) else [found]
+        results += outcome if isinstance(outcome, list) else [outcome]
     return results
 
 

@@ -53,9 +53,12 @@ def scene() -> Scene:
     add_target(plant)
     plant.Finalize()
     resting, moving = EmbreeScene(robust=True), []
-    own = plant.CreateDefaultContext()
+    plant_context = plant.CreateDefaultContext()
     for body, surfaces in body_surfaces(plant, scene_graph).items():
-        X_WB, group = plant.EvalBodyPoseInWorld(own, plant.get_body(BodyIndex(body))), EmbreeScene(robust=True)
+        X_WB, group = (
+            plant.EvalBodyPoseInWorld(plant_context, plant.get_body(BodyIndex(body))),
+            EmbreeScene(robust=True),
+        )
         for vertices, triangles in surfaces:
             TriangleMesh(group, vertices.astype(np.float32), triangles)
             TriangleMesh(resting, (X_WB @ vertices.T).T.astype(np.float32), triangles)
@@ -131,8 +134,8 @@ def _scanning(made: Scene) -> Simulator:
         errors=ErrorModel(noise=0.01),
     )
     simulator = Simulator(scanner)
-    own = made.plant.GetMyContextFromRoot(made.context)
-    poses = made.plant.GetOutputPort("body_poses").Eval(own)
+    plant_context = made.plant.GetMyContextFromRoot(made.context)
+    poses = made.plant.GetOutputPort("body_poses").Eval(plant_context)
     drifting = [SpatialVelocity(w=[0.02, 0.01, -0.03], v=[-0.1, 0.01, 0.0])] * made.plant.num_bodies()
     context = simulator.get_mutable_context()
     scanner.GetInputPort("body_poses").FixValue(context, Value[list[RigidTransform]](poses))

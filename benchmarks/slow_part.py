@@ -22,11 +22,11 @@ SAMPLE_PERIOD, LATENCY = 0.1, 0.2  # s
 def perceive(joint_position: np.ndarray) -> np.ndarray:
     """Compute for as long as a perception works on an image."""
     end = time.process_time() + TAKES
-    found = joint_position
+    perceived = joint_position
     numbers = np.random.default_rng(0).normal(size=(200, 200))
     while time.process_time() < end:
-        found = joint_position + np.abs(numbers).sum(axis=0)[:JOINTS]
-    return found
+        perceived = joint_position + np.abs(numbers).sum(axis=0)[:JOINTS]
+    return perceived
 
 
 @dataclass
@@ -39,7 +39,7 @@ class PerceivingScenario(ManipulatorScenario):
         part = SlowPart(
             perceive,
             inputs={"joint_position": JOINTS},
-            outputs={"found": JOINTS},
+            outputs={"perceived": JOINTS},
             period=SAMPLE_PERIOD,
             latency=LATENCY,
         )
@@ -70,10 +70,12 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
             for name, runtime in runtimes.items():
                 misses[name] += rig.run(runtime, cycles // rounds)
                 late[name] += runtime.lateness
-        (found,) = perceiving.slow_parts.statistics.values()
+        (statistics,) = perceiving.slow_parts.statistics.values()
         granted = rig.granted()
-    if found.took.count < 0.5 * cycles * PERIOD / SAMPLE_PERIOD:
-        raise RuntimeError(f"the perception has worked {found.took.count} times: measure on a machine with less load")
+    if statistics.took.count < 0.5 * cycles * PERIOD / SAMPLE_PERIOD:
+        raise RuntimeError(
+            f"the perception has worked {statistics.took.count} times: measure on a machine with less load"
+        )
     of, to = (misses[name] * PER / cycles for name in ("with", "without"))
     punctuality = "; ".join(f"{name} {percentiles(histogram(values))}" for name, values in late.items())
     return Benchmark(
@@ -83,6 +85,7 @@ def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
         goal=2.0,
         better=LOWER,
         against=f"the loop without it; missed in {PER} cycles: {of:g} to {to:g}",
-        note=f"from the deadline to the end: {punctuality}; {found.results} results in time, {found.missed} missing "
-        f"({found.late} of them late); from request to answer: {percentiles(found.took)}; {granted}",
+        note=f"from the deadline to the end: {punctuality}; {statistics.results} results in time, "
+        f"{statistics.missed} missing ({statistics.late} of them late); "
+        f"from request to answer: {percentiles(statistics.took)}; {granted}",
     )

@@ -30,14 +30,14 @@ def testbed_overhead(repeats: int = 20, chunk: float = 0.5) -> Benchmark:
     scenario = SpaceClimberScenario()
     ends = chunk * np.arange(1, round(HORIZON / chunk) + 1)
     ratios, ours, theirs = [], [], []
-    kept = []
+    alive = []
     for i in range(repeats):
         if i % 2:
             testbed, plain = scenario.build(), build_plain_climber(scenario)
         else:
             plain, testbed = build_plain_climber(scenario), scenario.build()
         a, b = testbed.simulator(), plain.simulator()
-        kept.append((testbed, plain, a, b))
+        alive.append((testbed, plain, a, b))
         times = _side_by_side(a, b, ends)
         ratios.append(times[:, 0] / times[:, 1])
         ours.append(times[:, 0].sum())
@@ -128,7 +128,7 @@ def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
         rows.append(f"{name}: RTF {rtf:.1f}, distance {100 * (distance / reference - 1):+.2f} %")
     rtf, distance = _measured(scenario, scenario.simulator_config, repeats)
     error = abs(distance / reference - 1.0)
-    chosen, fine = (_first_tipping(scenario, fields) for fields in (scenario.simulator_config, REFERENCE))
+    ours, fine = (_first_tipping(scenario, fields) for fields in (scenario.simulator_config, REFERENCE))
     study = "; ".join(rows)
     return [
         Benchmark(
@@ -139,7 +139,7 @@ def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
             better=HIGHER,
             against=f"accuracy {REFERENCE.accuracy:g}: {reference:.4f} m walked in {HORIZON:g} s",
             holds=rtf >= RTF_GOAL and error <= 0.01,
-            note=f"{study}. First mass that tips: {chosen:g} kg, with the reference {fine:g} kg",
+            note=f"{study}. First mass that tips: {ours:g} kg, with the reference {fine:g} kg",
         ),
         Benchmark(name="rollout_distance_error", value=error, unit="1", goal=0.01, better=LOWER,
                   against="the fine reference"),

@@ -35,18 +35,18 @@ def strip(notebook: NotebookNode) -> None:
         cell.metadata.pop("execution", None)
         if cell.cell_type != "code":
             continue
-        kept: list[NotebookNode] = []
+        outputs: list[NotebookNode] = []
         for output in cell.outputs:
             data = output.get("data", {})
             if WIDGET in data or output.get("name") == "stderr":
                 continue
             if "<iframe" in data.get("text/html", ""):
                 del data["text/html"]
-            if kept and output.get("name") == kept[-1].get("name") == "stdout":
-                kept[-1].text += output.text
+            if outputs and output.get("name") == outputs[-1].get("name") == "stdout":
+                outputs[-1].text += output.text
             else:
-                kept.append(output)
-        cell.outputs = kept
+                outputs.append(output)
+        cell.outputs = outputs
 
 
 def main() -> None:

@@ -14,16 +14,16 @@ TIMEOUT = 30.0
 
 def echo(connection):
     while True:
-        connection.send(connection.receive())
+        connection.send_frame(connection.receive_frame())
 
 
 def sum_up(connection):
     total = 0
     try:
         while True:
-            total += len(connection.receive())
+            total += len(connection.receive_frame())
     except EOFError:
-        connection.send(str(total).encode())
+        connection.send_frame(str(total).encode())
 
 
 def fall_asleep(connection):
@@ -31,7 +31,7 @@ def fall_asleep(connection):
 
 
 def tell_scheduling(connection):
-    connection.send(f"{os.sched_getscheduler(0)} {len(os.sched_getaffinity(0))}".encode())
+    connection.send_frame(f"{os.sched_getscheduler(0)} {len(os.sched_getaffinity(0))}".encode())
 
 
 def fail(connection, code):
@@ -44,7 +44,7 @@ def taken(worker, count):
     while len(frames) < count:
         worker.flush()
         ready, _, _ = select.select((worker,), (), (), 0.05)
-        frames += worker.take() if ready else []
+        frames += worker.take_frames() if ready else []
         assert time.monotonic() < end, f"{len(frames)} frames of {count} came back"
     return frames
 
@@ -56,8 +56,8 @@ def test_frames_return_whole_and_in_order():
     try:
         back = []
         for frame in sent:
-            assert worker.post(frame[:10], frame[10:])
-            back += worker.take()
+            assert worker.post_frame(frame[:10], frame[10:])
+            back += worker.take_frames()
         back += taken(worker, len(sent) - len(back))
         assert back == sent and worker.dropped == 0
     finally:
@@ -67,35 +67,35 @@ def test_frames_return_whole_and_in_order():
 def test_close_sends_what_waits():
     worker = BackgroundProcess(sum_up, name="sum", backlog=1 << 26)
     for _ in range(100):
-        assert worker.post(bytes(100_000))
+        assert worker.post_frame(bytes(100_000))
     assert worker.close() == 0
-    assert worker.take() == [b"10000000"]
+    assert worker.take_frames() == [b"10000000"]
 
 
 def test_close_receives_what_a_blocked_worker_sends():
     worker = BackgroundProcess(echo, name="echo", backlog=1 << 26)
     frames = [bytes([k]) * 100_000 for k in range(100)]
     for frame in frames:
-        assert worker.post(frame)
+        assert worker.post_frame(frame)
     assert worker.close() == 0
-    assert worker.take() == frames
+    assert worker.take_frames() == frames
 
 
 def test_long_frames_are_sent_in_pieces():
     worker = BackgroundProcess(sum_up, name="sum")
     waiting = []
-    worker.post(bytes(1 << 20))
+    worker.post_frame(bytes(1 << 20))
     while worker.unsent:
         waiting.append(worker.unsent)
         worker.flush()
     assert worker.close() == 0
-    assert worker.take() == [b"1048576"]
+    assert worker.take_frames() == [b"1048576"]
     assert np.diff(waiting, prepend=1 << 20).min() >= -(1 << 18)
 
 
 def test_full_backlog_drops_frames_without_waiting():
     worker = BackgroundProcess(fall_asleep, name="sleeper", backlog=1 << 20)
-    accepted = [worker.post(bytes(1 << 16)) for _ in range(200)]
+    accepted = [worker.post_frame(bytes(1 << 16)) for _ in range(200)]
     worker.kill()
     assert worker.dropped == accepted.count(False) > 0
     assert sum(accepted) <= 200 and worker.unsent <= 1 << 20
@@ -103,19 +103,19 @@ def test_full_backlog_drops_frames_without_waiting():
 
 def test_killed_worker_is_noticed_and_drops_are_counted():
     worker = BackgroundProcess(echo, name="victim")
-    worker.post(b"hello")
+    worker.post_frame(b"hello")
     assert taken(worker, 1) == [b"hello"]
     os.kill(worker.pid, signal.SIGKILL)
     select.select((worker,), (), (), TIMEOUT)
-    assert worker.take() == [] and not worker.alive
-    assert not worker.post(b"again") and worker.dropped == 1
+    assert worker.take_frames() == [] and not worker.alive
+    assert not worker.post_frame(b"again") and worker.dropped == 1
     assert worker.close() == -signal.SIGKILL
 
 
 def test_end_of_the_worker_is_logged_once(caplog):
     worker = BackgroundProcess(fail, 3, name="failure")
-    assert worker.wait_for_frames(TIMEOUT) == []
-    assert worker.take() == worker.take() == [] and not worker.alive
+    assert worker.wait_for_messages(TIMEOUT) == []
+    assert worker.take_frames() == worker.take_frames() == [] and not worker.alive
     assert caplog.text.count(f"failure (process {worker.pid}) is lost: ") == 1
     assert worker.close() == 3
 

@@ -1,10 +1,15 @@
-"""Background processes for slow or blocking tasks of the control loop, which never waits for them."""
+"""Background processes for slow or blocking tasks of the control loop, which never waits for them.
+
+One channel serves all of them. It carries frames, each with its length. A frame holds a message (any object, pickled,
+with its arrays beside it), or bytes that are not unpacked here: events of a log, or a message to be forwarded.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
+import pickle
 import select
 import socket
 import struct
@@ -18,6 +23,7 @@ from vtbdrake.control.streams import Frames
 
 _log = logging.getLogger(__name__)
 
+_COUNT = struct.Struct("<I")
 _LENGTH = struct.Struct("<Q")
 _CHUNK = 1 << 18
 _BUFFER = 1 << 20  # bytes of a socket's send buffer; the system may grant less
@@ -26,8 +32,28 @@ START_TIMEOUT = 120.0
 """Seconds within which a background process must have started; a computer with much else to do needs many of them."""
 
 
+def pack(message: Any) -> list[Any]:
+    """Return a message as parts of a frame; its arrays are parts of their own, which are not copied."""
+    buffers: list[pickle.PickleBuffer] = []
+    body = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
+    raw = [buffer.raw() for buffer in buffers]
+    lengths = [len(body), *(view.nbytes for view in raw)]
+    return [_COUNT.pack(len(lengths)), *map(_LENGTH.pack, lengths), body, *raw]
+
+
+def unpack(frame: bytes) -> Any:
+    """Return the message in a frame; its arrays are read-only views of the frame."""
+    (count,) = _COUNT.unpack_from(frame)
+    position = _COUNT.size + count * _LENGTH.size
+    parts = []
+    for (length,) in _LENGTH.iter_unpack(memoryview(frame)[_COUNT.size : position]):
+        parts.append(memoryview(frame)[position : position + length])
+        position += length
+    return pickle.loads(parts[0], buffers=parts[1:])
+
+
 class FrameConnection:
-    """The worker's end of the connection, which carries frames of bytes; its calls block."""
+    """The worker's end of the connection, which carries messages and other frames; its calls block."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
@@ -37,7 +63,15 @@ class FrameConnection:
         """Return the descriptor that becomes readable when frames arrive."""
         return self._socket.fileno()
 
-    def receive(self, timeout: float | None = None) -> bytes:
+    def receive(self, timeout: float | None = None) -> Any:
+        """Return the next message; see `receive_frame`."""
+        return unpack(self.receive_frame(timeout))
+
+    def send(self, message: Any) -> None:
+        """Send a message; see `send_frame`."""
+        self.send_frame(*pack(message))
+
+    def receive_frame(self, timeout: float | None = None) -> bytes:
         """Return the next frame.
 
         Args:
@@ -56,7 +90,7 @@ class FrameConnection:
                 raise EOFError("the other end of the connection is closed")
         return frame
 
-    def send(self, *parts: bytes) -> None:
+    def send_frame(self, *parts: bytes) -> None:
         """Send one frame that consists of the parts.
 
         Raises:
@@ -68,9 +102,9 @@ class FrameConnection:
 class BackgroundProcess:
     """A child process that runs ``function(connection, *arguments)``, with a `FrameConnection`.
 
-    No call waits for the worker, except `wait_until_ready`, `wait_for_frames`, `drain` and `close`; to start one takes
-    some milliseconds. It has ordinary scheduling on all processors, whatever the loop has. `close` ends it, and so does
-    the end of this process.
+    No call waits for the worker, except `wait_until_ready`, `wait_for_messages`, `drain` and `close`; to start one
+    takes some milliseconds. It has ordinary scheduling on all processors, whatever the loop has. `close` ends it, and
+    so does the end of this process.
 
     Args:
         function: A function of a `FrameConnection` and the arguments; it returns or raises EOFError when no more frames
@@ -110,7 +144,11 @@ class BackgroundProcess:
         """Return the number of bytes that wait to be sent."""
         return self._unsent_bytes
 
-    def post(self, *parts: bytes) -> bool:
+    def post(self, message: Any) -> bool:
+        """Send a message, without waiting; its arrays must not change until they are sent. See `post_frame`."""
+        return self.post_frame(*pack(message))
+
+    def post_frame(self, *parts: bytes) -> bool:
         """Send one frame that consists of the parts, without waiting.
 
         A frame that is too long to be sent at once is not copied: its parts must not change until they are sent.
@@ -167,11 +205,15 @@ class BackgroundProcess:
             _log.error("%s (process %d) is lost: %s", self._child.name, self.pid, reason)
         self._lost = True
 
-    def take(self) -> list[bytes]:
+    def take(self) -> list[Any]:
+        """Return the messages that the worker has sent since the last call, in order, without waiting."""
+        return list(map(unpack, self.take_frames()))
+
+    def take_frames(self) -> list[bytes]:
         """Return the frames that the worker has sent since the last call, in order, without waiting."""
         self._receive()
-        found, self._received = self._received, []
-        return found
+        frames, self._received = self._received, []
+        return frames
 
     def _receive(self) -> None:
         if self._socket.fileno() < 0:
@@ -194,8 +236,8 @@ class BackgroundProcess:
         """Wait until the worker has imported its function; return False if it has ended or is late."""
         return self._wait(lambda: self.ready, timeout)
 
-    def wait_for_frames(self, timeout: float) -> list[bytes]:
-        """Return the frames that the worker has sent, waiting for the first; none if it has ended or is late."""
+    def wait_for_messages(self, timeout: float) -> list[Any]:
+        """Return the messages that the worker has sent, waiting for the first; none if it has ended or is late."""
         self._wait(lambda: bool(self._received), timeout)
         return self.take()
 
@@ -254,7 +296,7 @@ def _serve(connection: socket.socket, function: Callable[..., None], arguments: 
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     frames = FrameConnection(connection)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        frames.send()  # If nobody reads it any more, what was sent before is still to be handled.
+        frames.send_frame()  # If nobody reads it any more, what was sent before is still to be handled.
     try:
         function(frames, *arguments)
     except (EOFError, BrokenPipeError, ConnectionResetError):

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.clock import Clock
-from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, pack, supervise, unpack
+from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, supervise
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import RESULT as CHANGE
 from vtbdrake.failures import error_text
@@ -154,14 +154,14 @@ class _Part:
         self._ready = False
         self._last_failure = ""
         self._logged_missed = -inf
-        self._answers: list[bytes] = []
+        self._answers: list[tuple[str, Any]] = []
         name = f"the supervisor of the slow part {path}"
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
 
     def receive(self, end: float) -> None:
         answers, self._answers = self._answers + self._supervisor.take(), []
         for answer in answers:
-            self._handle(*unpack(answer))
+            self._handle(*answer)
         overdue = [tick for tick in self._waiting if self._part.due(tick) <= end]
         for tick in overdue:
             self._miss(tick)
@@ -225,15 +225,15 @@ class _Part:
             self._requested = next(iter(self._waiting))
             self._requested_at = self._clock.now()
             arrays = {**self._waiting[self._requested], **self._part.memory(self._context)}
-            if not self._supervisor.post(*pack((self._requested, arrays))):
+            if not self._supervisor.post((self._requested, arrays)):
                 _log.error("the slow part %s: its processes have ended, and all results will be missing", self.path)
 
     def wait_until_ready(self, timeout: float) -> None:
         end, restarts = time.monotonic() + timeout, self.statistics.restarts
         while not self._ready:
-            answers = self._supervisor.wait_for_frames(max(0.0, end - time.monotonic()))
+            answers = self._supervisor.wait_for_messages(max(0.0, end - time.monotonic()))
             for answer in answers:
-                self._handle(*unpack(answer))
+                self._handle(*answer)
             if not answers or self.statistics.restarts > restarts:
                 reason = self._last_failure or f"it is not ready within {timeout:g} s"
                 raise ProcessStartError(
@@ -244,7 +244,7 @@ class _Part:
     def wait(self, timeout: float) -> bool:
         if self._answers or (self._ready and self._requested is None):
             return True
-        self._answers = self._supervisor.wait_for_frames(timeout)
+        self._answers = self._supervisor.wait_for_messages(timeout)
         return bool(self._answers)
 
     def close(self) -> None:

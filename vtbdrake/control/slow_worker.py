@@ -8,19 +8,14 @@ from __future__ import annotations
 
 import pickle
 import select
-import struct
 import time
 import traceback
 from math import inf
-from typing import Any
 
 from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 
 # The kinds of messages to the loop, which are pairs of a kind and its content.
 READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
-
-_COUNT = struct.Struct("<I")
-_LENGTH = struct.Struct("<Q")
 
 
 def supervise(loop: FrameConnection, function: bytes, patience: float, name: str) -> None:
@@ -39,11 +34,11 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
             reason = _forward(loop, worker, patience)
         finally:
             worker.kill()
-        loop.send(*pack((LOST, reason)))
+        loop.send((LOST, reason))
         # A worker that dies at its start must not be restarted all the time.
         if (pause := begin + patience - time.monotonic()) > 0.0:
             try:
-                loop.receive(pause)
+                loop.receive_frame(pause)
             except TimeoutError:
                 continue
 
@@ -56,11 +51,11 @@ def _forward(loop: FrameConnection, worker: BackgroundProcess, patience: float) 
         writable = [worker.fileno()] if worker.unsent else []
         readable, _, _ = select.select([loop.fileno(), worker.fileno()], writable, [], left)
         if loop.fileno() in readable:
-            worker.post(loop.receive())
+            worker.post_frame(loop.receive_frame())
             deadline = time.monotonic() + patience
         worker.flush()
-        for answer in worker.take():
-            loop.send(answer)
+        for answer in worker.take_frames():
+            loop.send_frame(answer)
             deadline = inf
         if not worker.alive:
             return f"died (exit code {worker.close(patience)})"
@@ -72,31 +67,11 @@ def compute(supervisor: FrameConnection, function: bytes) -> None:
     """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error)."""
     evaluate = pickle.loads(function)
     evaluate.prepare()
-    supervisor.send(*pack((READY, None)))
+    supervisor.send((READY, None))
     while True:
-        tick, arrays = unpack(supervisor.receive())
+        tick, arrays = supervisor.receive()
         try:
             answer = RESULT, (tick, evaluate(arrays))
         except Exception:
             answer = ERROR, (tick, traceback.format_exc())
-        supervisor.send(*pack(answer))
-
-
-def pack(message: Any) -> list[Any]:
-    """Return a message as parts of a frame; its arrays are parts of their own, which are not copied."""
-    buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
-    raw = [buffer.raw() for buffer in buffers]
-    lengths = [len(body), *(view.nbytes for view in raw)]
-    return [_COUNT.pack(len(lengths)), *map(_LENGTH.pack, lengths), body, *raw]
-
-
-def unpack(frame: bytes) -> Any:
-    """Return the message in a frame; its arrays are read-only views of the frame."""
-    (count,) = _COUNT.unpack_from(frame)
-    position = _COUNT.size + count * _LENGTH.size
-    parts = []
-    for (length,) in _LENGTH.iter_unpack(memoryview(frame)[_COUNT.size : position]):
-        parts.append(memoryview(frame)[position : position + length])
-        position += length
-    return pickle.loads(parts[0], buffers=parts[1:])
+        supervisor.send(answer)

@@ -138,7 +138,7 @@ class Recorder:
         self._worker = BackgroundProcess(
             write_log, os.fspath(self.path.absolute()), name=f"the recorder of {self.path}", backlog=backlog
         )
-        self._worker.post(*first_events)
+        self._worker.post_frame(*first_events)
         self._next_tap: Callable[[str, bytes], None] | None = runtime.bridge.tap
         runtime.bridge.tap = self._tap
         runtime.watch(self)
@@ -213,7 +213,7 @@ class Recorder:
         self._events.clear()
         self._recorded += 1
         self._last = cycle.number
-        if not self._worker.post(frame, zlib.crc32(frame).to_bytes(4, "big")):
+        if not self._worker.post_frame(frame, zlib.crc32(frame).to_bytes(4, "big")):
             self._warn("its process does not take them")
 
     def _add_faults(self, cycle: Cycle, utime: int) -> None:
@@ -227,7 +227,7 @@ class Recorder:
         self._events.append(self._message_event(FAULT, lcmt_vtb_fault(), **fields))
 
     def _take_losses(self) -> None:
-        for data in self._worker.take():
+        for data in self._worker.take_frames():
             lost, _, reason = data.decode().partition(" ")
             self._unwritten = int(lost)
             self._warn(reason)
@@ -257,7 +257,7 @@ class Recorder:
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
         message.crc = _signed_crc(message.encode()[:-4])
-        self._worker.post(*self._events, self._event(END, message.encode(), message.utime))
+        self._worker.post_frame(*self._events, self._event(END, message.encode(), message.utime))
         self._events.clear()
         code = self._worker.close()
         self._take_losses()
@@ -398,7 +398,7 @@ def write_log(connection: FrameConnection, path: str) -> None:
                 # Part of a frame would be damage, its absence is a gap. Once there is room again, the log goes on.
                 os.ftruncate(file, end)
                 lost += 1
-                connection.send(f"{lost} {error.strerror or error}".encode())
+                connection.send_frame(f"{lost} {error.strerror or error}".encode())
     except EOFError:
         pass
     finally:
@@ -409,6 +409,6 @@ def _next_frame(connection: FrameConnection) -> bytes:
     # Polls: waking up a waiting process would cost the loop more than all the rest.
     while True:
         try:
-            return connection.receive(0.0)
+            return connection.receive_frame(0.0)
         except TimeoutError:
             time.sleep(_POLL_PERIOD)

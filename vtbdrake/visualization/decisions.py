@@ -52,18 +52,18 @@ def plot_decision(decision: Decision) -> Figure:
 
 
 def _draw_qualities(axes: Axes, decision: Decision, colors: Mapping[int, str]) -> None:
-    (address, *others), one = list(decision.candidates[0].values), decision.candidates[0].values
-    single = not others and isinstance(one[address], float | int | np.floating) and not isinstance(one[address], bool)
-    known = [candidate for candidate in decision.candidates if np.isfinite(candidate.quality)]
-    places = {c.number: float(c.values[address]) if single else float(c.number) for c in known}
-    for candidate in sorted(known, key=lambda c: _rank(decision, c)):
+    (address, value), *further = decision.candidates[0].values.items()
+    single = not further and isinstance(value, float | int | np.floating) and not isinstance(value, bool)
+    judged = [candidate for candidate in decision.candidates if np.isfinite(candidate.quality)]
+    places = {c.number: float(c.values[address]) if single else float(c.number) for c in judged}
+    for candidate in sorted(judged, key=lambda c: _rank(decision, c)):
         place, counts = places[candidate.number], candidate.status == ELIGIBLE
         marker = "*" if candidate.number == decision.chosen else "s" if candidate.number == 0 else "o"
         color = colors[candidate.number] if counts else FAILED
         size = 14 if marker == "*" else 7
         axes.plot(place, candidate.quality, marker if counts else "x", color=color, ms=size, gid=candidate.status)
     if not single:
-        eligible = [candidate for candidate in known if candidate.status == ELIGIBLE]
+        eligible = [candidate for candidate in judged if candidate.status == ELIGIBLE]
         best = (np.minimum if decision.minimize else np.maximum).accumulate([c.quality for c in eligible])
         axes.plot([c.number for c in eligible], best, drawstyle="steps-post", color="0.6", lw=1, zorder=1, gid="best")
     title = "Quality over the decision" if single else "Quality in the order of trying, and the best so far"

@@ -93,22 +93,24 @@ def _class_name(system: System) -> str:
 
 
 def _world(testbed: VirtualTestbed) -> dict[str, tuple[str, ...]]:
-    found: dict[str, list[str]] = {role: [] for role in (*ROLES, "other")}
+    parts: dict[str, list[str]] = {role: [] for role in (*ROLES, "other")}
     for role, name in _plant_instances(testbed):
-        found[role].append(f"plant: {name}")
+        parts[role].append(f"plant: {name}")
     for system in testbed.diagram.GetSystems():
         if not _is_framework(testbed, system):
             name = str(system.get_name())
             part = re.fullmatch(rf"sim\.({'|'.join(ROLES)})\.(.+)", name)
             role, shown = part.groups() if part else ("other", name)
-            found[role].append(shown)
-    return {role: tuple(names) for role, names in found.items() if names or role != "other"}
+            parts[role].append(shown)
+    return {role: tuple(names) for role, names in parts.items() if names or role != "other"}
 
 
 def _is_framework(testbed: VirtualTestbed, system: System) -> bool:
     name = str(system.get_name())
-    own = system in (testbed.dps, testbed.plant, testbed.scene_graph) or isinstance(system, MeshcatVisualizer)
-    return own or name == BOARD or name.startswith((T_SENSE, T_ACT))
+    shown_apart = system in (testbed.dps, testbed.plant, testbed.scene_graph)
+    if shown_apart or isinstance(system, MeshcatVisualizer):
+        return True
+    return name == BOARD or name.startswith((T_SENSE, T_ACT))
 
 
 def _plant_instances(testbed: VirtualTestbed) -> Iterator[tuple[str, str]]:
@@ -215,8 +217,8 @@ class _Drawing:
         below = self._sim_bottom - 12
         self._write(WIDTH - 34, below + 1, structure.name, size=12, color=PALE, anchor="end")
         self._write(34, below + 1, "sim", size=15, color=SIM, bold=True)
-        others = f"; further systems: {', '.join(world['other'])}" if "other" in world else ""
-        self._write(70, below + 1, _cut(f"the simulated world, in the Diagram{others}", 120), size=12, color=PALE)
+        further = f"; further systems: {', '.join(world['other'])}" if "other" in world else ""
+        self._write(70, below + 1, _cut(f"the simulated world, in the Diagram{further}", 120), size=12, color=PALE)
         height = self._sim_bottom - 30 - (top + 18)
         for (x, width), role in zip(WORLD_BOXES, WORLD_ROLES, strict=True):
             self._frame(x, top + 18, width, height, SIM)

@@ -205,13 +205,13 @@ def show_poses(
     # A context of a terrain with many shapes takes as long as building it: there is one per scenario.
     built: list[tuple[Motion, VirtualTestbed, Context]] = []
     for name, motion in motions.items():
-        known = next((known for known in built if known[0].scenario == motion.scenario), None)
-        if known is None:
+        match = next((entry for entry in built if entry[0].scenario == motion.scenario), None)
+        if match is None:
             testbed = motion.scenario.build()
-            known = motion, testbed, testbed.default_context()
-            _draw(meshcat, *known[1:], f"{prefix}/surroundings/{len(built)}", moving=False)
-            built.append(known)
-        _, testbed, context = known
+            match = motion, testbed, testbed.default_context()
+            _draw(meshcat, *match[1:], f"{prefix}/surroundings/{len(built)}", moving=False)
+            built.append(match)
+        _, testbed, context = match
         states = _states(motion, testbed, f"{prefix}/{name}")
         instants = np.linspace(0, len(states) - 1, count).round().astype(int)
         for k, sample in enumerate(dict.fromkeys(instants.tolist())):
@@ -243,14 +243,15 @@ def _draw(
     plant, scene_graph = testbed.plant, testbed.scene_graph
     assert plant is not None and scene_graph is not None
     inspector = scene_graph.model_inspector()
-    own = plant.GetMyMutableContextFromRoot(context)
+    plant_context = plant.GetMyMutableContextFromRoot(context)
     if state is not None:
-        plant.SetPositionsAndVelocities(own, state)
+        plant.SetPositionsAndVelocities(plant_context, state)
     for body, geometry in _visible(plant):
         if plant.IsAnchored(body) != moving:
             part = f"{path}/{body.scoped_name()}/{geometry.get_value()}".replace("::", "/")
             meshcat.SetObject(part, inspector.GetShape(geometry), _tinted(_color(inspector, geometry), tint, opacity))
-            meshcat.SetTransform(part, plant.EvalBodyPoseInWorld(own, body) @ inspector.GetPoseInFrame(geometry))
+            X_WB = plant.EvalBodyPoseInWorld(plant_context, body)
+            meshcat.SetTransform(part, X_WB @ inspector.GetPoseInFrame(geometry))
 
 
 def _looks(
@@ -373,13 +374,13 @@ class _Actor:
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
     """Return (time, sample number) of every keyframe: at most ``rate`` a second, the last sample, and the end."""
     stamps = np.round(np.asarray(times, dtype=float) * _RESOLUTION) / _RESOLUTION
-    chosen: list[tuple[float, int]] = []
+    keyframes: list[tuple[float, int]] = []
     for sample, stamp in enumerate(stamps):
-        if not chosen or stamp - chosen[-1][0] >= 1.0 / rate - 0.5 / _RESOLUTION:
-            chosen.append((float(stamp), sample))
+        if not keyframes or stamp - keyframes[-1][0] >= 1.0 / rate - 0.5 / _RESOLUTION:
+            keyframes.append((float(stamp), sample))
     last = (float(stamps[-1]), len(stamps) - 1)
-    if chosen[-1] != last:
-        chosen.append(last)
+    if keyframes[-1] != last:
+        keyframes.append(last)
     if end > last[0]:
-        chosen.append((round(end * _RESOLUTION) / _RESOLUTION, last[1]))
-    return chosen
+        keyframes.append((round(end * _RESOLUTION) / _RESOLUTION, last[1]))
+    return keyframes

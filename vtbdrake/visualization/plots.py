@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from io import BytesIO
@@ -188,14 +188,14 @@ def draw_threshold(axes: Axes, threshold: float) -> None:
 
 def keys(words: _Words, *, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
     """Return the legend entries that all rollouts share."""
-    found = [_key("t*", marker="o", color="white", mec="black", ls="")]
+    entries = [_key("t*", marker="o", color="white", mec="black", ls="")]
     if exceedances:
-        found.append(_key(f"G₁: {words.symbol} {words.beyond} {words.limit}", color="0.6", lw=6, alpha=0.5))
+        entries.append(_key(f"G₁: {words.symbol} {words.beyond} {words.limit}", color="0.6", lw=6, alpha=0.5))
     if np.isfinite(threshold):
-        found.append(_key(f"{words.limit} = {threshold:g}", color=THRESHOLD, lw=1, ls=(0, (4, 2))))
+        entries.append(_key(f"{words.limit} = {threshold:g}", color=THRESHOLD, lw=1, ls=(0, (4, 2))))
     if failed:
-        found.append(_key("rollout failed", marker="x", color=FAILED, ls="", mew=2))
-    return found
+        entries.append(_key("rollout failed", marker="x", color=FAILED, ls="", mew=2))
+    return entries
 
 
 def _key(text: str, **style: Any) -> Line2D:
@@ -209,11 +209,11 @@ def describe(values: object) -> str:
     return ", ".join(f"{_short(address, values)} = {_number(value)}" for address, value in values.items())
 
 
-def _short(address: str, others: dict[str, object]) -> str:
+def _short(address: str, addresses: Iterable[str]) -> str:
     words = address.split(".")
     for count in range(1, len(words)):
         tail = words[-count:]
-        if sum(other.split(".")[-count:] == tail for other in others) == 1:
+        if sum(other.split(".")[-count:] == tail for other in addresses) == 1:
             return ".".join(tail)
     return address
 
@@ -247,21 +247,21 @@ def draw_landscape(axes: Axes, sweep: Sweep) -> None:
     words = _Words.of(minimize=sweep.minimize[0])
     points, h = worst(sweep)
     x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
-    known = np.isfinite(h)
+    is_finite = np.isfinite(h)
     threshold = sweep.rollouts[0].threshold
     if len(points) == x.size * y.size and min(x.size, y.size) > 1:
         # np.unique has sorted the points by x, then y.
         image = h.reshape(x.size, y.size).T
         log = sweep.parameters[0].log, sweep.parameters[1].log
         drawn: ScalarMappable = draw_mesh(axes, x, y, image, log=log, lines=min(x.size, y.size) > 2)
-        if known.any() and np.nanmin(h) < threshold < np.nanmax(h):
+        if is_finite.any() and np.nanmin(h) < threshold < np.nanmax(h):
             axes.contour(x, y, image, levels=[threshold], colors=_THRESHOLD, linewidths=2)
             axes.plot([], [], color=_THRESHOLD, lw=2, label=f"{words.limit} = {threshold:g}")
     else:
-        x_known, y_known = points[known].T
-        drawn = axes.scatter(x_known, y_known, c=h[known], cmap="viridis", s=60, gid="h")
-    if not known.all():
-        axes.plot(*points[~known].T, "x", color=FAILED, mew=2, label="failed or not finished", gid="failed")
+        xs, ys = points[is_finite].T
+        drawn = axes.scatter(xs, ys, c=h[is_finite], cmap="viridis", s=60, gid="h")
+    if not is_finite.all():
+        axes.plot(*points[~is_finite].T, "x", color=FAILED, mew=2, label="failed or not finished", gid="failed")
     _draw_best(axes, sweep, words)
     first, second = (label(p.address, unit) for p, unit in zip(sweep.parameters, sweep.units, strict=True))
     axes.set(xlabel=first, ylabel=second)
@@ -297,9 +297,9 @@ def draw_mesh(
     cells = axes.pcolormesh(
         _edges(x, log=log[0]), _edges(y, log=log[1]), np.ma.masked_invalid(image), cmap=cmap, gid="h"
     )
-    known = image[np.isfinite(image)]
-    if lines and known.size and known.max() > known.min():
-        levels = np.linspace(known.min(), known.max(), 9)[1:-1]
+    heights = image[np.isfinite(image)]
+    if lines and heights.size and heights.max() > heights.min():
+        levels = np.linspace(heights.min(), heights.max(), 9)[1:-1]
         axes.contour(x, y, image, levels=levels, colors="white", linewidths=0.6, alpha=0.6)
     return cells
 
@@ -453,8 +453,8 @@ def _draw_h(axes: Axes, sweep: Sweep, boundary: Boundary | None) -> None:
         line.set_linewidth(1.2)
         # An open marker: f' exceeded f_m, or a constraint was violated.
         line.set_markerfacecolor("white")
-        held = mine & ~sweep.unsafe
-        axes.plot(values[held], h[held], marker, color=color, ms=5, gid="not_exceeded")
+        safe = mine & ~sweep.unsafe
+        axes.plot(values[safe], h[safe], marker, color=color, ms=5, gid="not_exceeded")
     threshold = _threshold(sweep)
     draw_threshold(axes, threshold)
     handles = list(axes.get_legend_handles_labels()[0])

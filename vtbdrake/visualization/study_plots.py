@@ -36,7 +36,7 @@ _DROPPED = "0.6"
 class Points:
     """The points of a study, grouped by their outcome."""
 
-    kept: tuple[Trial, ...]  # they have a value and keep all constraints
+    feasible: tuple[Trial, ...]  # they have a value and keep all constraints
     broken: tuple[Trial, ...]  # they have a value, but break a constraint
     dropped: tuple[Trial, ...]  # by racing; their value is only known to be no better than their bound
     failed: tuple[Trial, ...]  # a simulation failed
@@ -48,7 +48,7 @@ class Points:
         Raises:
             ValueError: The study has no points.
         """
-        sorted_: dict[str, list[Trial]] = {"kept": [], "broken": [], "dropped": [], "failed": []}
+        sorted_: dict[str, list[Trial]] = {"feasible": [], "broken": [], "dropped": [], "failed": []}
         for trial in study.trials:
             sorted_[_kind(trial)].append(trial)
         if not any(sorted_.values()):
@@ -56,32 +56,32 @@ class Points:
         return cls(**{kind: tuple(trials) for kind, trials in sorted_.items()})
 
     @property
-    def known(self) -> tuple[Trial, ...]:
+    def valued(self) -> tuple[Trial, ...]:
         """Return the points that have a value."""
-        return (*self.kept, *self.broken)
+        return (*self.feasible, *self.broken)
 
     def best_at(self, place: Callable[[Sequence[Trial]], np.ndarray], quality: int, sign: float) -> Points:
         """Return the best point in one quality at each of the places, which have shape (n, k) for n points.
 
         One that keeps the constraints is better than one that does not, and this better than one without a value.
         """
-        groups = (self.kept, self.broken, self.dropped, self.failed)
+        groups = (self.feasible, self.broken, self.dropped, self.failed)
         trials = [trial for group in groups for trial in group]
         rank = np.repeat(range(4), [len(group) for group in groups])
         worth = np.where(rank < 2, sign * values(trials, quality), 0.0)
         # Sorted from good to bad, the first of each place is the best there.
         order = np.lexsort((-worth, rank))
         _, first = np.unique(place(trials)[order], axis=0, return_index=True)
-        chosen = order[first]
-        kept, broken, dropped, failed = (
-            tuple(trials[k] for k in chosen if rank[k] == group) for group in range(len(groups))
+        best = order[first]
+        feasible, broken, dropped, failed = (
+            tuple(trials[k] for k in best if rank[k] == group) for group in range(len(groups))
         )
-        return Points(kept, broken, dropped, failed)
+        return Points(feasible, broken, dropped, failed)
 
     def best(self, study: Study, quality: int) -> Trial | None:
         """Return the best point in one quality; None if no point keeps the constraints."""
         sign = study.signs[quality]
-        return max(self.kept, key=lambda trial: sign * trial.values[quality], default=None)
+        return max(self.feasible, key=lambda trial: sign * trial.values[quality], default=None)
 
 
 def _kind(trial: Trial) -> str:
@@ -90,7 +90,7 @@ def _kind(trial: Trial) -> str:
         return "failed"
     if not trial.exact:
         return "dropped"
-    return "kept" if trial.feasible else "broken"
+    return "feasible" if trial.feasible else "broken"
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
@@ -100,8 +100,8 @@ def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
 
 def name(study: Study, quality: int) -> str:
     """Return the name of a quality; h if its function has none."""
-    found = study.names[quality]
-    return found if found.isidentifier() else "h(s⁰)"
+    function_name = study.names[quality]
+    return function_name if function_name.isidentifier() else "h(s⁰)"
 
 
 def quality_label(study: Study, quality: int) -> str:
@@ -129,10 +129,10 @@ class Scale:
 
     def places(self, trials: Sequence[Trial]) -> np.ndarray:
         """Return the positions of points on the axis, shape (n,)."""
-        found = [trial.parameters[self.dimension.address] for trial in trials]
+        positions = [trial.parameters[self.dimension.address] for trial in trials]
         if isinstance(self.dimension, Choice):
-            found = [self.dimension.options.index(self.dimension.check(value)) for value in found]
-        return np.array(found, dtype=float)
+            positions = [self.dimension.options.index(self.dimension.check(value)) for value in positions]
+        return np.array(positions, dtype=float)
 
     def set_up(self, axes: Axes, which: str, *, width: int = 60) -> None:
         """Set label (wrapped after about ``width`` letters), scale and ticks of the axis ``x`` or ``y``."""
@@ -174,7 +174,7 @@ def draw_points(
     infinite.
     """
     style = {"s": 22, "zorder": 3, "linewidths": 0, **style}
-    axes.scatter(x(points.kept), values(points.kept, quality), gid="kept", **style)
+    axes.scatter(x(points.feasible), values(points.feasible, quality), gid="kept", **style)
     axes.plot(x(points.broken), values(points.broken, quality), gid="broken", **BROKEN_STYLE)
     bounds = values(points.dropped, quality)
     finite = np.isfinite(bounds)
@@ -237,7 +237,7 @@ _LEVELS = 12
 
 
 def plot_landscape(study: Study, *addresses: str) -> Figure:
-    """Plot every quality over one or two parameters; if others vary too, the best value at each place.
+    """Plot every quality over one or two parameters; if num_others vary too, the best value at each place.
 
     Over two: an image where the points fill a grid; else filled contours between the points if nothing but these two
     numbers varies (between points that differ in more there is nothing to interpolate), and the points in colour.
@@ -250,23 +250,23 @@ def plot_landscape(study: Study, *addresses: str) -> Figure:
         ValueError: There are no points, an address is none of the study's parameters, or there are not one or two.
     """
     points = Points.of(study)
-    known = scales(study)
-    chosen = addresses or tuple(known)
-    for address in chosen:
-        if address not in known:
-            raise ValueError(f"{address} is no parameter of the study; those are {', '.join(known)}")
-    if not 1 <= len(chosen) <= 2 or len(set(chosen)) < len(chosen):
+    scale_of = scales(study)
+    addresses = addresses or tuple(scale_of)
+    for address in addresses:
+        if address not in scale_of:
+            raise ValueError(f"{address} is no parameter of the study; those are {', '.join(scale_of)}")
+    if not 1 <= len(addresses) <= 2 or len(set(addresses)) < len(addresses):
         raise ValueError(
-            f"a landscape lies over one or two different parameters, not over {', '.join(chosen)}: name two of them, "
-            "plot_landscape(first, second)"
+            f"a landscape lies over one or two different parameters, not over {', '.join(addresses)}: name two of "
+            "them, plot_landscape(first, second)"
         )
     count = len(study.names)
-    figure = Picture(7.2 if count == 1 else 6.0 * count, 5.4 if len(chosen) == 2 else 4.6)
-    draw = _draw_surface if len(chosen) == 2 else _draw_line
-    shown = [known[address] for address in chosen]
+    figure = Picture(7.2 if count == 1 else 6.0 * count, 5.4 if len(addresses) == 2 else 4.6)
+    draw = _draw_surface if len(addresses) == 2 else _draw_line
+    shown = [scale_of[address] for address in addresses]
     for quality, axes in enumerate(figure.subplots(1, count, squeeze=False)[0]):
-        handles = draw(axes, study, points, *shown, quality=quality, others=len(known) - len(chosen))
-        _legend_with_best(axes, study, points, chosen, handles, quality=quality)
+        handles = draw(axes, study, points, *shown, quality=quality, num_others=len(scale_of) - len(addresses))
+        _legend_with_best(axes, study, points, addresses, handles, quality=quality)
     return figure
 
 
@@ -278,7 +278,7 @@ def draw_slice(
     Points are coloured by their order unless ``style`` has a color.
     """
     if "color" not in style:
-        style["c"] = [trial.number for trial in points.kept]
+        style["c"] = [trial.number for trial in points.feasible]
     draw_points(axes, study, points, scale.places, quality=quality, **style)
     best = points.best(study, quality)
     if best is not None:
@@ -287,24 +287,26 @@ def draw_slice(
     finish(axes)
 
 
-def _draw_line(axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, others: int) -> list[Artist]:
+def _draw_line(
+    axes: Axes, study: Study, points: Points, scale: Scale, *, quality: int, num_others: int
+) -> list[Artist]:
     """Draw the values and return legend entries."""
     draw_slice(axes, study, points, scale, quality=quality, color=_SINGLE)
     axes.set_ylabel(quality_label(study, quality))
     best = points.best_at(lambda trials: scale.places(trials)[:, None], quality, study.signs[quality])
     handles: list[Artist] = []
     # Where nearly every point has a place of its own, the best at each is no curve.
-    if not isinstance(scale.dimension, Choice) and (not others or 2 * len(best.known) <= len(points.known)):
-        order = np.argsort(scale.places(best.known))
-        text = f"the best over {_count(others)}" if others else None
-        at, h = scale.places(best.known)[order], values(best.known, quality)[order]
+    if not isinstance(scale.dimension, Choice) and (not num_others or 2 * len(best.valued) <= len(points.valued)):
+        order = np.argsort(scale.places(best.valued))
+        text = f"the best over {_count(num_others)}" if num_others else None
+        at, h = scale.places(best.valued)[order], values(best.valued, quality)[order]
         (line,) = axes.plot(at, h, color=_SINGLE, lw=1.2, zorder=2, label=text, gid="h")
-        handles = [line] if others else []
+        handles = [line] if num_others else []
     return [*handles, *point_keys(study, points)]
 
 
 def _draw_surface(
-    axes: Axes, study: Study, points: Points, x: Scale, y: Scale, *, quality: int, others: int
+    axes: Axes, study: Study, points: Points, x: Scale, y: Scale, *, quality: int, num_others: int
 ) -> list[Artist]:
     """Draw the values and return legend entries."""
     sign = study.signs[quality]
@@ -318,19 +320,19 @@ def _draw_surface(
     x.set_up(axes, "x")
     y.set_up(axes, "y")
     numbers = not any(isinstance(scale.dimension, Choice) for scale in (x, y))
-    everywhere = (*best.known, *best.dropped, *best.failed)
-    (xs, column), (ys, row) = (np.unique(found, return_inverse=True) for found in places(everywhere).T)
-    h = values(best.known, quality)
+    everywhere = (*best.valued, *best.dropped, *best.failed)
+    (xs, column), (ys, row) = (np.unique(column, return_inverse=True) for column in places(everywhere).T)
+    h = values(best.valued, quality)
     if len(everywhere) == xs.size * ys.size and min(xs.size, ys.size) > 1:
         image = np.full((ys.size, xs.size), np.nan)
         image[row[: h.size], column[: h.size]] = h
         lines = numbers and min(image.shape) > 2
         drawn: ScalarMappable = draw_mesh(axes, xs, ys, image, log=(x.is_log, y.is_log), lines=lines, **style)
     else:
-        at = places(best.known)
+        at = places(best.valued)
         if h.size:
             style.update(vmin=h.min(), vmax=h.max())
-        if not others and numbers and _spans_a_plane(unit := _unit(at, x, y)):
+        if not num_others and numbers and _spans_a_plane(unit := _unit(at, x, y)):
             triangles = Triangulation(at[:, 0], at[:, 1], Triangulation(unit[:, 0], unit[:, 1]).triangles)
             axes.tricontourf(triangles, h, levels=_LEVELS, alpha=0.85, **style)
         marks: dict[str, Any] = {"s": 26, "edgecolors": "white", "linewidths": 0.5, "zorder": 2, "gid": "h"}
@@ -340,13 +342,13 @@ def _draw_surface(
     if winner is not None:
         mark_best(axes, *places([winner])[0])
     axes.figure.colorbar(drawn, ax=axes, label=quality_label(study, quality), pad=0.02)
-    if others:
-        axes.set_title(f"at each place, the best over {_count(others)}", fontsize="medium")
+    if num_others:
+        axes.set_title(f"at each place, the best over {_count(num_others)}", fontsize="medium")
     return [*handles]
 
 
-def _count(others: int) -> str:
-    return f"{others} other parameter{'s' * (others > 1)}"
+def _count(num_others: int) -> str:
+    return f"{num_others} other parameter{'s' * (num_others > 1)}"
 
 
 def _unit(places: np.ndarray, x: Scale, y: Scale) -> np.ndarray:
@@ -360,12 +362,12 @@ def _spans_a_plane(unit: np.ndarray) -> bool:
 
 
 def _legend_with_best(
-    axes: Axes, study: Study, points: Points, chosen: Sequence[str], handles: Sequence[Artist], *, quality: int
+    axes: Axes, study: Study, points: Points, addresses: Sequence[str], handles: Sequence[Artist], *, quality: int
 ) -> None:
     best = points.best(study, quality)
     if best is not None:
         (star,) = (line for line in axes.get_lines() if line.get_gid() == "best")
-        at = ", ".join(_text(best.parameters[address]) for address in chosen)
+        at = ", ".join(_text(best.parameters[address]) for address in addresses)
         star.set_label(f"s⁰* = [{at}], {name(study, quality)} = {best.values[quality]:.4g}")
         handles = [star, *handles]
     if handles:
@@ -403,13 +405,13 @@ def plot_history(study: Study) -> Figure:
             axes,
             study,
             points,
-            lambda found: np.array([trial.number for trial in found], dtype=float),
+            lambda trials: np.array([trial.number for trial in trials], dtype=float),
             quality=quality,
-            c=[colors[trial.method] for trial in points.kept],
+            c=[colors[trial.method] for trial in points.feasible],
         )
-        if points.kept:
-            numbers = np.array([trial.number for trial in points.kept])
-            best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.kept, quality))
+        if points.feasible:
+            numbers = np.array([trial.number for trial in points.feasible])
+            best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.feasible, quality))
             # The last best value holds up to the last point.
             numbers, best = np.append(numbers, trials[-1].number), np.append(best, best[-1])
             axes.plot(numbers, best, color=BEST, drawstyle="steps-post", lw=1.4, gid="best so far", zorder=2.5)
@@ -421,7 +423,7 @@ def plot_history(study: Study) -> Figure:
         Line2D([], [], marker="o", ls="none", ms=5, color=colors[method], label=f"{method} ({number})")
         for method, number in methods.items()
     ]
-    if points.kept:
+    if points.feasible:
         handles.append(Line2D([], [], color=BEST, lw=1.4, label="best so far"))
     _legend(figure, [*handles, *point_keys(study, points)])
     return figure
@@ -486,7 +488,7 @@ def plot_importances(study: Study) -> Figure:
         )
         finish(axes)
         axes.grid(False, axis="y")
-    axes.set_xlabel(f"share of the importance (PED-ANOVA on {len(points.known)} of {len(study.trials)} points)")
+    axes.set_xlabel(f"share of the importance (PED-ANOVA on {len(points.valued)} of {len(study.trials)} points)")
     return figure
 
 
@@ -527,12 +529,14 @@ def plot_pareto(study: Study) -> Figure:
 
 def _draw_pair(axes: Axes, study: Study, points: Points, pair: tuple[int, int]) -> None:
     i, j = pair
-    axes.scatter(values(points.kept, i), values(points.kept, j), s=22, color=_BARS, alpha=0.6, linewidths=0, gid="kept")
+    axes.scatter(
+        values(points.feasible, i), values(points.feasible, j), s=22, color=_BARS, alpha=0.6, linewidths=0, gid="kept"
+    )
     axes.plot(values(points.broken, i), values(points.broken, j), gid="broken", **BROKEN_STYLE)
 
 
 def _best_key(points: Points) -> list[Line2D]:
-    if not points.kept:
+    if not points.feasible:
         return []
     return [Line2D([], [], marker="*", ls="none", color=BEST, ms=11, mec="white", label="best")]
 

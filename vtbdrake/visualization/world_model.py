@@ -65,41 +65,42 @@ def show_world_model(
         raise ValueError(
             f"marker is positive, deviations and label_height are at least 0, not {(marker, deviations, label_height)}"
         )
-    chosen = _COLORS | {kind: to_hex(color) for kind, color in (colors or {}).items()}
-    shown = [one for one in model if one.status != RETIRED]
+    color_of_kind = _COLORS | {kind: to_hex(color) for kind, color in (colors or {}).items()}
+    shown = [each for each in model if each.status != RETIRED]
     meshcat.Delete(prefix)
-    for one in shown:
-        path = f"{prefix}/{one.kind}/{one.identity}"
-        red, green, blue = to_rgb(chosen.get(one.kind, _OTHERS))
-        opacity = _TENTATIVE_OPACITY if one.status == TENTATIVE else 1.0
-        if parts is not None and one.kind in parts:
-            for part in parts[one.kind](one):
+    for object_ in shown:
+        path = f"{prefix}/{object_.kind}/{object_.identity}"
+        red, green, blue = to_rgb(color_of_kind.get(object_.kind, _OTHERS))
+        opacity = _TENTATIVE_OPACITY if object_.status == TENTATIVE else 1.0
+        if parts is not None and object_.kind in parts:
+            for part in parts[object_.kind](object_):
                 meshcat.SetObject(f"{path}/{part.name}", part.shape, Rgba(red, green, blue, opacity))
-                meshcat.SetTransform(f"{path}/{part.name}", one.X_WO @ part.X_OS)
+                meshcat.SetTransform(f"{path}/{part.name}", object_.X_WO @ part.X_OS)
         else:
             meshcat.SetObject(f"{path}/marker", Sphere(marker), Rgba(red, green, blue, opacity))
-            meshcat.SetTransform(f"{path}/marker", one.X_WO)
+            meshcat.SetTransform(f"{path}/marker", object_.X_WO)
         if deviations:
-            X_WE, semi_axes = covariance_ellipsoid(one)
+            X_WE, semi_axes = covariance_ellipsoid(object_)
             shape = Ellipsoid(*np.maximum(deviations * semi_axes, _FLAT))
             meshcat.SetObject(f"{path}/covariance", shape, Rgba(red, green, blue, _ELLIPSOID_OPACITY))
             meshcat.SetTransform(f"{path}/covariance", X_WE)
         if label_height:
-            start, end = text_strokes(one.identity, label_height)
+            start, end = text_strokes(object_.identity, label_height)
             meshcat.SetLineSegments(f"{path}/label", start, end, 1.0, Rgba(red, green, blue, 1.0))
-            meshcat.SetTransform(f"{path}/label", RigidTransform(one.p_WoOo_W + np.array([0.0, 0.0, 2.0 * marker])))
-    return Scene(meshcat, legend={kind: chosen.get(kind, _OTHERS) for kind in sorted({one.kind for one in shown})})
+            meshcat.SetTransform(f"{path}/label", RigidTransform(object_.p_WoOo_W + np.array([0.0, 0.0, 2.0 * marker])))
+    kinds = sorted({each.kind for each in shown})
+    return Scene(meshcat, legend={kind: color_of_kind.get(kind, _OTHERS) for kind in kinds})
 
 
-def covariance_ellipsoid(one: WorldObject) -> tuple[RigidTransform, NDArray[np.float64]]:
+def covariance_ellipsoid(object_: WorldObject) -> tuple[RigidTransform, NDArray[np.float64]]:
     """Return the pose in W of the ellipsoid of one standard deviation of the position, and its semi-axes (3,) in m.
 
     The semi-axis along a coordinate that is not known is 0.
     """
-    covariance = one.pose.covariance[3:, 3:]
+    covariance = object_.pose.covariance[3:, 3:]
     variances, axes = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
     axes[:, 0] *= np.linalg.det(axes)
-    return RigidTransform(RotationMatrix(axes), one.p_WoOo_W), np.sqrt(np.maximum(variances, 0.0))
+    return RigidTransform(RotationMatrix(axes), object_.p_WoOo_W), np.sqrt(np.maximum(variances, 0.0))
 
 
 def text_strokes(text: str, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

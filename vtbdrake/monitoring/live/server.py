@@ -1,16 +1,13 @@
 """The server of live values: it communicates with the clients on the bus, in a worker process of the loop.
 
-The loop sends frames of two kinds: `VALUES`, many and quick, and pickled outcomes of requests. The server sends it
-pickled requests.
+The loop sends `VALUES`, many and quick, and the outcomes of requests. The server sends it requests, each with a number.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import pickle
 import select
-import struct
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -51,20 +48,13 @@ _MEMORY = 1000  # requests to set and get whose repetition is recognized
 _CONNECT_TIMEOUT = 2.0  # s
 _RETRY_PERIOD = 0.5  # s
 
-# Frames of the loop:
-VALUES = b"v"  # records of values
-OUTCOME = b"o"  # a pickled (number of a request, outcome)
-_HEAD = struct.Struct("<IQddI")
+# The kinds of messages of the loop, which are pairs of a kind and its content:
+VALUES = "values"  # a list of `Record`, tuples, which are written and read in a fraction of a microsecond
+OUTCOME = "outcome"  # (number of a request, a dict with ``ok``, ``error``, ``unknown`` (address) or ``shapes``)
 
-
-def values_record(number: int, cycle: int, since: float, time: float, entries: Sequence[float]) -> bytes:
-    """Return a record of the values read for request ``number``; concatenated records make a frame of `VALUES`."""
-    return struct.pack(f"<IQddI{len(entries)}d", number, cycle, since, time, len(entries), *entries)
-
-
-def outcome_frame(number: int, **outcome: Any) -> bytes:
-    """Return a frame with the outcome of request ``number``: ``ok``, ``error``, ``unknown`` (address) or ``shapes``."""
-    return OUTCOME + pickle.dumps((number, outcome))
+# The values of one round: the number of the request, that of the cycle in which the round ended, the times of the DPS
+# when it began and when it ended, and the entries of all values, concatenated.
+Record = tuple[int, int, float, float, list[float]]
 
 
 @dataclass
@@ -114,7 +104,7 @@ class LiveServer:
                     _log.error("the live service waits for the bus, no client can get or set: %s", error)
                 logged = True
                 with contextlib.suppress(TimeoutError):
-                    self._loop.receive(_RETRY_PERIOD)  # The loop sends nothing before the first request.
+                    self._loop.receive_frame(_RETRY_PERIOD)  # The loop sends nothing before the first request.
 
     def run(self) -> None:
         """Serve until the loop closes its connection."""
@@ -124,7 +114,7 @@ class LiveServer:
                 select.select(sources, (), (), _TICK)
                 while self._link.take(0.0, _BURST) == _BURST:
                     pass
-                self._take_frames()
+                self._take_messages()
                 self._end_leases()
                 self._report_rejected()
         except EOFError:
@@ -161,7 +151,7 @@ class LiveServer:
         self._num_tasks += 1
         lease = request.lease if isinstance(request, ReadRequest) else 0.0
         self._tasks[self._num_tasks] = _Task(request, channel, now + lease)
-        self._loop.send(pickle.dumps((self._num_tasks, request)))
+        self._loop.send((self._num_tasks, request))
 
     def _renew(self, request: ReadRequest, now: float) -> bool:
         """Renew the lease of a watch and return whether there was one; drop a watch that has changed or ended."""
@@ -181,28 +171,27 @@ class LiveServer:
 
     def _drop(self, number: int) -> None:
         del self._tasks[number]
-        self._loop.send(pickle.dumps((number, None)))
+        self._loop.send((number, None))
 
     def _report_rejected(self) -> None:
         now = time.monotonic()
         if self.rejected > self._reported and now >= self._next_report:
             self._reported, self._next_report = self.rejected, now + _TICK
-            self._loop.send(pickle.dumps((0, self.rejected)))
+            self._loop.send((0, self.rejected))
 
     # -- from the loop
 
-    def _take_frames(self) -> None:
+    def _take_messages(self) -> None:
         while True:
             try:
-                frame = self._loop.receive(0.0)
+                kind, content = self._loop.receive(0.0)
             except TimeoutError:
                 return
-            if frame[:1] == VALUES:
-                start = 1
-                while start < len(frame):
-                    start = self._publish_values(frame, start)
+            if kind == VALUES:
+                for record in content:
+                    self._publish_values(record)
             else:
-                self._finish(*pickle.loads(frame[1:]))
+                self._finish(*content)
 
     def _finish(self, number: int, outcome: dict[str, Any]) -> None:
         task = self._tasks.get(number)
@@ -225,14 +214,11 @@ class LiveServer:
             return f"{address} is a port: it can be read, not set"
         return f"there is no variable and no port {address!r}{suggestion(address, self._addresses)}"
 
-    def _publish_values(self, frame: bytes, start: int) -> int:
-        """Publish the record that begins at ``start`` and return where the next one begins."""
-        number, cycle, since, now, count = _HEAD.unpack_from(frame, start)
-        end = start + _HEAD.size + 8 * count
+    def _publish_values(self, record: Record) -> None:
+        number, cycle, since, now, entries = record
         task = self._tasks.get(number)
         if task is None or not isinstance(task.request, ReadRequest):
-            return int(end)
-        entries = struct.unpack_from(f"<{count}d", frame, start + _HEAD.size)
+            return
         values, place = {}, 0
         for address, shape in zip(task.request.addresses, task.shapes, strict=True):
             values[address] = nested(entries[place : place + prod(shape)], shape)
@@ -242,7 +228,6 @@ class LiveServer:
         else:
             del self._tasks[number]
             self._answer(task, ok=True, time=now, values=values)
-        return int(end)
 
     def _answer(self, task: _Task, **outcome: Any) -> None:
         self._publish(task.channel + ANSWER, {"id": task.request.id, **outcome})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,13 +11,13 @@ from typing import Any, Self
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.background_process import BackgroundProcess
+from vtbdrake.control.background_process import BackgroundProcess, unpack
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.failures import FAILURES
 from vtbdrake.monitoring.live.messages import ReadRequest, Request, SetRequest
-from vtbdrake.monitoring.live.server import VALUES, outcome_frame, serve, values_record
+from vtbdrake.monitoring.live.server import OUTCOME, VALUES, Record, serve
 
 # Seconds between two frames of watched values: waking the worker process costs more than reading a value.
 _PAUSE = 0.01
@@ -58,7 +57,7 @@ class LiveService:
         self._ports = frozenset(addresses)
         self._requests: deque[bytes] = deque()
         self._readings: deque[_Reading] = deque()
-        self._records: list[bytes] = []
+        self._records: list[Record] = []
         self._flush_at = -inf
 
         self._worker = BackgroundProcess(serve, url, addresses, name="the live service")
@@ -87,9 +86,9 @@ class LiveService:
 
     def __call__(self, cycle: Cycle) -> None:
         """Take one request and read the values that are due; the runtime calls it in every cycle."""
-        self._requests += self._worker.take()
+        self._requests += self._worker.take_frames()
         if self._requests:
-            self._begin(*pickle.loads(self._requests.popleft()))
+            self._begin(*unpack(self._requests.popleft()))
         busy = bool(self._readings) and self._read(cycle)
         # Preferably in a cycle in which nothing is read.
         if self._records and cycle.now >= self._flush_at + busy * _PAUSE:
@@ -115,7 +114,7 @@ class LiveService:
             self._post(number, self._reset())
 
     def _post(self, number: int, outcome: dict[str, Any]) -> None:
-        self._worker.post(outcome_frame(number, **outcome))
+        self._worker.post((OUTCOME, (number, outcome)))
 
     def _set(self, values: dict[str, Any]) -> dict[str, Any]:
         # Checked first: Variables searches for similar addresses, which takes long.
@@ -174,11 +173,11 @@ class LiveService:
         if not reading.described:
             reading.described = True
             self._post(reading.number, {"shapes": reading.shapes})
-        self._records.append(values_record(reading.number, cycle.number, reading.since, cycle.time, reading.entries))
+        self._records.append((reading.number, cycle.number, reading.since, cycle.time, reading.entries))
         return reading.every > 0
 
     def _flush(self, now: float) -> None:
-        self._worker.post(VALUES, *self._records)
+        self._worker.post((VALUES, self._records))
         self._records.clear()
         self._flush_at = now + _PAUSE
         if self._worker.dropped and not self._worker.alive:

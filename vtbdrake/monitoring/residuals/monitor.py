@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -126,7 +125,7 @@ class ResidualMonitor:
         sizes = {address: prod(variables[address].shape) for group in estimates.values() for address in group}
         self._rows = RowLayout(interface, reported, sizes)
         if self._worker is not None:
-            self._worker.post(pickle.dumps(self._rows))
+            self._worker.post(self._rows)
         else:
             self._comparison = Comparison(predictor, self._rows, config, mode=mode)
         self._results = 0
@@ -144,11 +143,11 @@ class ResidualMonitor:
 
     @staticmethod
     def _await_estimates(worker: BackgroundProcess) -> dict[int, tuple[str, ...]]:
-        frames = worker.wait_for_frames(START_TIMEOUT)
-        if not frames:
+        messages = worker.wait_for_messages(START_TIMEOUT)
+        if not messages:
             worker.kill()
             raise ResidualError(f"the worker process has ended, or did not start within {START_TIMEOUT:g} s")
-        answer = pickle.loads(frames[0])
+        answer = messages[0]
         if isinstance(answer, str):
             worker.close()
             raise ValueError(answer)
@@ -185,8 +184,8 @@ class ResidualMonitor:
         self._begin_block()
 
     def _take_reports(self, worker: BackgroundProcess) -> None:
-        for frame in worker.take():
-            self._take_report(pickle.loads(frame))
+        for report in worker.take():
+            self._take_report(report)
 
     def _take_report(self, report: ResidualReport) -> None:
         self.history.extend(report.windows)
@@ -458,10 +457,10 @@ def _serve(
     try:
         predictor = Predictor(scenario, period=config.period, values=config.values)
     except ValueError as error:
-        connection.send(pickle.dumps(str(error)))
+        connection.send(str(error))
         return
-    connection.send(pickle.dumps(predictor.estimates))
-    layout: RowLayout = pickle.loads(connection.receive())
+    connection.send(predictor.estimates)
+    layout: RowLayout = connection.receive()
     comparison = Comparison(predictor, layout, config, mode=mode)
     pending, late, reported, ended = ResidualReport(), False, 0, False
     while not ended:
@@ -475,10 +474,10 @@ def _serve(
             # Windows without a result are reported, too.
             without = report.skipped + report.failed
             if report.alarms or len(report.windows) + without - reported >= _REPORT_WINDOWS:
-                connection.send(pickle.dumps(report))
+                connection.send(report)
                 pending = replace(report, windows=[], alarms=[])
                 reported = without
-    connection.send(pickle.dumps(pending))
+    connection.send(pending)
 
 
 def _waiting_blocks(connection: FrameConnection) -> tuple[list[bytes], bool]:
