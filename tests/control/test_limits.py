@@ -113,8 +113,9 @@ def test_command_that_cannot_stop_is_reduced(acceleration: float, upper: float, 
         position, step = sent, sent - position
 
 
-def test_command_at_the_limit_passes_without_rounding() -> None:
-    one = limiter(-1.0, acceleration=1.0 / T**2, upper=0.0)
+@pytest.mark.parametrize("limits", [{"acceleration": 1.0 / T**2}, {"rate": 1.0 / T}])
+def test_command_at_the_limit_passes_without_rounding(limits: dict[str, float]) -> None:
+    one = limiter(-1.0, **limits, upper=0.0)
     assert one.limit([-1e-300]).item() == -1e-300
 
 
@@ -194,12 +195,15 @@ def test_acceleration_limit_is_counted() -> None:
     assert one.counts["acceleration"].largest == pytest.approx(1.0 - 1e-5)
 
 
-def test_rounding_at_a_limit_is_not_counted() -> None:
-    one = limiter(rate=0.7)
+@pytest.mark.parametrize("rate", [0.7e-6, 0.7, 0.7e6])
+def test_rounding_at_a_limit_is_not_counted(rate: float) -> None:
+    one = limiter(rate=rate)
     for k in range(1, 1000):
-        command = 0.7 * k * T
+        command = rate * k * T
         assert one.limit([command]).item() == pytest.approx(command, rel=1e-14)
     assert one.counts["rate"].changed == 0
+    one.limit([rate * 1001.001 * T])  # by a millionth of the way to it
+    assert one.counts["rate"].changed == 1
 
 
 def test_commands_depart_from_start_at_rest() -> None:
@@ -210,12 +214,14 @@ def test_commands_depart_from_start_at_rest() -> None:
     assert one.limit([1.0]).item() == pytest.approx(0.3 + 1e-5, rel=1e-12)
 
 
-@pytest.mark.parametrize(("limits"), [{"rate": 1.0}, {"acceleration": 1.0}])
-def test_rate_limit_without_start_is_an_error(limits: dict[str, float]) -> None:
-    one = limiter(None, **limits)
+@pytest.mark.parametrize(
+    "limits", [{"rate": 1.0}, {"acceleration": 1.0}, {"rate": [inf, 1.0]}, {"acceleration": [1.0, inf]}]
+)
+def test_rate_limit_without_start_is_an_error(limits: dict[str, Any]) -> None:
+    one = RateLimiter(signal(2, **limits), period=T)
     assert one.needs_start and not one.has_start
     with pytest.raises(ActuationError, match="nothing to depart from") as caught:
-        one.limit([0.0])
+        one.limit([0.0, 0.0])
     assert caught.value.kind == "not started"
 
 
@@ -261,9 +267,11 @@ def test_period_must_be_positive(period: float) -> None:
         RateLimiter(signal(), period=period)
 
 
-def test_limits_without_any_step_are_rejected() -> None:
+@pytest.mark.parametrize("limit", ["rate", "acceleration"])
+@pytest.mark.parametrize("value", [1e-300, [1.0, 1e-300]])
+def test_limits_without_any_step_are_rejected(limit: str, value: float | list[float]) -> None:
     with pytest.raises(ValueError, match="leave no step"):
-        RateLimiter(signal(acceleration=1e-300), period=T)
+        RateLimiter(signal(2, **{limit: value}), period=T)
 
 
 def test_abstract_signal_is_remembered_without_limits() -> None:
@@ -271,9 +279,15 @@ def test_abstract_signal_is_remembered_without_limits() -> None:
     with pytest.raises(ValueError, match="abstract"):
         RateLimiter(picture, period=T)
     one = PassThrough()
-    assert one.limit("on") == "on" and one.last_sent == "on"
+    assert not one.needs_start and not one.has_start
+    assert one.limit("on") == "on" and one.last_sent == "on" and one.has_start
     with pytest.raises(ActuationError):
         one.limit(None)
+    one.limit("dim")
+    one.take_back()
+    assert one.last_sent == "on"
+    one.release()
+    assert not one.has_start
 
 
 # -- bounds of values
@@ -320,6 +334,13 @@ def test_read_only_array_is_a_value() -> None:
     assert RateLimiter(signal(2), period=T).limit(value).tolist() == [1.0, 1.0]
 
 
+@pytest.mark.parametrize(
+    ("value", "problem"), [([1.0], ""), ([1.5], "limits"), ([nan], "not finite"), ([1, 1], "size")]
+)
+def test_bounds_of_a_single_entry_are_checked(value: list[float], problem: str) -> None:
+    assert Bounds(signal(1, lower=-1.0, upper=1.0)).check(value) == problem
+
+
 def test_abstract_value_has_its_type() -> None:
     bounds = Bounds(Signal("picture", model_value="", idle=""))
     assert [bounds.check(value) for value in ("cat", 1.0)] == ["", "type"]
@@ -328,6 +349,7 @@ def test_abstract_value_has_its_type() -> None:
 def test_bounds_of_equal_signals_are_equal() -> None:
     wide, narrow = Signal("a", size=2, upper=2.0), Signal("a", size=2, upper=1.0)
     assert Bounds(wide) == Bounds(Signal("b", size=2, upper=[2.0, 2.0])) != Bounds(narrow)
+    assert Bounds(signal(1, upper=2.0)) == Bounds(signal(1, upper=2.0)) != Bounds(signal(1, upper=1.0))
     assert Bounds(Signal("a", model_value="", idle="")) != Bounds(wide)
 
 
@@ -337,6 +359,15 @@ def test_jump_bounds_agree_with_numpy(before: list[float], value: list[float], s
     with np.errstate(invalid="ignore"):
         expected = (abs(np.subtract(value, before)) <= rate * seconds + tolerance).all()
     assert JumpBounds(rate, tolerance).contains(np.array(before), np.array(value), seconds) == expected
+
+
+@pytest.mark.parametrize("bad", [[0.0, 0.0], np.zeros(3), np.zeros(2, dtype=np.float32), None])
+def test_jump_bounds_contain_arrays_of_their_size_only(bad: Any) -> None:
+    bounds, good = JumpBounds([1.0, 1.0], [1.0, 1.0]), np.zeros(2)
+    assert bounds.contains(good, good, 1.0)
+    assert not bounds.contains(bad, good, 1.0)
+    assert not bounds.contains(good, bad, 1.0)
+    assert not bounds.contains(bad, bad, 1.0)
 
 
 def test_jump_bounds_of_different_sizes_are_rejected() -> None:
@@ -423,6 +454,69 @@ def test_motion_comes_to_rest_in_the_range_at_any_times(seed: int) -> None:
         if sent == upper:
             break
     assert sent == pytest.approx(upper, rel=1e-3)
+
+
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    acceleration=st.floats(50.0, 1e4),
+    upper=st.floats(1e-4, 0.1),
+    side=st.sampled_from([1.0, -1.0]),
+)
+def test_steps_are_the_longest_allowed_at_any_times(seed: int, acceleration: float, upper: float, side: float) -> None:
+    random = np.random.default_rng(seed)
+    a, rate = acceleration * T**2, 5.0
+    one = limiter(rate=rate, acceleration=acceleration, lower=-upper, upper=upper)
+    now, position, step = 0.0, one.limit([0.0], 0.0).item(), 0.0
+    for _ in range(80):
+        share = random.choice([random.uniform(0.01, 0.99), 1.0])
+        now += share * T
+        sent = side * one.limit([side * 1e6], now).item()
+        r = min(share, 1.0)
+        most = min(r * rate * T, r * step + a * r**2, r * longest_step_of_share(upper - position, a, r))
+        assert sent - position == pytest.approx(most, rel=1e-6, abs=1e-9 * upper)
+        position, step = sent, (sent - position) / r
+
+
+def longest_step_of_share(d: float, a: float, r: float) -> float:
+    """By bisection: the longest step w of a whole period, of which a share r is taken, with a rest within d."""
+    low, high = 0.0, d / r
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        way = r * middle + way_to_rest(middle - a, a)
+        low, high = (middle, high) if way <= d else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize(
+    ("share", "counted"),
+    [
+        (1.0 - 0.5e-6, 1.0),  # times are rounded
+        (1.0 + 0.5e-6, 1.0),
+        (1.0 - 1.5e-6, 1.0 - 1.5e-6),
+        (0.0015, 0.0015),
+        (0.0009, 0.0),
+    ],
+)
+def test_time_counts_as_a_share_of_the_period(share: float, counted: float) -> None:
+    one = limiter(rate=1.0)
+    one.limit([0.0], 0.0)
+    assert one.limit([1.0], share * T).item() == pytest.approx(counted * T, rel=1e-8, abs=1e-30)
+
+
+def test_short_times_add_up() -> None:
+    one = limiter(rate=1.0)
+    one.limit([0.0], 0.0)
+    sent = [one.limit([1.0], 1e-4 * T * k).item() for k in range(1, 1001)]
+    assert sent[-1] == pytest.approx(0.1 * T, abs=1.1e-3 * T)
+    assert max(np.diff(sent)) <= 1.2e-3 * T
+
+
+def test_command_at_the_same_time_keeps_the_velocity() -> None:
+    one = limiter(acceleration=10.0)
+    a = 10.0 * T**2
+    sent = [one.limit([1.0], at).item() for at in (0.0, 0.0, T, T, 2.0 * T)]
+    assert sent == pytest.approx([a, a, 3.0 * a, 3.0 * a, 6.0 * a], rel=1e-9)
 
 
 def test_clock_that_is_set_back_holds_for_one_command() -> None:

@@ -44,6 +44,18 @@ def test_every_parameter_of_a_dps_has_bounds(name: str) -> None:
                 dps.write(context, {address: np.full(value.shape, wild)})
 
 
+@pytest.mark.one_python
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_no_two_variables_of_a_testbed_lie_in_one_place(name: str) -> None:
+    addresses: dict[tuple[str, str, int, int], str] = {}
+    for address, variable in EXAMPLES[name]().build().variables().items():
+        if (place := variable.place) is None:
+            continue
+        for entry in range(place.start, place.start + int(np.prod(variable.shape))):
+            other = addresses.setdefault((place.system.GetSystemPathname(), place.group, place.index, entry), address)
+            assert other == address
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_arm_is_stable_at_the_bounds_of_its_gains(law: str) -> None:
     """At 5 times its value, a damping already shakes the joints by radians per second, 13 N m from period to period."""
