@@ -6,11 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linear_sum_assignment
 
+from vtbdrake.components.estimation import (
+    chi_square_quantile,
+    kalman_update,
+    one_to_one,
+    squared_distances,
+    weighted_mean,
+)
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import inverse, rotation
-from vtbdrake.components.world_model.association import chi_square_quantile
 
 Array = NDArray[np.float64]
 
@@ -100,18 +105,14 @@ class Submap:
         if not len(landmarks):
             return self
         scan = landmarks.seen_from(self.X_OH)
-        noise = scan.covariances + _LEAST_DEVIATION**2 * np.eye(2)
-        S = self.covariances[:, None] + noise
+        R = scan.covariances + _LEAST_DEVIATION**2 * np.eye(2)
         nu = scan.positions - self.positions[:, None]
-        squares = np.einsum("nmi,nmij,nmj->nm", nu, np.linalg.inv(S), nu)
-        value = np.maximum(chi_square_quantile(_GATE, 2) - squares, 0.0)
-        old, new = linear_sum_assignment(value, maximize=True)
-        paired = value[old, new] > 0.0
-        old, new = old[paired], new[paired]
-        gain = self.covariances[old] @ np.linalg.inv(S[old, new])
+        squares = squared_distances(nu, self.covariances[:, None] + R)
+        old, new = one_to_one(chi_square_quantile(_GATE, 2) - squares)
+        update = kalman_update(self.covariances[old], nu[old, new], H=np.eye(2), R=R[new])
         positions, covariances = self.positions.copy(), self.covariances.copy()
-        positions[old] += np.einsum("nij,nj->ni", gain, nu[old, new])
-        covariances[old] -= gain @ self.covariances[old]
+        positions[old] += update.step
+        covariances[old] = update.P
         diameters, deviations = self.diameters.copy(), self.diameter_deviations.copy()
         diameters[old], deviations[old] = _mean(
             diameters[old], deviations[old], scan.diameters[new], scan.diameter_deviations[new]
@@ -127,7 +128,7 @@ class Submap:
             self.X_OH,
             self.distance,
             np.concatenate([positions, scan.positions[rest]]),
-            np.concatenate([covariances, noise[rest]]),
+            np.concatenate([covariances, R[rest]]),
             np.concatenate([diameters, scan.diameters[rest]]),
             np.concatenate([deviations, scan.diameter_deviations[rest]]),
             np.concatenate([seen, once]),
@@ -147,11 +148,7 @@ class Submap:
         return replace(self, **{name: getattr(self, name)[mask] for name in names})
 
 
-def _mean(one: Array, one_deviation: Array, two: Array, two_deviation: Array) -> tuple[Array, Array]:
-    """Return the mean of two measurements, weighted by their variances, and its deviation.
-
-    Infinite deviations count as a thousand metres.
-    """
-    first, second = (1.0 / np.clip(deviation, 1e-4, 1e3) ** 2 for deviation in (one_deviation, two_deviation))
-    known = np.isfinite(one_deviation) | np.isfinite(two_deviation)
-    return (first * one + second * two) / (first + second), np.where(known, (first + second) ** -0.5, np.inf)
+def _mean(x: Array, deviation_x: Array, y: Array, deviation_y: Array) -> tuple[Array, Array]:
+    """Return the weighted means of two measurements and their deviations; an infinite deviation counts as 1,000 m."""
+    mean, deviation = weighted_mean(x, np.clip(deviation_x, 1e-4, 1e3), y, np.clip(deviation_y, 1e-4, 1e3))
+    return mean, np.where(np.isfinite(deviation_x) | np.isfinite(deviation_y), deviation, np.inf)

@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import RotationalInertia
 from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
+from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
     Array,
     PoseEstimate,
@@ -182,12 +183,12 @@ class MotionModel:
         They are the roots of the mean variances, of first order in the angle turned since.
         """
         dt = time - track.time
-        found = []
+        deviations = []
         for place, density in ((0, self.rate_noise**2), (3, self.velocity_noise**2)):
             P, a, b = track.P, slice(place, place + 3), slice(place + 6, place + 9)
             total = P[a, a].trace() + 2.0 * dt * P[a, b].trace() + dt**2 * P[b, b].trace()
-            found.append(float(total / 3.0 + density * dt**3 / 3.0) ** 0.5)
-        return found[0], found[1]
+            deviations.append(float(total / 3.0 + density * dt**3 / 3.0) ** 0.5)
+        return deviations[0], deviations[1]
 
     def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
         r"""Return the track with a measured pose, and the normalized innovation squared (six degrees of freedom).
@@ -201,26 +202,17 @@ class MotionModel:
             track = self.predict(track, estimate.time)
         dt = estimate.time - track.time
         H, there = self._transition(track, dt)[:6], self.moved(track, estimate.time)
-        innovation = np.concatenate(
-            [rotation_vector(estimate.matrix[:, :3] @ there.R.T), estimate.matrix[:, 3] - there.p],
+        nu = np.concatenate([rotation_vector(estimate.matrix[:, :3] @ there.R.T), estimate.matrix[:, 3] - there.p])
+        step, P, squares = kalman_update(track.P, nu, H=H, R=estimate.covariance + self._noise(-dt)[:6, :6])
+        fused = replace(
+            track,
+            R=rotation_matrix(step[:3]) @ track.R,
+            p=track.p + step[3:6],
+            w=track.w + step[6:9],
+            v=track.v + step[9:],
+            P=P,
         )
-        PHt = track.P @ H.T
-        S = H @ PHt + estimate.covariance + self._noise(-dt)[:6, :6]
-        solved = np.linalg.solve(S, np.column_stack([innovation, PHt.T]))
-        step, gain = PHt @ solved[:, 0], solved[:, 1:].T
-        A = np.eye(12) - gain @ H
-        P = A @ track.P @ A.T + gain @ (S - H @ PHt) @ gain.T
-        return (
-            replace(
-                track,
-                R=rotation_matrix(step[:3]) @ track.R,
-                p=track.p + step[3:6],
-                w=track.w + step[6:9],
-                v=track.v + step[9:],
-                P=0.5 * (P + P.T),
-            ),
-            float(innovation @ solved[:, 0]),
-        )
+        return fused, float(squares)
 
 
 STATE_SIZE, STATUS_SIZE = 13, 4

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.optimize import linear_sum_assignment
-from scipy.special import gammaincinv
 
+from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.objects import (
     Array,
@@ -45,50 +44,47 @@ class Sighting:
     def __post_init__(self) -> None:
         owner = f"a sighting of a {self.kind}"
         check_pose(owner, self.pose)
-        known = finite_part(self.pose.covariance)
-        if not known[3:].any() or np.linalg.eigvalsh(self.pose.covariance[np.ix_(known, known)])[0] <= 0.0:
+        part = finite_part(self.pose.covariance)
+        if not part[3:].any() or np.linalg.eigvalsh(self.pose.covariance[np.ix_(part, part)])[0] <= 0.0:
             raise ValueError(
                 f"the covariance of {owner} is positive definite in what was measured, a position at least"
             )
         object.__setattr__(self, "attributes", checked_attributes(owner, self.attributes))
 
 
-def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Return the value below which a chi-square variable of ``degrees`` of freedom lies with ``probability``."""
-    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
-
-
-def mahalanobis(one: WorldObject, sighting: Sighting) -> tuple[float, int]:
+def mahalanobis(world_object: WorldObject, sighting: Sighting) -> tuple[float, int]:
     """Return the squared Mahalanobis distance d² of a sighting from an object, and its degrees of freedom.
 
     With the innovation ν in all that both know (components of the pose, measured attributes) and its covariance S,
     d² = νᵀ S⁻¹ ν. If the sighting is of the object, d² is chi-square distributed, to first order in the rotation.
 
     Args:
-        one: The object in the model.
+        world_object: The object in the model.
         sighting: The observation, in the world frame of the model.
 
     Raises:
         ValueError: An attribute was seen in another unit.
     """
-    part = finite_part(one.pose.covariance) & finite_part(sighting.pose.covariance)
-    delta = one.pose.error_to(sighting.pose.X)[part]
-    S = (one.pose.covariance + sighting.pose.covariance)[np.ix_(part, part)]
-    innovation, spread = [delta], [S]
-    for name, seen in sighting.attributes.items():
-        known = one.attributes.get(name)
-        if known is not None and known.is_measured and seen.is_measured:
-            check_units(one, name, known, seen)
-            innovation.append(np.array([float(seen.value) - float(known.value)]))
-            spread.append(np.array([[known.deviation**2 + seen.deviation**2]]))
-    nu = np.concatenate(innovation)
-    return float(nu @ np.linalg.solve(block_diag(*spread), nu)), nu.size
+    part = finite_part(world_object.pose.covariance) & finite_part(sighting.pose.covariance)
+    innovations = [world_object.pose.error_to(sighting.pose.X)[part]]
+    covariances = [(world_object.pose.covariance + sighting.pose.covariance)[np.ix_(part, part)]]
+    for name, measured in sighting.attributes.items():
+        expected = world_object.attributes.get(name)
+        if expected is not None and expected.is_measured and measured.is_measured:
+            check_units(world_object, name, measured)
+            innovations.append(np.array([float(measured.value) - float(expected.value)]))
+            covariances.append(np.array([[expected.deviation**2 + measured.deviation**2]]))
+    nu, S = np.concatenate(innovations), block_diag(*covariances)
+    return float(squared_distances(nu, S)), nu.size
 
 
-def check_units(one: WorldObject, name: str, known: Quantity, seen: Quantity) -> None:
-    """Raise a ValueError if a seen attribute has another unit than the known one."""
-    if known.unit != seen.unit:
-        raise ValueError(f"{name} of {one.identity} is in {known.unit}, but was seen in {seen.unit}: use one unit")
+def check_units(world_object: WorldObject, name: str, measured: Quantity) -> None:
+    """Raise a ValueError if a measured attribute has another unit than that of the object."""
+    unit = world_object.attributes[name].unit
+    if unit != measured.unit:
+        raise ValueError(
+            f"{name} of {world_object.identity} is in {unit}, but was seen in {measured.unit}: use one unit"
+        )
 
 
 def associate(
@@ -109,19 +105,18 @@ def associate(
     Raises:
         ValueError: One of the sightings is something else.
     """
-    for one in sightings:
-        if not isinstance(one, Sighting):
+    for sighting in sightings:
+        if not isinstance(sighting, Sighting):
             raise ValueError(
-                f"sightings are of the class Sighting, not {type(one).__name__}: give class, pose, and attributes of "
-                "what was seen, as Sighting(kind, pose, attributes)"
+                f"sightings are of the class Sighting, not {type(sighting).__name__}: give class, pose, and attributes "
+                "of what was seen, as Sighting(kind, pose, attributes)"
             )
     gain = np.zeros((len(sightings), len(objects)))
     for i, j in np.argwhere(_within_reach(objects, sightings, probability)):
         distance, degrees = mahalanobis(objects[j], sightings[i])
         if degrees:
-            gain[i, j] = max(0.0, chi_square_quantile(probability, degrees) - distance)
-    rows, columns = linear_sum_assignment(gain, maximize=True)
-    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0.0}
+            gain[i, j] = chi_square_quantile(probability, degrees) - distance
+    return {int(i): int(j) for i, j in zip(*one_to_one(gain), strict=True)}
 
 
 def _within_reach(
@@ -138,10 +133,11 @@ def _within_reach(
     reach = reach.reshape(len(sightings), len(objects))
     delta2, trace = np.zeros(reach.shape), np.zeros(reach.shape)
     for axis in range(3):
-        there, seen = (_coordinate([one.pose for one in group], axis) for group in (objects, sightings))
-        variance = seen[1][:, np.newaxis] + there[1]
+        expected, expected_variance = _coordinate([world_object.pose for world_object in objects], axis)
+        measured, measured_variance = _coordinate([sighting.pose for sighting in sightings], axis)
+        variance = measured_variance[:, np.newaxis] + expected_variance
         shared = np.isfinite(variance)
-        delta2 += np.where(shared, seen[0][:, np.newaxis] - there[0], 0.0) ** 2
+        delta2 += np.where(shared, measured[:, np.newaxis] - expected, 0.0) ** 2
         trace += np.where(shared, variance, 0.0)
     return reach & (delta2 <= gate * trace)
 

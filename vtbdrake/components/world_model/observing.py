@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.math import RotationMatrix
-from scipy.optimize import linear_sum_assignment
 
+from vtbdrake.components.estimation import kalman_update, one_to_one, weighted_mean
 from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
 from vtbdrake.components.world_model.association import Sighting, associate, check_units
 from vtbdrake.components.world_model.model import WorldModel
@@ -122,7 +122,7 @@ def observe(
     return updated.without(forgotten) if forgotten else updated
 
 
-def fused(prior: PoseEstimate, seen: PoseEstimate) -> PoseEstimate:
+def fused(prior: PoseEstimate, measurement: PoseEstimate) -> PoseEstimate:
     """Return the estimate of a pose from a prior one and an independent measurement, at the time of the later one.
 
     This is the fusion by information: P⁻¹ = P₁⁻¹ + P₂⁻¹ and P⁻¹ δ = P₂⁻¹ δ₂, where δ is the change from the prior and
@@ -131,33 +131,26 @@ def fused(prior: PoseEstimate, seen: PoseEstimate) -> PoseEstimate:
 
     Args:
         prior: The estimate before; its covariance may be singular, or infinite in some components.
-        seen: The measurement; its covariance is positive definite, or infinite in some components.
+        measurement: The measurement; its covariance is positive definite, or infinite in some components.
     """
-    had, measured = finite_part(prior.covariance), finite_part(seen.covariance)
+    had, measured = finite_part(prior.covariance), finite_part(measurement.covariance)
     both, new = had & measured, ~had & measured
     P = np.where(np.outer(had, had), prior.covariance, 0.0)
-    delta_seen = prior.error_to(seen.X)
-    R_seen = np.where(np.outer(measured, measured), seen.covariance, 0.0)
-
-    S = (P + R_seen)[np.ix_(both, both)]
-    K = np.linalg.solve(S, P[both]).T
-    delta = K @ delta_seen[both]
-    # In Joseph's form, the covariance stays symmetric and positive semidefinite.
-    left = np.eye(6)
-    left[:, both] -= K
-    P = left @ P @ left.T + K @ R_seen[np.ix_(both, both)] @ K.T
+    R = np.where(np.outer(measured, measured), measurement.covariance, 0.0)
+    nu = prior.error_to(measurement.X)
+    delta, P, _ = kalman_update(P, nu[both], H=np.eye(6)[both], R=R[np.ix_(both, both)])
 
     # What is known for the first time: the measurement, less its error as far as the other components tell it.
-    G = np.linalg.solve(R_seen[np.ix_(both, both)], R_seen[np.ix_(both, new)]).T
-    delta[new] = delta_seen[new] - G @ (delta_seen[both] - delta[both])
+    G = np.linalg.solve(R[np.ix_(both, both)], R[np.ix_(both, new)]).T
+    delta[new] = nu[new] - G @ (nu[both] - delta[both])
     across = G @ P[both]
     P[new, :] = across
     P[:, new] = across.T
-    P[np.ix_(new, new)] = R_seen[np.ix_(new, new)] - G @ R_seen[np.ix_(both, new)] + across[:, both] @ G.T
+    P[np.ix_(new, new)] = R[np.ix_(new, new)] - G @ R[np.ix_(both, new)] + across[:, both] @ G.T
     covariance = 0.5 * (P + P.T)
     unknown = ~(had | measured)
     covariance[unknown, unknown] = np.inf
-    return PoseEstimate(_moved(prior, delta), covariance, max(prior.time, seen.time))
+    return PoseEstimate(_moved(prior, delta), covariance, max(prior.time, measurement.time))
 
 
 def _moved(prior: PoseEstimate, delta: Array) -> Array:
@@ -166,17 +159,20 @@ def _moved(prior: PoseEstimate, delta: Array) -> Array:
     return np.column_stack([rotation, prior.matrix[:, 3] + delta[3:]])
 
 
-def _fused_attributes(one: WorldObject, sighting: Sighting) -> Mapping[str, Quantity]:
+def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[str, Quantity]:
     """Return attributes after a sighting: measured numbers are fused, exact ones and texts are kept, new ones added."""
-    attributes = dict(one.attributes)
-    for name, seen in sighting.attributes.items():
-        known = attributes.setdefault(name, seen)
-        if known is not seen:
-            check_units(one, name, known, seen)
-        if known is not seen and known.is_measured and seen.is_measured:
-            gain = known.deviation**2 / (known.deviation**2 + seen.deviation**2)
-            value = float(known.value) + gain * (float(seen.value) - float(known.value))
-            attributes[name] = Quantity(value, known.unit, float(np.sqrt(gain)) * seen.deviation)
+    attributes = dict(world_object.attributes)
+    for name, measured in sighting.attributes.items():
+        if name not in world_object.attributes:
+            attributes[name] = measured
+            continue
+        prior = world_object.attributes[name]
+        check_units(world_object, name, measured)
+        if prior.is_measured and measured.is_measured:
+            value, deviation = weighted_mean(
+                float(prior.value), prior.deviation, float(measured.value), measured.deviation
+            )
+            attributes[name] = Quantity(value, prior.unit, deviation)
     return attributes
 
 
@@ -196,13 +192,12 @@ def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
 def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: LifeCycle) -> dict[str, Sighting]:
     """Return the sighting nearest to each object that was expected elsewhere; one to one, by horizontal distance."""
     gain = np.zeros((len(unseen), len(left)))
-    for i, one in enumerate(unseen):
+    for i, world_object in enumerate(unseen):
         for j, sighting in enumerate(left):
-            if one.kind == sighting.kind:
-                offset = sighting.pose.matrix[:2, 3] - one.pose.matrix[:2, 3]
-                gain[i, j] = max(0.0, rules.revise_within - float(np.hypot(*offset)))
-    rows, columns = linear_sum_assignment(gain, maximize=True)
-    return {unseen[i].identity: left[j] for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0.0}
+            if world_object.kind == sighting.kind:
+                offset = sighting.pose.matrix[:2, 3] - world_object.pose.matrix[:2, 3]
+                gain[i, j] = rules.revise_within - float(np.hypot(*offset))
+    return {unseen[i].identity: left[j] for i, j in zip(*one_to_one(gain), strict=True)}
 
 
 def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
