@@ -10,7 +10,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexer, Multiplexer, Saturation
 
 from vtbdrake.components.casadi_system import CasadiSystem, clamp
-from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state import NamedVector, Quantity
+from vtbdrake.state.declarations import DISCRETE, PARAMETER, Element
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
 from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
@@ -80,7 +81,7 @@ def _make_sense() -> Diagram:
     size = sum(SENSOR_SIGNALS.values())
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(size)))
     largest = np.concatenate([np.full(SENSOR_SIGNALS[signal], most) for signal, most in LARGEST_OFFSETS.items()])
-    offset.variables = (parameter("value", 0, shape=(size,), bounds=(-largest, largest)),)
+    offset.variables = (Element("value", PARAMETER, 0, (size,), bounds=(-largest, largest)),)
     measured = builder.AddNamedSystem("measured", Adder(2, size))
     for k, signal in enumerate(SENSOR_SIGNALS):
         builder.ExportInput(raw.get_input_port(k), signal)
@@ -208,7 +209,7 @@ def _make_act(arm: Arm, size: int) -> Diagram:
     torque = builder.AddNamedSystem("torque", Demultiplexer([JOINTS, size - JOINTS]))
     offset = builder.AddNamedSystem("offset", ConstantVectorSource(np.zeros(JOINTS)))
     largest = LARGEST_OFFSETS["joint_torque_measured"]
-    offset.variables = (parameter("value", 0, shape=(JOINTS,), unit="N m", bounds=(-largest, largest)),)
+    offset.variables = (Element("value", PARAMETER, 0, (JOINTS,), unit="N m", bounds=(-largest, largest)),)
     calibrated = builder.AddNamedSystem("calibrated", Adder(2, JOINTS))
     limited = builder.AddNamedSystem("limited", Saturation(-limits, limits))
     builder.ExportInput(torque.get_input_port(), "controlled")
@@ -253,19 +254,18 @@ def _system(
     ends = np.cumsum([part.numel() for part in parts]).tolist()
     packed = casadi.vertcat(*(following[name] for name in state))
     (packed,) = casadi.substitute([packed], parts, casadi.vertsplit(whole, [0, *ends]))
-    x0 = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value, _ in state.values()])
+    flat = {
+        name: np.ravel(value) if np.size(value) > 1 else np.asarray(value).item() for name, (value, _) in state.items()
+    }
+    vector = NamedVector(**{name: Quantity(value, state[name][1]) for name, value in flat.items()})
     system = CasadiSystem(
         update=function(name, {_STATE: whole, **p, **inputs}, {f"{_STATE}_next": packed}),
-        state={_STATE: x0},
+        state={_STATE: vector.array()},
         parameters={name: value for name, (value, _, _) in gains.items()},
         period=period,
         units={name: unit for name, (_, unit, _) in gains.items()},
         bounds={name: bounds for name, (_, _, bounds) in gains.items()},
         compile=None if compile else False,
     )
-    named = [
-        discrete_state(name, 0, shape=part.shape[:1] if part.numel() > 1 else (), start=end - part.numel(), unit=unit)
-        for part, end, (name, (_, unit)) in zip(parts, ends, state.items(), strict=True)
-    ]
-    system.variables = (*(e for e in system.variables if e.name != _STATE), *named)
+    system.variables = (*(e for e in system.variables if e.name != _STATE), *vector.elements(DISCRETE, 0))
     return system

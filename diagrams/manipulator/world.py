@@ -10,10 +10,9 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, SpatialInertia
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericParameterIndex
+from pydrake.systems.framework import Context
 
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from vtbdrake_diagrams.manipulator.model import ARM_SDF
 
@@ -65,7 +64,7 @@ def set_ball_material(plant: MultibodyPlant, scene_graph: SceneGraph, arm: Model
         scene_graph.AssignRole(plant.get_source_id(), geometry, material, RoleAssign.kReplace)
 
 
-class Push(LeafSystem):
+class Push(AddressedSystem):
     """A source of a constant wrench on a frame of a body, a parameter.
 
     .. pydrake_system::
@@ -77,26 +76,23 @@ class Push(LeafSystem):
     The parameter ``wrench``, [torque (N m); force (N)] in the world, acts at the origin of the frame.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, plant: MultibodyPlant, frame: str) -> None:
         super().__init__()
         pushed = plant.GetFrameByName(frame)
         self._body = pushed.body().index()
         self._p_BoBq_B = pushed.GetFixedPoseInBodyFrame().translation()
-        wrench = int(self.DeclareNumericParameter(BasicVector(np.zeros(6))))
-        self.variables = (parameter("wrench", wrench, shape=(6,), unit="N m, N"),)
+        self._push = self.declare_parameters(wrench=Quantity(np.zeros(6), "N m, N"))
         self.DeclareAbstractOutputPort(
             "spatial_force",
             lambda: Value([ExternallyAppliedSpatialForce()]),
-            weakly(self, Push._calc),
-            prerequisites_of_calc={self.numeric_parameter_ticket(NumericParameterIndex(wrench))},
+            self._calc,
+            prerequisites_of_calc={self.numeric_parameter_ticket(self._push.index)},
         )
 
     def _calc(self, context: Context, output: Value) -> None:  # type: ignore[valid-type]
         force = ExternallyAppliedSpatialForce()
         force.body_index = self._body
         force.p_BoBq_B = self._p_BoBq_B
-        values = context.get_numeric_parameter(0).value()
+        values = self._push.view(context).wrench
         force.F_Bq_W = SpatialForce(tau=values[:3], f=values[3:])
         output.set_value([force])  # type: ignore[attr-defined]

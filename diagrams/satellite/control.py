@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.perception.estimate import cross_matrix, rotation_vector
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
@@ -33,7 +33,7 @@ UNLIMITED = 1e6
 _LEAST = 0.1
 
 
-class ArmController(LeafSystem):
+class ArmController(AddressedSystem):
     r"""Resolved-rate control of the gripper, with the base's motion subtracted, and of the fingers.
 
     .. pydrake_system::
@@ -67,8 +67,6 @@ class ArmController(LeafSystem):
     the guidance's opening with ``finger_rate``.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, wheels: bool = False) -> None:
         super().__init__()
         self._period, self._wheels = period, wheels
@@ -79,15 +77,20 @@ class ArmController(LeafSystem):
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
         self._guidance = self.DeclareVectorInputPort("guidance", GUIDANCE)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
-        command = self.DeclareDiscreteState(servicer.home)
-        self.DeclareStateOutputPort("joint_position", command)
-        # The rates of the arm's joints, for how long an abort has lasted, and the positions measured last.
-        memory = self.DeclareDiscreteState(np.concatenate((np.zeros(ARM_JOINTS + 1), servicer.home)))
+        self._command = self.declare_discrete_state(joint_position=Quantity(servicer.home, "rad, m"))
+        self.DeclareStateOutputPort("joint_position", self._command.index)
+        self._memory = self.declare_discrete_state(
+            joint_rate_command=Quantity(np.zeros(ARM_JOINTS), "rad/s"),
+            aborted_for=Quantity(0.0, "s"),
+            measured_position=Quantity(servicer.home, "rad, m"),
+        )
         # The momentum of the arm's motion, and whether the target is part of it.
-        momentum, torque = self.DeclareDiscreteState(4), self.DeclareDiscreteState(3)
-        self.DeclareStateOutputPort("reaction", torque)
-        self._command, self._memory, self._momentum, self._reaction = map(int, (command, memory, momentum, torque))
-        declared = {
+        self._momentum = self.declare_discrete_state(
+            momentum=Quantity(np.zeros(3), "N m s"), holding=Quantity(0.0, bounds=(0.0, 1.0))
+        )
+        self._torque = self.declare_discrete_state(reaction=Quantity(np.zeros(3), "N m"))
+        self.DeclareStateOutputPort("reaction", self._torque.index)
+        settings = {
             # Value, unit, and the largest value. What is written while the arm moves comes to it: a gain times the
             # period stays far below 1, speeds and rates lie within what its drives follow.
             "position_gain": (1.0, "1/s", 10.0),
@@ -105,63 +108,50 @@ class ArmController(LeafSystem):
             "back_off": (4.0, "s", 60.0),
             "back_off_speed": (0.08, "m/s", 0.5),
         }
-        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
-        self.variables = (
-            discrete_state("joint_position", self._command, shape=(len(JOINT_NAMES),), unit="rad, m"),
-            discrete_state("joint_rate_command", self._memory, shape=(ARM_JOINTS,), unit="rad/s"),
-            discrete_state("aborted_for", self._memory, start=ARM_JOINTS, unit="s"),
-            discrete_state(
-                "measured_position", self._memory, start=ARM_JOINTS + 1, shape=(len(JOINT_NAMES),), unit="rad, m"
-            ),
-            discrete_state("momentum", self._momentum, shape=(3,), unit="N m s"),
-            discrete_state("holding", self._momentum, start=3, bounds=(0.0, 1.0)),
-            discrete_state("reaction", self._reaction, shape=(3,), unit="N m"),
-            *(
-                parameter(name, 0, start=k, unit=unit, bounds=(0.0, most))
-                for k, (name, (_, unit, most)) in enumerate(declared.items())
-            ),
+        self._settings = self.declare_parameters(
+            **{name: Quantity(value, unit, (0.0, most)) for name, (value, unit, most) in settings.items()}
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T = self._period
-        p = context.get_numeric_parameter(0).value().tolist()
-        k_p, k_R, speed, turn, push, torque, limit, posture, damping, lead, brake, finger_rate, back_off, back_speed = p
+        p, memory = self._settings.view(context), self._memory.mutable(state)
         guidance = Guidance.of(self._guidance.Eval(context))
         relative, measured = Relative.of(self._relative.Eval(context)), self._joints.Eval(context)
-        command, memory = context.get_discrete_state(self._command).value(), context.get_discrete_state(1).value()
-        q, before, aborted = measured[:ARM_JOINTS], memory[:ARM_JOINTS], memory[ARM_JOINTS]
+        command, q, before = self._command.array(context), measured[:ARM_JOINTS], memory.joint_rate_command.copy()
         mode = guidance.mode
         if mode == ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
-            aborted += T
-            if aborted < back_off:
-                away = np.concatenate((np.zeros(3), -back_speed * relative.R_BG[:, 2]))
-                rates = self._rates.value((q, away, [0.0, damping])).copy()
+            memory.aborted_for += T
+            if memory.aborted_for < p.back_off:
+                away = np.concatenate((np.zeros(3), -p.back_off_speed * relative.R_BG[:, 2]))
+                rates = self._rates.value((q, away, [0.0, p.damping])).copy()
             else:
-                rates = np.clip(self._stowed - command[:ARM_JOINTS], -0.5 * limit, 0.5 * limit)
+                rates = np.clip(self._stowed - command[:ARM_JOINTS], -0.5 * p.joint_rate, 0.5 * p.joint_rate)
         elif guidance.follows:
-            twist = self._twist(relative, guidance, k_p, k_R, speed, turn, push)
-            rates = self._rates.value((q, twist, [posture, damping])).copy()
+            twist = self._twist(relative, guidance, p)
+            rates = self._rates.value((q, twist, [p.posture_gain, p.damping])).copy()
         elif mode in (RETREAT, HOLD, ABORT):
-            rates = before * np.exp(-T / max(brake, T))
+            rates = before * np.exp(-T / max(p.brake_time, T))
         else:
             rates = np.zeros(ARM_JOINTS)
-        rates *= min(1.0, limit / max(float(np.abs(rates).max()), 1e-9))
+        rates *= min(1.0, p.joint_rate / max(float(np.abs(rates).max()), 1e-9))
         if self._wheels:
-            momentum = context.get_discrete_state(self._momentum).value()
+            momentum, most = self._momentum.mutable(state), T * p.largest_reaction
             holding = mode in (RETREAT, HOLD)
-            rates, momentum, reaction = self._gentle(q, before, rates, momentum, most=T * torque, holding=holding)
-            state.set_value(self._momentum, momentum)
-            state.set_value(self._reaction, reaction)
-        following = np.clip(command[:ARM_JOINTS] + T * rates, q - lead, q + lead)
+            # When the target is gripped, its momentum comes at once.
+            had = momentum.momentum if holding == (momentum.holding > 0.5) else None
+            rates, has, reaction = self._gentle(q, before, rates, had, most=most, holding=holding)
+            momentum.momentum, momentum.holding = has, holding
+            self._torque.mutable(state).reaction = reaction
+        following = np.clip(command[:ARM_JOINTS] + T * rates, q - p.lead, q + p.lead)
         following = np.clip(following, self._lower, self._upper)
         fingers = command[ARM_JOINTS:]
-        fingers = fingers + np.clip(guidance.opening - fingers, -T * finger_rate, T * finger_rate)
-        state.set_value(self._command, np.concatenate((following, fingers)))
-        state.set_value(self._memory, np.concatenate((rates, (aborted,), measured)))
+        fingers = fingers + np.clip(guidance.opening - fingers, -T * p.finger_rate, T * p.finger_rate)
+        self._command.mutable(state).joint_position = np.concatenate((following, fingers))
+        memory.joint_rate_command, memory.measured_position = rates, measured
 
     def _gentle(
-        self, q: Array, before: Array, rates: Array, momentum: Array, *, most: float, holding: bool
+        self, q: Array, before: Array, rates: Array, had: Array | None, *, most: float, holding: bool
     ) -> tuple[Array, Array, Array]:
         """Return the rates on the way from ``before`` to ``rates`` whose momentum changes slowly, that and its rate.
 
@@ -169,24 +159,21 @@ class ArmController(LeafSystem):
             q: The positions of the joints.
             before: Their rates one period ago.
             rates: The rates that they should have.
-            momentum: h_B one period ago, and whether the target was part of it.
+            had: h_B one period ago; None: that of ``before``.
             most: The largest change of h_B, in N m s.
             holding: Whether the target is part of it.
         """
         kernel = arm_reaction(holding=holding)
         unchanged = kernel.value((q, before))[:3].copy()
         change = kernel.value((q, rates))[:3] - unchanged
-        # When the target is gripped, its momentum comes at once.
-        had = momentum[:3] if holding == (momentum[3] > 0.5) else unchanged
+        had = unchanged if had is None else had
         room = np.maximum(most - np.sign(change) * (unchanged - had), _LEAST * most)
         share = min(1.0, float((room / np.maximum(np.abs(change), 1e-12)).min()))
         has = unchanged + share * change
-        return before + share * (rates - before), np.append(has, float(holding)), (has - had) / self._period
+        return before + share * (rates - before), has, (has - had) / self._period
 
     @staticmethod
-    def _twist(
-        relative: Relative, guidance: Guidance, k_p: float, k_R: float, speed: float, turn: float, push: float
-    ) -> Array:
+    def _twist(relative: Relative, guidance: Guidance, p: NamedView) -> Array:
         """Return V_BG as it should be, [angular; linear] in B."""
         axis = relative.R_BH[:, 2]
         offset = -guidance.distance * axis
@@ -195,8 +182,9 @@ class ArmController(LeafSystem):
         e_R = rotation_vector(R_BD @ relative.R_BG.T)
         v_BD = relative.v_BH + cross_matrix(relative.w_BH) @ offset - guidance.rate * axis
         distance = float(np.linalg.norm(e_p))
-        v = min(speed, stopping_speed(distance, gain=k_p, acceleration=push)) * e_p / max(distance, 1e-9)
-        return np.concatenate((relative.w_BH + _limited(k_R * e_R, turn), v_BD + v))
+        speed = stopping_speed(distance, gain=p.position_gain, acceleration=p.acceleration)
+        v = min(p.speed, speed) * e_p / max(distance, 1e-9)
+        return np.concatenate((relative.w_BH + _limited(p.orientation_gain * e_R, p.turn_rate), v_BD + v))
 
 
 def _limited(vector: Array, length: float) -> Array:
@@ -204,7 +192,7 @@ def _limited(vector: Array, length: float) -> Array:
     return vector if norm <= length else vector * (length / norm)
 
 
-class AttitudeController(LeafSystem):
+class AttitudeController(AddressedSystem):
     r"""Holds the base's attitude by reaction wheels, against the motion of the arm.
 
     .. pydrake_system::
@@ -228,8 +216,6 @@ class AttitudeController(LeafSystem):
     deceleration on the way back is half of what the wheels can do, so that they do not saturate before the end.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float) -> None:
         super().__init__()
         self._torque = Servicer().wheel_torque
@@ -237,17 +223,13 @@ class AttitudeController(LeafSystem):
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
         self._reaction = self.DeclareVectorInputPort("reaction", 3)
         self._guidance = self.DeclareVectorInputPort("guidance", GUIDANCE)
-        torque = self.DeclareDiscreteState(3)
-        self.DeclareStateOutputPort("wheel_torque", torque)
-        self.DeclareNumericParameter(BasicVector([0.5]))
-        self.variables = (
-            discrete_state("wheel_torque", int(torque), shape=(3,), unit="N m"),
-            parameter("bandwidth", 0, unit="rad/s", bounds=(0.0, 5.0)),
-        )
+        self._command = self.declare_discrete_state(wheel_torque=Quantity(np.zeros(3), "N m"))
+        self.DeclareStateOutputPort("wheel_torque", self._command.index)
+        self._settings = self.declare_parameters(bandwidth=Quantity(0.5, "rad/s", (0.0, 5.0)))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        (bandwidth,) = context.get_numeric_parameter(0).value().tolist()
+        bandwidth = self._settings.view(context).bandwidth
         base, q = self._base.Eval(context), self._joints.Eval(context)[:ARM_JOINTS]
         holding = Guidance.of(self._guidance.Eval(context)).mode in (RETREAT, HOLD)
         J = arm_reaction(holding=holding).value((q, np.zeros(ARM_JOINTS)))[3:].reshape(3, 3)
@@ -257,4 +239,4 @@ class AttitudeController(LeafSystem):
         angle = float(np.linalg.norm(theta))
         brakes = 0.5 * self._torque / float(J.diagonal().max())
         back = stopping_speed(angle, gain=0.5 * bandwidth, acceleration=brakes) * theta / max(angle, 1e-9)
-        state.set_value(0, self._reaction.Eval(context) - J @ (2.0 * bandwidth * (w + back)))
+        self._command.mutable(state).wheel_torque = self._reaction.Eval(context) - J @ (2.0 * bandwidth * (w + back))

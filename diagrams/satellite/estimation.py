@@ -8,12 +8,11 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.components.perception.tracking import pose_of_state
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 
 Array = NDArray[np.float64]
 
@@ -25,7 +24,7 @@ POSE = 8
 """Size of an entry of that history: [time (s), q_IB (wxyz), p_IoBo (m)]."""
 
 
-class BaseEstimator(LeafSystem):
+class BaseEstimator(AddressedSystem):
     r"""An inertial navigation: pose and velocity of the base B from its gyros and accelerometers.
 
     .. pydrake_system::
@@ -48,40 +47,33 @@ class BaseEstimator(LeafSystem):
     first), each laid out as `POSE` says, see `pose_at`.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float) -> None:
         super().__init__()
         self._period = period
         self._kernel = _navigation(period)
         self._imu = self.DeclareVectorInputPort("imu", 6)
-        start = np.zeros(BASE)
-        start[0], start[1] = -period, 1.0
-        # Poses of the time before the start are those at the start: the base is where it is.
-        past = np.tile(start[:POSE], (HISTORY, 1))
-        past[:, 0] -= period * np.arange(HISTORY)
-        base, history = self.DeclareDiscreteState(start), self.DeclareDiscreteState(past.ravel())
-        self.DeclareStateOutputPort("base", base)
-        self.DeclareStateOutputPort("history", history)
-        self._base, self._history = int(base), int(history)
-        self.variables = (
-            discrete_state("time", self._base, unit="s"),
-            discrete_state("orientation", self._base, start=1, shape=(4,)),
-            discrete_state("position", self._base, start=5, shape=(3,), unit="m"),
-            discrete_state("angular_velocity", self._base, start=8, shape=(3,), unit="rad/s"),
-            discrete_state("velocity", self._base, start=11, shape=(3,), unit="m/s"),
-            discrete_state("history", self._history, shape=(HISTORY, POSE), unit="s, 1, m"),
+        self._base = self.declare_discrete_state(
+            time=Quantity(-period, "s"),
+            orientation=Quantity([1.0, 0.0, 0.0, 0.0]),
+            position=Quantity(np.zeros(3), "m"),
+            angular_velocity=Quantity(np.zeros(3), "rad/s"),
+            velocity=Quantity(np.zeros(3), "m/s"),
         )
+        # Poses of the time before the start are those at the start: the base is where it is.
+        past = np.tile(self._base.vector.array()[:POSE], (HISTORY, 1))
+        past[:, 0] -= period * np.arange(HISTORY)
+        self._history = self.declare_discrete_state(history=Quantity(past, "s, 1, m"))
+        self.DeclareStateOutputPort("base", self._base.index)
+        self.DeclareStateOutputPort("history", self._history.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        base = context.get_discrete_state(self._base).value()
-        following = self._kernel.value((base, self._imu.Eval(context)))
+        following = self._base.mutable_array(state)
+        following[:] = self._kernel.value((self._base.array(context), self._imu.Eval(context)))
         # The samples before the first interval are over at t = 0 and are about no motion.
-        following[0] = context.get_time() - self._period
-        past = context.get_discrete_state(self._history).value()
-        state.set_value(self._base, following)
-        state.set_value(self._history, np.concatenate((following[:POSE], past[:-POSE])))
+        self._base.mutable(state).time = context.get_time() - self._period
+        past = self._history.array(context)
+        self._history.mutable_array(state)[:] = np.concatenate((following[:POSE], past[:-POSE]))
 
 
 def pose_at(history: ArrayLike, time: float) -> RigidTransform:

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, State
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, pose_at
 
 if TYPE_CHECKING:
@@ -38,8 +37,6 @@ class PoseSensor(SampledSensor):
     of its `ErrorModel` is added to each of the seven numbers, so that a noise of s is one of s m in the position and,
     as the quaternion's vector is half the angle, of 2 s rad in the orientation. The quaternion is then not of length 1.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -71,7 +68,7 @@ class PoseSensor(SampledSensor):
         return self._relative(self._state_port.Eval(context))
 
 
-class PoseReader(LeafSystem):
+class PoseReader(AddressedSystem):
     """The data processing of a `PoseSensor`: it relates each pose to the inertial frame I of the base's navigation.
 
     .. pydrake_system::
@@ -89,8 +86,6 @@ class PoseReader(LeafSystem):
     that did not arrive: sensors have noise.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, latency: float = 0.0, deviation: float = 0.01) -> None:
         """Declare the system.
 
@@ -106,35 +101,33 @@ class PoseReader(LeafSystem):
         estimate = self.DeclareAbstractState(Value(PoseEstimate.missing()))
         self.DeclareStateOutputPort("estimate", estimate)
         self._estimate = int(estimate)
-        self._last = int(self.DeclareDiscreteState(7))
-        self._arrived = int(self.DeclareDiscreteState([0.0, 0.0]))
-        self.DeclareNumericParameter(BasicVector([latency, deviation]))
-        self.variables = (
-            discrete_state("last_pose", self._last, shape=(7,), unit="1, m"),
-            discrete_state("last_time", self._arrived, unit="s"),
-            discrete_state("waiting", self._arrived, start=1, bounds=(0.0, 1.0)),
-            parameter("latency", 0, unit="s", bounds=(0.0, 1.0)),
-            parameter("deviation", 0, start=1, unit="m", bounds=(0.0, 10.0)),
+        self._last = self.declare_discrete_state(last_pose=Quantity(np.zeros(7), "1, m"))
+        self._arrived = self.declare_discrete_state(
+            last_time=Quantity(0.0, "s"), waiting=Quantity(0.0, bounds=(0.0, 1.0))
+        )
+        self._settings = self.declare_parameters(
+            latency=Quantity(latency, "s", (0.0, 1.0)), deviation=Quantity(deviation, "m", (0.0, 10.0))
         )
         self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        latency, deviation = context.get_numeric_parameter(0).value().tolist()
-        last = context.get_discrete_state(self._last).value()
-        time, waiting = context.get_discrete_state(self._arrived).value().tolist()
-        taken, pose = context.get_time() - self._period - latency, self._pose.Eval(context)
+        settings, last = self._settings.view(context), self._last.array(context)
+        arrived = self._arrived.view(context)
+        taken, pose = context.get_time() - self._period - settings.latency, self._pose.Eval(context)
         # Nothing was measured before the start; times are rounded.
         is_new = taken > -0.5 * self._period and not (pose == last).all()
-        if not (is_new or waiting):
+        if not (is_new or arrived.waiting):
             return EventStatus.DidNothing()
-        if waiting:
-            X_IB: RigidTransform = pose_at(self._history.Eval(context), time)
-            covariance = np.diag(np.repeat([2.0 * deviation, deviation], 3) ** 2)
-            estimate = PoseEstimate.of(X_IB @ pose_of_state(last), covariance, time=time)
+        if arrived.waiting:
+            X_IB: RigidTransform = pose_at(self._history.Eval(context), arrived.last_time)
+            covariance = np.diag(np.repeat([2.0 * settings.deviation, settings.deviation], 3) ** 2)
+            estimate = PoseEstimate.of(X_IB @ pose_of_state(last), covariance, time=arrived.last_time)
             state.get_mutable_abstract_state(self._estimate).set_value(estimate)
+        numbers = state.get_mutable_discrete_state()
+        following = self._arrived.mutable(numbers)
+        following.waiting = is_new
         if is_new:
-            state.get_mutable_discrete_state(self._last).SetFromVector(pose)
-            time = max(taken, 0.0)
-        state.get_mutable_discrete_state(self._arrived).SetFromVector([time, float(is_new)])
+            self._last.mutable(numbers).last_pose = pose
+            following.last_time = max(taken, 0.0)
         return EventStatus.Succeeded()

@@ -8,10 +8,10 @@ from functools import lru_cache
 import casadi
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from vtbdrake.components.casadi_system.kernel import Kernel
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
 from vtbdrake_diagrams.satellite.estimation import BASE, rotated, turned
 from vtbdrake_diagrams.satellite.kinematics import gripper
@@ -53,7 +53,7 @@ class Relative:
         return Relative(float(x[0]), x[1] > 0.5, R_BH, x[11:14], x[14:17], x[17:20], R_BG, x[29:32])
 
 
-class RelativeMotion(LeafSystem):
+class RelativeMotion(AddressedSystem):
     """The motion of the grapple fixture H against the base B, and where the gripper G is.
 
     .. pydrake_system::
@@ -71,8 +71,6 @@ class RelativeMotion(LeafSystem):
     base is extrapolated to the time of the others, one period later. ``relative`` is a `Relative` as a vector.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float) -> None:
         super().__init__()
         self._period = period
@@ -81,7 +79,7 @@ class RelativeMotion(LeafSystem):
         self._target = self.DeclareVectorInputPort("target", 13)
         self._status = self.DeclareVectorInputPort("status", 4)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
-        self.DeclareVectorOutputPort("relative", RELATIVE, weakly(self, RelativeMotion._calc))
+        self.DeclareVectorOutputPort("relative", RELATIVE, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         valid, age = self._status.Eval(context)[:2].tolist()

@@ -12,10 +12,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, NumericParameterIndex
+from pydrake.systems.framework import Context
 
-from vtbdrake.state import parameter
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.satellite.bodies import Target
 
@@ -73,7 +72,7 @@ def random_start(seed: int, *, tumble: float, distance: float) -> Start:
     return Start(RigidTransform(before @ off, p_WTo), tumble * axis, v_WT)
 
 
-class Release(LeafSystem):
+class Release(AddressedSystem):
     """Sets a resting, floating body in motion in the first step of a discrete plant.
 
     .. pydrake_system::
@@ -89,8 +88,6 @@ class Release(LeafSystem):
     body's frame is at its centre of mass, and its mass is that of the model.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, start: Start) -> None:
         super().__init__()
         body = plant.GetBodyByName("body", instance)
@@ -98,15 +95,16 @@ class Release(LeafSystem):
         inertia = body.default_spatial_inertia()
         self._mass, self._I_T = inertia.get_mass(), inertia.CalcRotationalInertia().CopyToFullMatrix3()
         self._quaternion = slice(body.floating_positions_start(), body.floating_positions_start() + 4)
-        velocity = int(self.DeclareNumericParameter(BasicVector(np.concatenate((start.w_WT, start.v_WT)))))
-        self.variables = (parameter("velocity", velocity, shape=(6,), unit="rad/s, m/s"),)
+        self._settings = self.declare_parameters(
+            velocity=Quantity(np.concatenate((start.w_WT, start.v_WT)), "rad/s, m/s")
+        )
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self.DeclareAbstractOutputPort(
             "spatial_force",
             lambda: Value([ExternallyAppliedSpatialForce()]),
-            weakly(self, Release._calc),
+            self._calc,
             prerequisites_of_calc={
-                self.numeric_parameter_ticket(NumericParameterIndex(velocity)),
+                self.numeric_parameter_ticket(self._settings.index),
                 self.time_ticket(),
                 self._state.ticket(),
             },
@@ -116,7 +114,7 @@ class Release(LeafSystem):
         if context.get_time() >= 0.5 * self._step:
             output.set_value([])  # type: ignore[attr-defined]
             return
-        velocity = context.get_numeric_parameter(0).value()
+        velocity = self._settings.view(context).velocity
         R_WT = RotationMatrix(Quaternion(self._state.Eval(context)[self._quaternion])).matrix()
         push = ExternallyAppliedSpatialForce()
         push.body_index = self._body

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.perception.estimate import rotation_vector
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
 
@@ -124,7 +124,7 @@ class _Step:
     attempts: float
 
 
-class Supervisor(LeafSystem):
+class Supervisor(AddressedSystem):
     """A state machine that leads a capture from sensor data alone.
 
     .. pydrake_system::
@@ -164,8 +164,6 @@ class Supervisor(LeafSystem):
     The variables ``mode`` and ``reason`` are numbers: positions in `MODES` and `REASONS`.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, acceleration: float) -> None:
         super().__init__()
         self._period = period
@@ -177,15 +175,27 @@ class Supervisor(LeafSystem):
         self._capture = self.DeclareVectorInputPort("capture", 1)
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
-        start = [WAIT, 0.0, 0.0, 0.0, self._opening, 0.0]
-        guidance = self.DeclareDiscreteState(start)
-        self.DeclareStateOutputPort("guidance", guidance)
-        # reason, time in the mode, time since the start of the capture, steady for, attempts, fingers' last positions
-        memory = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, self._opening, self._opening]))
+        flag = (0.0, 1.0)
+        self._instructions = self.declare_discrete_state(
+            mode=Quantity(WAIT, bounds=(0.0, ABORT)),
+            follows=Quantity(0.0, bounds=flag),
+            distance=Quantity(0.0, "m"),
+            rate=Quantity(0.0, "m/s"),
+            opening=Quantity(self._opening, "m"),
+            flip=Quantity(0.0, bounds=flag),
+        )
+        self.DeclareStateOutputPort("guidance", self._instructions.index)
+        self._memory = self.declare_discrete_state(
+            reason=Quantity(_START, bounds=(0.0, len(REASONS) - 1.0)),
+            time_in_mode=Quantity(0.0, "s"),
+            capture_time=Quantity(0.0, "s"),
+            steady_for=Quantity(0.0, "s"),
+            attempts_made=Quantity(0.0),
+            last_fingers=Quantity([self._opening, self._opening], "m"),
+        )
         # The arm's positions through a low-pass filter, which are behind by the arm's rates times _SMOOTHING.
-        smooth = self.DeclareDiscreteState(ARM_JOINTS)
-        self._state, self._memory, self._smooth = int(guidance), int(memory), int(smooth)
-        declared = {
+        self._smooth = self.declare_discrete_state(smooth_position=Quantity(np.zeros(ARM_JOINTS), "rad"))
+        settings = {
             # Value, unit, and the largest value.
             "standoff": (0.25, "m", 2.0),
             "closing_speed": (0.06, "m/s", 0.5),
@@ -204,58 +214,47 @@ class Supervisor(LeafSystem):
             "still_rate": (2e-3, "rad/s", 1.0),
             "still_time": (1.0, "s", 60.0),
         }
-        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
-        self._names = tuple(declared)
-        self.variables = (
-            discrete_state("mode", self._state, bounds=(0.0, ABORT)),
-            discrete_state("follows", self._state, start=1, bounds=(0.0, 1.0)),
-            discrete_state("distance", self._state, start=2, unit="m"),
-            discrete_state("rate", self._state, start=3, unit="m/s"),
-            discrete_state("opening", self._state, start=4, unit="m"),
-            discrete_state("flip", self._state, start=5, bounds=(0.0, 1.0)),
-            discrete_state("reason", self._memory, bounds=(0.0, len(REASONS) - 1.0)),
-            discrete_state("time_in_mode", self._memory, start=1, unit="s"),
-            discrete_state("capture_time", self._memory, start=2, unit="s"),
-            discrete_state("steady_for", self._memory, start=3, unit="s"),
-            discrete_state("smooth_position", self._smooth, shape=(ARM_JOINTS,), unit="rad"),
-            discrete_state("attempts_made", self._memory, start=4),
-            discrete_state("last_fingers", self._memory, start=5, shape=(2,), unit="m"),
-            *(
-                parameter(name, 0, start=k, unit=unit, bounds=(0.0, most))
-                for k, (name, (_, unit, most)) in enumerate(declared.items())
-            ),
+        self._settings = self.declare_parameters(
+            **{name: Quantity(value, unit, (0.0, most)) for name, (value, unit, most) in settings.items()}
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T = self._period
-        p = dict(zip(self._names, context.get_numeric_parameter(0).value().tolist(), strict=True))
-        mode, _, distance, rate, opening, flip = context.get_discrete_state(self._state).value().tolist()
-        memory = context.get_discrete_state(self._memory).value()
-        reason, in_mode, since, steady, attempts = memory[:5].tolist()
+        p, last, memory = self._settings.view(context), self._instructions.view(context), self._memory.view(context)
+        mode = last.mode
         relative = Relative.of(self._relative.Eval(context))
         arm, fingers = np.split(self._joints.Eval(context), [ARM_JOINTS])
-        behind = arm - context.get_discrete_state(self._smooth).value()
-        rests = float(np.abs(behind).max()) < p["still_rate"] * _SMOOTHING
+        behind = arm - self._smooth.array(context)
+        rests = float(np.abs(behind).max()) < p.still_rate * _SMOOTHING
         go = float(self._capture.Eval(context)[0])
-        still = bool((np.abs(fingers - memory[5:]) < 5e-4 * T / 0.02).all())
+        still = bool((np.abs(fingers - memory.last_fingers) < 5e-4 * T / 0.02).all())
         holds = 0.6 * self._bar < float(fingers.sum()) < 1.4 * self._bar
-        in_mode, since = in_mode + T, since + T if mode != WAIT else 0.0
+        in_mode, since = memory.time_in_mode + T, memory.capture_time + T if mode != WAIT else 0.0
 
-        step = _Step(mode, reason, distance, 0.0, opening, flip, steady, attempts)
+        step = _Step(
+            mode=mode,
+            reason=memory.reason,
+            distance=last.distance,
+            rate=0.0,
+            opening=last.opening,
+            flip=last.flip,
+            steady=memory.steady_for,
+            attempts=memory.attempts_made,
+        )
         trouble = self._trouble(mode, go, relative, since, p)
-        fresh = relative.age < p["hold_after"]
+        fresh = relative.age < p.hold_after
         if trouble:
             step.mode, step.reason = ABORT, trouble
         elif mode == WAIT:
             if go > 0.5 and relative.valid and fresh and not self._unreachable(relative, p):
-                step.mode, step.reason, step.distance = APPROACH, _FIX, p["standoff"]
+                step.mode, step.reason, step.distance = APPROACH, _FIX, p.standoff
                 step.flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
         elif mode in (APPROACH, TRACK) and fresh:
-            self._steer(step, relative, rate, p)
+            self._steer(step, relative, last.rate, p)
         elif mode == GRIP:
             self._grip(step, still, holds, in_mode, p)
-        elif mode == RETREAT and holds and self._lasts(step, rests) > p["still_time"]:
+        elif mode == RETREAT and holds and self._lasts(step, rests) > p.still_time:
             step.mode, step.reason = HOLD, _STOPPED
         elif mode in (RETREAT, HOLD) and not holds and still:
             step.mode, step.reason = ABORT, SLIPPED
@@ -264,66 +263,70 @@ class Supervisor(LeafSystem):
         if step.mode != mode:
             in_mode = step.steady = 0.0
         follows = step.mode in (APPROACH, TRACK, GRIP) and fresh
-        guidance = [step.mode, follows, step.distance, step.rate, step.opening, step.flip]
-        state.set_value(self._state, np.array(guidance))
-        state.set_value(self._memory, np.array([step.reason, in_mode, since, step.steady, step.attempts, *fingers]))
-        state.set_value(self._smooth, arm - behind * np.exp(-T / _SMOOTHING))
+        following = self._instructions.mutable(state)
+        following.mode, following.follows, following.flip = step.mode, follows, step.flip
+        following.distance, following.rate, following.opening = step.distance, step.rate, step.opening
+        remembered = self._memory.mutable(state)
+        remembered.reason, remembered.time_in_mode, remembered.capture_time = step.reason, in_mode, since
+        remembered.steady_for, remembered.attempts_made = step.steady, step.attempts
+        remembered.last_fingers = fingers
+        self._smooth.mutable(state).smooth_position = arm - behind * np.exp(-T / _SMOOTHING)
 
     def _lasts(self, step: _Step, true: bool) -> float:
         """Return for how long something has been true, in s."""
         step.steady = step.steady + self._period if true else 0.0
         return step.steady
 
-    def _steer(self, step: _Step, relative: Relative, rate: float, p: dict[str, float]) -> None:
+    def _steer(self, step: _Step, relative: Relative, rate: float, p: NamedView) -> None:
         """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
         T = self._period
         error, angle = self._errors(relative, step.distance, step.flip)
-        close = error < p["position_tolerance"] and angle < p["orientation_tolerance"]
+        close = error < p.position_tolerance and angle < p.orientation_tolerance
         lasts = self._lasts(step, close)
         if step.mode == APPROACH:
             if lasts > 0.5:
                 step.mode, step.reason = TRACK, _BEFORE
         elif step.distance > 0.0:
-            push = p["acceleration"]
-            goal = min(p["closing_speed"], stopping_speed(step.distance, gain=1.0 / T, acceleration=push))
+            push = p.acceleration
+            goal = min(p.closing_speed, stopping_speed(step.distance, gain=1.0 / T, acceleration=push))
             step.rate = -min(goal, push * T - rate) if close else 0.0
             step.distance += step.rate * T
         else:
-            step.steady = lasts if error < p["grip_tolerance"] else 0.0
-            if step.steady > p["grip_time"]:
+            step.steady = lasts if error < p.grip_tolerance else 0.0
+            if step.steady > p.grip_time:
                 step.mode, step.reason = GRIP, _AT_BAR
 
-    def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: dict[str, float]) -> None:
+    def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: NamedView) -> None:
         """Close the fingers; ``still`` tells whether they rest, ``holds`` whether the bar is between them."""
         step.opening = 0.0
         if self._lasts(step, still) <= 0.3 or in_mode <= 0.5:
             return
         if holds:
             step.mode, step.reason = RETREAT, _HELD
-        elif step.attempts + 1.0 >= p["attempts"]:
+        elif step.attempts + 1.0 >= p.attempts:
             step.mode, step.reason = ABORT, MISSED_ALL
         else:
             step.mode, step.reason, step.attempts = APPROACH, _MISSED, step.attempts + 1.0
-            step.distance, step.opening = p["standoff"], self._opening
+            step.distance, step.opening = p.standoff, self._opening
 
-    def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: dict[str, float]) -> float:
+    def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: NamedView) -> float:
         """Return the reason for an abort, or 0."""
         if mode not in (APPROACH, TRACK, GRIP):
             return COMMANDED if go < -0.5 and mode in (RETREAT, HOLD) else 0.0
         checks = {
             COMMANDED: go < -0.5,
-            LOST: relative.age > p["lost_after"] or not relative.valid,
+            LOST: relative.age > p.lost_after or not relative.valid,
             OUT_OF_REACH: self._unreachable(relative, p),
-            TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p["largest_speed"],
-            TIMEOUT: since > p["time_limit"],
+            TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p.largest_speed,
+            TIMEOUT: since > p.time_limit,
         }
         return next((reason for reason, found in checks.items() if found), 0.0)
 
-    def _unreachable(self, relative: Relative, p: dict[str, float]) -> bool:
+    def _unreachable(self, relative: Relative, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""
         wrist = relative.p_BH - self._wrist * relative.R_BH[:, 2]
-        far = float(np.linalg.norm(wrist - self._shoulder)) > p["reach"]
-        return far or relative.R_BH[0, 2] < np.cos(p["largest_angle"])
+        far = float(np.linalg.norm(wrist - self._shoulder)) > p.reach
+        return far or relative.R_BH[0, 2] < np.cos(p.largest_angle)
 
     def _errors(self, relative: Relative, distance: float, flip: float) -> tuple[float, float]:
         """Return by how far (m) and by which angle (rad) the gripper is off."""

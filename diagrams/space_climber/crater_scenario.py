@@ -11,12 +11,11 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus
 
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.settings import setting
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
 from vtbdrake_diagrams.space_climber.morphology import Morphology
@@ -145,7 +144,7 @@ class CraterScenario(SpaceClimberScenario):
         self._believe_joints(builder)
 
 
-class EndOfClimb(LeafSystem):
+class EndOfClimb(AddressedSystem):
     """A system that ends the simulation when the robot has passed the rim, has tipped over, or is stuck.
 
     .. pydrake_system::
@@ -154,8 +153,6 @@ class EndOfClimb(LeafSystem):
         input_ports:
         - body_poses
     """
-
-    __slots__ = NO_DICT
 
     def __init__(self, base: BodyIndex, *, period: float, patience: float = 0.0) -> None:
         """Declare the system.
@@ -170,11 +167,7 @@ class EndOfClimb(LeafSystem):
         self._base = int(base)
         self._checks = patience / period
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
-        self.DeclareDiscreteState(2)
-        self.variables = (
-            discrete_state("farthest", 0, unit="m"),
-            discrete_state("checks_since", 0, start=1),
-        )
+        self._progress = self.declare_discrete_state(farthest=Quantity(0.0, "m"), checks_since=Quantity(0.0))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
 
     def _check(self, context: Context, state: DiscreteValues) -> EventStatus:
@@ -185,9 +178,11 @@ class EndOfClimb(LeafSystem):
         rotation = X_WB.rotation().ToRollPitchYaw()
         if max(abs(rotation.roll_angle()), abs(rotation.pitch_angle())) > TIPPED_OVER:
             return EventStatus.ReachedTermination(self, "the robot has tipped over")
-        farthest, checks = context.get_discrete_state(0).value()
-        moved = distance > farthest + PROGRESS
-        state.set_value(0, [distance, 0.0] if moved else [farthest, checks + 1.0])
-        if self._checks and not moved and checks + 1.0 >= self._checks:
-            return EventStatus.ReachedTermination(self, "the robot is stuck")
+        progress = self._progress.mutable(state)
+        if distance > progress.farthest + PROGRESS:
+            progress.farthest, progress.checks_since = distance, 0.0
+        else:
+            progress.checks_since += 1.0
+            if self._checks and progress.checks_since >= self._checks:
+                return EventStatus.ReachedTermination(self, "the robot is stuck")
         return EventStatus.Succeeded()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.space_climber.conditioning import calibrate, limit
 from vtbdrake_diagrams.space_climber.estimation import PerceivedEnvironment
 from vtbdrake_diagrams.space_climber.gait import GAITS
@@ -71,7 +70,7 @@ def _make_sense(*, period: float, morphology: Morphology) -> Diagram:
     return builder.Build()
 
 
-class Calibration(LeafSystem):
+class Calibration(AddressedSystem):
     """A system that calibrates the raw sensor values and filters those of the IMU.
 
     .. pydrake_system::
@@ -87,36 +86,34 @@ class Calibration(LeafSystem):
     ``y += (1 - exp(-T / tau)) (u - y)``. The output is the state of the last sample.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._period = period
         stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
         joints, feet = stance.size, len(LEGS)
         self._raw = self.DeclareVectorInputPort("raw", 6 + joints + feet)
-        measurements = self.DeclareDiscreteState(np.concatenate([np.zeros(6), stance, np.zeros(feet)]))
-        self.DeclareStateOutputPort("measurements", measurements)
+        self._measurements = self.declare_discrete_state(
+            imu=Quantity(np.zeros(6), "rad/s, m/s^2"),
+            joint_encoders=Quantity(stance, "rad"),
+            foot_contact=Quantity(np.zeros(feet), bounds=(0.0, 1.0)),
+        )
+        self.DeclareStateOutputPort("measurements", self._measurements.index)
         # What is subtracted from every raw value, then tau.
-        self.DeclareNumericParameter(BasicVector([*np.zeros(6 + joints + feet), 0.02]))
-        self.variables = (
-            discrete_state("imu", 0, shape=(6,), unit="rad/s, m/s^2"),
-            discrete_state("joint_encoders", 0, start=6, shape=(joints,), unit="rad"),
-            discrete_state("foot_contact", 0, start=6 + joints, shape=(feet,), bounds=(0.0, 1.0)),
-            parameter("gyro_bias", 0, shape=(3,), unit="rad/s", bounds=(-1.0, 1.0)),
-            parameter("accelerometer_bias", 0, start=3, shape=(3,), unit="m/s^2", bounds=(-1.0, 1.0)),
-            parameter("encoder_offset", 0, start=6, shape=(joints,), unit="rad", bounds=(-0.1, 0.1)),
-            parameter("imu_time_constant", 0, start=6 + joints + feet, unit="s", bounds=(0.0, 10.0)),
+        self._settings = self.declare_parameters(
+            gyro_bias=Quantity(np.zeros(3), "rad/s", (-1.0, 1.0)),
+            accelerometer_bias=Quantity(np.zeros(3), "m/s^2", (-1.0, 1.0)),
+            encoder_offset=Quantity(np.zeros(joints), "rad", (-0.1, 0.1)),
+            _contact_offset=Quantity(np.zeros(feet)),
+            imu_time_constant=Quantity(0.02, "s", (0.0, 10.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        parameters = context.get_numeric_parameter(0).value()
-        raw, measurements = self._raw.Eval(context), state.get_mutable_value(0)
-        calibrate(parameters, raw, measurements, filtered=SENSOR_SIGNALS["imu"], period=self._period)
+        settings, measurements = self._settings.array(context), self._measurements.mutable_array(state)
+        calibrate(settings, self._raw.Eval(context), measurements, filtered=SENSOR_SIGNALS["imu"], period=self._period)
 
 
-class CommandLimiter(LeafSystem):
+class CommandLimiter(AddressedSystem):
     """A system that keeps joint commands within the ranges and the speed of the joints.
 
     .. pydrake_system::
@@ -131,25 +128,20 @@ class CommandLimiter(LeafSystem):
     between ``lower`` and ``upper``. The first command is the nominal stance.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._period = period
         stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
         self._target = self.DeclareVectorInputPort("joint_position", stance.size)
-        self.DeclareStateOutputPort("joint_position", self.DeclareDiscreteState(stance))
-        limits = [*morphology.joint_lower, *morphology.joint_upper, morphology.joint_speed]
-        self.DeclareNumericParameter(BasicVector(limits))
-        size = len(JOINT_NAMES)
-        self.variables = (
-            discrete_state("joint_position", 0, shape=(size,), unit="rad"),
-            parameter("lower", 0, shape=(size,), unit="rad", bounds=(-np.pi, np.pi)),
-            parameter("upper", 0, start=size, shape=(size,), unit="rad", bounds=(-np.pi, np.pi)),
-            parameter("rate", 0, start=2 * size, unit="rad/s", bounds=(0.0, morphology.joint_speed)),
+        self._command = self.declare_discrete_state(joint_position=Quantity(stance, "rad"))
+        self.DeclareStateOutputPort("joint_position", self._command.index)
+        self._limits = self.declare_parameters(
+            lower=Quantity(morphology.joint_lower, "rad", (-np.pi, np.pi)),
+            upper=Quantity(morphology.joint_upper, "rad", (-np.pi, np.pi)),
+            rate=Quantity(morphology.joint_speed, "rad/s", (0.0, morphology.joint_speed)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        limits = context.get_numeric_parameter(0).value()
-        limit(limits, self._target.Eval(context), state.get_mutable_value(0), period=self._period)
+        limits, command = self._limits.array(context), self._command.mutable_array(state)
+        limit(limits, self._target.Eval(context), command, period=self._period)

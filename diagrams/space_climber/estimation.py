@@ -5,16 +5,15 @@ from __future__ import annotations
 from math import pi
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
 from vtbdrake_diagrams.space_climber.pose_filter import PoseFilter
 
 
-class PerceivedEnvironment(LeafSystem):
+class PerceivedEnvironment(AddressedSystem):
     r"""An estimator: attitude by a complementary filter, position by leg odometry.
 
     .. pydrake_system::
@@ -40,34 +39,28 @@ class PerceivedEnvironment(LeafSystem):
     displacement. The height is that of the torso's centre over the ground under the feet, on average.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, morphology: Morphology) -> None:
         super().__init__()
         self._filter = PoseFilter(LegKinematics(morphology), foot_radius=morphology.foot_radius, period=period)
         legs = len(LEGS)
         self._measurements = self.DeclareVectorInputPort("measurements", 6 + 4 * legs)
-        pose = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, morphology.torso_clearance]))
-        self.DeclareStateOutputPort("pose", pose)
-        self.DeclareDiscreteState(1 + 3 * legs)
-        self.DeclareNumericParameter(BasicVector([2.0]))
-        self.variables = (
-            *(
-                discrete_state(name, 0, start=k, unit="rad", bounds=(-pi, pi))
-                for k, name in enumerate(("roll", "pitch", "yaw"))
-            ),
-            discrete_state("position", 0, start=3, shape=(3,), unit="m"),
-            discrete_state("attitude_known", 1, start=0, bounds=(0.0, 1.0)),
-            discrete_state("standing", 1, start=1, shape=(legs,), bounds=(0.0, 1.0)),
-            discrete_state("feet", 1, start=1 + legs, shape=(legs, 2), unit="m"),
-            parameter("time_constant", 0, unit="s", bounds=(0.0, 1e3)),
+        angle, flag = Quantity(0.0, "rad", (-pi, pi)), (0.0, 1.0)
+        self._pose = self.declare_discrete_state(
+            roll=angle, pitch=angle, yaw=angle, position=Quantity([0.0, 0.0, morphology.torso_clearance], "m")
         )
+        self.DeclareStateOutputPort("pose", self._pose.index)
+        self._memory = self.declare_discrete_state(
+            attitude_known=Quantity(0.0, bounds=flag),
+            standing=Quantity(np.zeros(legs), bounds=flag),
+            feet=Quantity(np.zeros((legs, 2)), "m"),
+        )
+        self._settings = self.declare_parameters(time_constant=Quantity(2.0, "s", (0.0, 1e3)))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         self._filter.step(
-            context.get_numeric_parameter(0)[0],
+            self._settings.view(context).time_constant,
             self._measurements.Eval(context),
-            state.get_mutable_value(0),
-            state.get_mutable_value(1),
+            self._pose.mutable_array(state),
+            self._memory.mutable_array(state),
         )

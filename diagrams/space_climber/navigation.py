@@ -9,12 +9,24 @@ from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors import ErrorModel, SampledSensor
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, NamedVector, Quantity
 from vtbdrake_diagrams.space_climber.pose_filter import wrap
+
+_ANGLE = Quantity(0.0, "rad")
+# The port ``input`` of a `Navigator`.
+_INPUT = NamedVector(
+    roll=_ANGLE,
+    pitch=_ANGLE,
+    yaw=_ANGLE,
+    position=Quantity([0.0, 0.0], "m"),
+    height=Quantity(0.0, "m"),
+    heading=_ANGLE,
+    walk=Quantity(0.0),
+    visual_odometry=Quantity(np.zeros(3), "m/s"),
+)
 
 
 class VisualOdometer(SampledSensor):
@@ -32,8 +44,6 @@ class VisualOdometer(SampledSensor):
     frame B: (R_WB)^T (p_WB(t) - p_WB(t - T)) / T. The first sample is 0.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, body: BodyIndex, *, period: float, errors: ErrorModel | None = None) -> None:
         """Declare the sensor of the body with this index in the plant."""
         super().__init__(
@@ -47,23 +57,22 @@ class VisualOdometer(SampledSensor):
         self._body = int(body)
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         # Whether there was a sample, and the position at it.
-        self._memory = int(self.DeclareDiscreteState(4))
-        self.variables += (
-            discrete_state("known", self._memory, bounds=(0.0, 1.0)),
-            discrete_state("last_position", self._memory, start=1, shape=(3,), unit="m"),
+        self._memory = self.declare_discrete_state(
+            known=Quantity(0.0, bounds=(0.0, 1.0)), last_position=Quantity(np.zeros(3), "m")
         )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         X_WB = self._poses.Eval(context)[self._body]
-        known, *last = context.get_discrete_state(self._memory).value()
-        state.set_value(self._memory, np.array([1.0, *X_WB.translation()]))
-        if not known:
+        last, following = self._memory.view(context), self._memory.mutable(state)
+        following.known, following.last_position = 1.0, X_WB.translation()
+        if not last.known:
             return np.zeros(3)
-        velocity: NDArray[np.float64] = X_WB.rotation().inverse() @ ((X_WB.translation() - last) / self.period)
+        displacement = X_WB.translation() - last.last_position
+        velocity: NDArray[np.float64] = X_WB.rotation().inverse() @ (displacement / self.period)
         return velocity
 
 
-class Navigator(LeafSystem):
+class Navigator(AddressedSystem):
     r"""A system that turns the command "walk in this direction" into the heading and the walk command of the gait.
 
     .. pydrake_system::
@@ -92,65 +101,54 @@ class Navigator(LeafSystem):
     Tip: ``tipped`` becomes 1 when the estimated roll or pitch exceeds ``tip_angle``, and stays 1; the robot then stops.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float) -> None:
         super().__init__()
         self._period = period
-        self._input = self.DeclareVectorInputPort("input", 6 + 2 + 3)
-        self.DeclareStateOutputPort("course", self.DeclareDiscreteState(1))
-        self.DeclareStateOutputPort("walk", self.DeclareDiscreteState(1))
-        self.DeclareDiscreteState(12)
-        defaults = {
-            "course_gain": (0.3, "rad/m", (0.0, 10.0)),
-            "course_limit": (0.5, "rad", (0.0, pi / 2)),
-            "slip_time": (2.0, "s", (0.0, 1e3)),
-            "slip_limit": (0.05, "m/s", (0.0, 10.0)),
-            "tip_angle": (0.8, "rad", (0.0, pi)),
-        }
-        self.DeclareNumericParameter(BasicVector([value for value, _, _ in defaults.values()]))
-        flag = (0.0, 1.0)
-        self.variables = (
-            discrete_state("course", 0, unit="rad"),
-            discrete_state("walk", 1, bounds=flag),
-            discrete_state("position", 2, shape=(2,), unit="m"),
-            discrete_state("slip", 2, start=2, shape=(2,), unit="m/s"),
-            discrete_state("slipping", 2, start=4, bounds=flag),
-            discrete_state("tipped", 2, start=5, bounds=flag),
-            discrete_state("under_way", 2, start=6, bounds=flag),
-            discrete_state("origin", 2, start=7, shape=(2,), unit="m"),
-            discrete_state("heading", 2, start=9, unit="rad"),
-            discrete_state("last_step", 2, start=10, shape=(2,), unit="m"),
-            *(
-                parameter(name, 0, start=k, unit=unit, bounds=bounds)
-                for k, (name, (_, unit, bounds)) in enumerate(defaults.items())
-            ),
+        self._input = self.DeclareVectorInputPort("input", _INPUT.size)
+        flag, point = Quantity(0.0, bounds=(0.0, 1.0)), Quantity([0.0, 0.0], "m")
+        self._course = self.declare_discrete_state(course=Quantity(0.0, "rad"))
+        self._walk = self.declare_discrete_state(walk=flag)
+        for port, group in (("course", self._course), ("walk", self._walk)):
+            self.DeclareStateOutputPort(port, group.index)
+        self._memory = self.declare_discrete_state(
+            position=point,
+            slip=Quantity([0.0, 0.0], "m/s"),
+            slipping=flag,
+            tipped=flag,
+            under_way=flag,
+            origin=point,
+            heading=Quantity(0.0, "rad"),
+            last_step=point,
+        )
+        self._settings = self.declare_parameters(
+            course_gain=Quantity(0.3, "rad/m", (0.0, 10.0)),
+            course_limit=Quantity(0.5, "rad", (0.0, pi / 2)),
+            slip_time=Quantity(2.0, "s", (0.0, 1e3)),
+            slip_limit=Quantity(0.05, "m/s", (0.0, 10.0)),
+            tip_angle=Quantity(0.8, "rad", (0.0, pi)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        T = self._period
-        course_gain, course_limit, slip_time, slip_limit, tip_angle = context.get_numeric_parameter(0).value().tolist()
-        roll, pitch, yaw, leg_x, leg_y, _, heading, walk, *v_B = self._input.Eval(context).tolist()
-        x, y, slip_x, slip_y, _, tipped, under_way, x0, y0, last_heading, last_x, last_y = (
-            context.get_discrete_state(2).value().tolist()
-        )
-        vx, vy = horizontal(v_B, roll, pitch, yaw)
-        x, y = x + T * vx, y + T * vy
-        share = 1.0 - exp(-T / slip_time) if slip_time > 0.0 else 1.0
-        slip_x += share * ((leg_x - last_x) / T - vx - slip_x)
-        slip_y += share * ((leg_y - last_y) / T - vy - slip_y)
-        if abs(roll) > tip_angle or abs(pitch) > tip_angle:
-            tipped = 1.0
-        if walk > 0.0 and not (under_way and heading == last_heading):
-            x0, y0 = x, y
-        aside = cos(heading) * (y - y0) - sin(heading) * (x - x0)
-        correction = min(max(course_gain * aside, -course_limit), course_limit) if walk > 0.0 else 0.0
-        slipping = hypot(slip_x, slip_y) > slip_limit
-        memory = (x, y, slip_x, slip_y, slipping, tipped, walk > 0.0, x0, y0, heading, leg_x, leg_y)
-        state.set_value(0, np.array([wrap(heading - correction)]))
-        state.set_value(1, np.array([0.0 if tipped else walk]))
-        state.set_value(2, np.array(memory, dtype=float))
+        T, settings, memory = self._period, self._settings.view(context), self._memory.mutable(state)
+        u = _INPUT.view(self._input.Eval(context))
+        heading, walks = u.heading, u.walk > 0.0
+        v = np.array(horizontal(u.visual_odometry.tolist(), u.roll, u.pitch, u.yaw))
+        memory.position += T * v
+        share = 1.0 - exp(-T / settings.slip_time) if settings.slip_time > 0.0 else 1.0
+        memory.slip += share * ((u.position - memory.last_step) / T - v - memory.slip)
+        memory.slipping = hypot(*memory.slip.tolist()) > settings.slip_limit
+        if max(abs(u.roll), abs(u.pitch)) > settings.tip_angle:
+            memory.tipped = 1.0
+        if walks and not (memory.under_way and heading == memory.heading):
+            memory.origin = memory.position
+        ahead, aside = (memory.position - memory.origin).tolist()
+        across = cos(heading) * aside - sin(heading) * ahead
+        limit = settings.course_limit
+        correction = min(max(settings.course_gain * across, -limit), limit) if walks else 0.0
+        memory.under_way, memory.heading, memory.last_step = walks, heading, u.position
+        self._course.mutable(state).course = wrap(heading - correction)
+        self._walk.mutable(state).walk = 0.0 if memory.tipped else u.walk
 
 
 def horizontal(v_B: list[float], roll: float, pitch: float, yaw: float) -> tuple[float, float]:

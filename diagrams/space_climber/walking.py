@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.space_climber.gait import Gait
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
-from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
+from vtbdrake_diagrams.space_climber.morphology import Morphology
 from vtbdrake_diagrams.space_climber.navigation import Navigator
 from vtbdrake_diagrams.space_climber.walker import Walker
 
 
-class GaitGenerator(LeafSystem):
+class GaitGenerator(AddressedSystem):
     """A system that computes joint positions from a walk command and a heading.
 
     .. pydrake_system::
@@ -38,48 +36,41 @@ class GaitGenerator(LeafSystem):
     ``joint_position`` is a state: the inverse kinematics of the feet, as of the last sample.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, gait: Gait, *, period: float, morphology: Morphology, clearance: float = 0.05) -> None:
         super().__init__()
         legs = LegKinematics(morphology)
         foot_radius = morphology.foot_radius
         self._walker = Walker(gait, legs, stance=morphology.stance, foot_radius=foot_radius, period=period)
         self._input = self.DeclareVectorInputPort("input", 8)
-        self.DeclareDiscreteState(np.concatenate([np.zeros(4), morphology.stance[:, :2].ravel()]))
-        command = self.DeclareDiscreteState(legs.inverse(morphology.stance).ravel())
-        self.DeclareStateOutputPort("joint_position", command)
-        defaults = {
-            "period": (2.0, "s", (0.2, 60.0)),
-            "stroke": (0.2, "m", (0.0, 0.3)),
-            "clearance": (clearance, "m", (0.0, 0.15)),
-            "height": (morphology.torso_clearance, "m", (0.1, 0.35)),
-            "ramp_time": (1.0, "s", (0.02, 60.0)),
-            "heading_gain": (0.5, "1/s", (0.0, 10.0)),
-            "yaw_rate_limit": (0.15, "rad/s", (0.0, 1.0)),
-            "posture_gain": (1.0, "1/s", (0.0, 10.0)),
-            "lean_limit": (0.15, "rad", (0.0, 0.5)),
-        }
-        self.DeclareNumericParameter(BasicVector([value for value, _, _ in defaults.values()]))
-        self.variables = (
-            discrete_state("phase", 0, start=0, unit="cycle", bounds=(0.0, 1.0)),
-            discrete_state("level", 0, start=1, bounds=(0.0, 1.0)),
-            discrete_state("lean", 0, start=2, shape=(2,), unit="rad"),
-            discrete_state("feet", 0, start=4, shape=(len(LEGS), 2), unit="m"),
-            discrete_state("joint_position", 1, shape=(3 * len(LEGS),), unit="rad"),
-            *(
-                parameter(name, 0, start=k, unit=unit, bounds=bounds)
-                for k, (name, (_, unit, bounds)) in enumerate(defaults.items())
-            ),
+        self._gait = self.declare_discrete_state(
+            phase=Quantity(0.0, "cycle", (0.0, 1.0)),
+            level=Quantity(0.0, bounds=(0.0, 1.0)),
+            lean=Quantity([0.0, 0.0], "rad"),
+            feet=Quantity(morphology.stance[:, :2], "m"),
+        )
+        self._command = self.declare_discrete_state(
+            joint_position=Quantity(legs.inverse(morphology.stance).ravel(), "rad")
+        )
+        self.DeclareStateOutputPort("joint_position", self._command.index)
+        self._settings = self.declare_parameters(
+            period=Quantity(2.0, "s", (0.2, 60.0)),
+            stroke=Quantity(0.2, "m", (0.0, 0.3)),
+            clearance=Quantity(clearance, "m", (0.0, 0.15)),
+            height=Quantity(morphology.torso_clearance, "m", (0.1, 0.35)),
+            ramp_time=Quantity(1.0, "s", (0.02, 60.0)),
+            heading_gain=Quantity(0.5, "1/s", (0.0, 10.0)),
+            yaw_rate_limit=Quantity(0.15, "rad/s", (0.0, 1.0)),
+            posture_gain=Quantity(1.0, "1/s", (0.0, 10.0)),
+            lean_limit=Quantity(0.15, "rad", (0.0, 0.5)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         self._walker.step(
-            context.get_numeric_parameter(0).value(),
+            self._settings.array(context),
             self._input.Eval(context),
-            state.get_mutable_value(0),
-            state.get_mutable_value(1),
+            self._gait.mutable_array(state),
+            self._command.mutable_array(state),
         )
 
 

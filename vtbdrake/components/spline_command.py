@@ -81,7 +81,7 @@ class SplineCommand(AddressedSystem):
         t = context.get_time() - float(plan[0])
         if t < -_ROUNDING:
             return
-        value = np.asarray(self._value.mutable(state))
+        value = self._value.mutable_array(state)
         if t > spline.duration + _ROUNDING and self._after is not None:
             value[:] = self._after
         else:

@@ -167,7 +167,7 @@ class OnboardReasoner(SlowPart):
             return
         tick = self._tick(context, self.latency)
         if self._is_for_candidate(tick, context):
-            self._show_vectors(state, tick, {_DECISION: np.asarray(self._candidate.view(context))})
+            self._show_vectors(state, tick, {_DECISION: self._candidate.array(context)})
 
     def _is_for_candidate(self, tick: int, context: Context) -> bool:
         """Return whether the candidate of the rollout is the result of sample number ``tick``."""

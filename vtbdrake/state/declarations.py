@@ -178,6 +178,11 @@ class ParameterGroup(_Group):
         super().__init__(vector, number)
         self.index = NumericParameterIndex(number)
 
+    def array(self, context: Context) -> np.ndarray:
+        """Return the values in the system's own context as one array, to be read."""
+        values: np.ndarray = context.get_numeric_parameter(self._number).value()
+        return values
+
     def view(self, context: Context) -> NamedView:
         """Return the values in the system's own context by name, to be read."""
         return self._view(context.get_numeric_parameter(self._number).value())
@@ -199,9 +204,19 @@ class DiscreteGroup(_Group):
         super().__init__(vector, number)
         self.index = DiscreteStateIndex(number)
 
+    def array(self, context: Context) -> np.ndarray:
+        """Return the values in the system's own context as one array, to be read."""
+        values: np.ndarray = context.get_discrete_state(self._number).value()
+        return values
+
     def view(self, context: Context) -> NamedView:
         """Return the values in the system's own context by name, to be read."""
         return self._view(context.get_discrete_state(self._number).value())
+
+    def mutable_array(self, state: DiscreteValues) -> np.ndarray:
+        """Return the values in ``state`` (see `mutable`) as one array, to be read and written."""
+        values: np.ndarray = state.get_mutable_value(self._number)
+        return values
 
     def mutable(self, state: DiscreteValues) -> NamedView:
         """Return the values in ``state`` by name, to be read and written.

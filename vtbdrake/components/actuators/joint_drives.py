@@ -135,16 +135,18 @@ class JointDrives(AddressedSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
-        settings, memory = self._settings.view(context), self._memory.view(context)
+        settings, memory = self._settings.array(context), self._memory.array(context)
         u, x = self._command.Eval(context), self._state_port.Eval(context)
-        delay = round(settings.delay) if self._max_delay else 0
-        delayed = memory.in_transit[delay - 1] if delay else u
-        y = self._kernel.value((np.asarray(settings), np.asarray(memory)[: 2 * n], delayed, x))
-        self._torque.mutable(state).torque = y[:n]
-        following = self._memory.mutable(state)
-        np.asarray(following)[: 2 * n] = y[n:]
+        delayed = u
+        if self._max_delay and (delay := round(self._settings.view(context).delay)):
+            delayed = self._memory.view(context).in_transit[delay - 1]
+        # The torques that follow, then the motors' and the references.
+        y = self._kernel.value((settings, memory[: 2 * n], delayed, x))
+        self._torque.mutable_array(state)[:] = y[:n]
+        self._memory.mutable_array(state)[: 2 * n] = y[n:]
         if self._max_delay:
-            following.in_transit = np.concatenate((u[np.newaxis], memory.in_transit[:-1]))
+            in_transit = self._memory.view(context).in_transit
+            self._memory.mutable(state).in_transit = np.concatenate((u[np.newaxis], in_transit[:-1]))
 
 
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from pydrake.systems.framework import BasicVector, Context
 
 from vtbdrake.state import AddressedSystem, Quantity
@@ -21,4 +20,4 @@ class Conditions(AddressedSystem):
         self.DeclareVectorOutputPort(port, self._conditions.vector.size, self._calc, {ticket})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(np.asarray(self._conditions.view(context)))
+        output.SetFromVector(self._conditions.array(context))

@@ -179,7 +179,7 @@ class ErrorStage:
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
-        all_but_seed = np.asarray(self._parameters.view(context))[1:]
+        all_but_seed = self._parameters.array(context)[1:]
         if not (np.count_nonzero(all_but_seed) or (self._more and self._remembers(context))):
             return y
         settings: _Settings = self._settings(context)

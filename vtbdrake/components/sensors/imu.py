@@ -95,7 +95,7 @@ class Imu(SampledSensor):
             )
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        return self._sample_into(np.asarray(self._memory.mutable(state)), context)
+        return self._sample_into(self._memory.mutable_array(state), context)
 
     def _sample_into(self, memory: NDArray[np.float64], context: Context) -> NDArray[np.float64]:
         """Return the measurement; ``memory`` is that of the last sample, and becomes that of this one."""
