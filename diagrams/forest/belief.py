@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
-from vtbdrake.components.localization.planar import compose, inverse
+from vtbdrake.components.localization.planar import chord, compose, inverse
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
 from vtbdrake_diagrams.forest.world.ground import Ground
@@ -57,8 +57,7 @@ def declare_belief(
                 "says that it tracks"
             )
         X_WA = compose([*position, float(heading)], [-rear, 0.0, 0.0])
-        way, turn = age * float(speed), age * float(turn_rate)
-        return compose(X_WA, inverse([way * np.cos(turn / 2.0), way * np.sin(turn / 2.0), turn]))
+        return compose(X_WA, inverse(chord(age * float(speed), age * float(turn_rate))))
 
     def pose(position: Array, heading: float, speed: float, turn_rate: float, roll: float, pitch: float) -> list[float]:
         x, y, yaw = compose(axle(position, heading, speed, turn_rate), [rear, 0.0, 0.0]).tolist()

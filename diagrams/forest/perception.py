@@ -30,7 +30,7 @@ from vtbdrake.components.localization.dead_reckoning import (
     history_size,
 )
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import compose, inverse, rotation
+from vtbdrake.components.localization.planar import chord, compose, inverse, rotation
 from vtbdrake.components.localization.unit import (
     LOST,
     UNIT_STATE_CODEC,
@@ -218,9 +218,8 @@ class PresentPose(LeafSystem):
             pose, covariance, status = lost.pose, lost.covariance, [lost.status]
         elif np.isfinite(covariance).all():
             since, _, _, x, y, heading, speed, turn_rate = motion.tolist()
-            turn = turn_rate * (now - since)
-            way = speed * (now - since)
-            X_OA_now = compose([x, y, heading], [self._axle + way * np.cos(turn / 2), way * np.sin(turn / 2), turn])
+            X_OA = compose([x, y, heading], [self._axle, 0.0, 0.0])
+            X_OA_now = compose(X_OA, chord(speed * (now - since), turn_rate * (now - since)))
             X_OH_now = compose(X_OA_now, [-self._axle, 0.0, 0.0])
             X_HH_now = compose(inverse(X_OH), X_OH_now)
             pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - float(time[0]))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
+from vtbdrake.components.localization.planar import chord, compose, inverse, rotations, transform, wrap
 from vtbdrake_diagrams.forest.world.stand import Stand
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class Wood:
         found = found[rng.random(len(found)) >= detector.missed]
         places = transform(inverse(X_WH), self.trunks.positions[found])
         bearings = np.arctan2(places[:, 1], places[:, 0])
-        R_HRay = np.array([rotation(angle) for angle in bearings]).reshape(-1, 2, 2)
+        R_HRay = rotations(bearings)
         deviations = np.array([detector.along, detector.across])
         errors_Ray = rng.normal(size=(len(found), 2)) * deviations + [detector.range_bias, 0.0]
         seen = Landmarks(
@@ -128,7 +128,7 @@ def visible(trunks: Landmarks, place: ArrayLike, *, reach: float) -> Array:
     half_widths = np.arcsin(radii[near] / distances[near])
     rays = bearings[:, np.newaxis] + half_widths[:, np.newaxis] * np.linspace(-0.9, 0.9, _RAYS)
     # [trunk, ray, other]: the nearer other trunk covers the ray.
-    apart = np.abs((rays[:, :, np.newaxis] - bearings + np.pi) % (2.0 * np.pi) - np.pi)
+    apart = np.abs(wrap(rays[:, :, np.newaxis] - bearings))
     nearer = np.tri(len(near), k=-1, dtype=bool)[:, np.newaxis, :]
     hidden = ((apart < half_widths) & nearer).any(axis=2)
     return near[(~hidden).mean(axis=1) >= _LEAST_VISIBLE]
@@ -145,8 +145,7 @@ def arc(X_WH: ArrayLike, *, length: float, curvature: float, step: float) -> Arr
     """
     poses = [np.asarray(X_WH, dtype=float)]
     turn = curvature * step
-    chord = step * np.sinc(turn / 2.0 / np.pi)
-    move = np.array([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn])
+    move = chord(step * np.sinc(turn / 2.0 / np.pi), turn)
     for _ in range(round(length / step)):
         poses.append(compose(poses[-1], move))
     return np.array(poses)

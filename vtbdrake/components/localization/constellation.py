@@ -45,7 +45,7 @@ from scipy.spatial import cKDTree
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
-from vtbdrake.components.localization.planar import compose, rotation, transform, wrap
+from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -352,13 +352,11 @@ class ConstellationMap:
         Returns:
             The improved poses (k, 3), and their sums of weights (k,).
         """
-        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        x = c * places[:, 0] - s * places[:, 1] + poses[:, :1]
-        y = s * places[:, 0] + c * places[:, 1] + poses[:, 1:2]
-        distances, nearest = self._tree.query(np.stack([x, y], axis=-1), distance_upper_bound=2.5 * width)
-        known = nearest < len(self._places)
-        weight = weights * np.where(known, np.exp(-0.5 * np.minimum(distances / width, 9.0) ** 2), 0.0)
-        target = self._places[np.where(known, nearest, 0)]
+        seen = places @ rotations(poses[:, 2]).swapaxes(1, 2) + poses[:, np.newaxis, :2]
+        distances, nearest = self._tree.query(seen, distance_upper_bound=2.5 * width)
+        is_near = nearest < len(self._places)
+        weight = weights * np.where(is_near, np.exp(-0.5 * np.minimum(distances / width, 9.0) ** 2), 0.0)
+        target = self._places[np.where(is_near, nearest, 0)]
         total = weight.sum(axis=1)
         weight /= np.maximum(total, 1e-9)[:, np.newaxis]
         mean_C, mean_M = weight @ places, np.einsum("kn,kni->ki", weight, target)
@@ -366,8 +364,7 @@ class ConstellationMap:
         along = np.einsum("kn,kni,kni->k", weight, u, v)
         across = np.einsum("kn,kn->k", weight, u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
         heading = np.arctan2(across, along)
-        c, s = np.cos(heading), np.sin(heading)
-        turned = np.column_stack([c * mean_C[:, 0] - s * mean_C[:, 1], s * mean_C[:, 0] + c * mean_C[:, 1]])
+        turned = np.einsum("kij,kj->ki", rotations(heading), mean_C)
         return np.column_stack([mean_M - turned, heading]), total
 
     def _matches(self, here: _Local, pose: Array, mean: Array, spread: Array) -> _Matches:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
 from vtbdrake.components.localization.ground import fit_ground
+from vtbdrake.components.localization.planar import wrap
 from vtbdrake.settings import check_settings, setting
 
 Array = NDArray[np.float64]
@@ -198,9 +199,7 @@ class Clusters:
     @cached_property
     def azimuths(self) -> Array:
         """The directions of the points in rad, counted from those of their clusters, (n,)."""
-        angles = self.scene.azimuths[self.rows] - self.bearings[self.owners]
-        wrapped: Array = (angles + pi) % (2.0 * pi) - pi
-        return wrapped
+        return wrap(self.scene.azimuths[self.rows] - self.bearings[self.owners])
 
     def sums(self, values: Array) -> Array:
         """Return the sums over the clusters, (k, ...), of values of the points, (n, ...)."""
