@@ -32,10 +32,11 @@ BELOW: dict[str, set[str]] = {
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
 # Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
-# travel to them, when the names of a package are imported, splines and
-# laser scans.
+# travel to them, when the names of a package are imported, what a cache keeps, splines and laser scans.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "child_process", "failures", "lazy", "pickling", "scan", "settings", "spline"})
+    _layers.update(
+        {"argument_checks", "child_process", "failures", "lazy", "lru", "pickling", "scan", "settings", "spline"}
+    )
 BELOW["spline"] = {"argument_checks", "spline_kernel"}
 BELOW["spline_kernel"] = {"state"}
 BELOW["scan"] = set()
@@ -45,6 +46,7 @@ BELOW["argument_checks"] = set()
 BELOW["settings"] = set()
 BELOW["failures"] = set()
 BELOW["lazy"] = set()
+BELOW["lru"] = set()
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

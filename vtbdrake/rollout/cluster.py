@@ -8,7 +8,7 @@ import pickle
 import threading
 import time
 import uuid
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
@@ -16,6 +16,7 @@ from math import inf
 from typing import Any
 
 from vtbdrake.failures import error_text
+from vtbdrake.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
 from vtbdrake.rollout.pruning import Cutoff
@@ -83,7 +84,7 @@ class DaskExecutor(Executor):
         self._threads = 0
         self._counted = -inf
         self._pickler = TaskPickler()
-        self._sent: OrderedDict[str, str] = OrderedDict()
+        self._sent: LruDict[str, str] = LruDict(_TASKS)
 
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
@@ -139,24 +140,25 @@ class DaskExecutor(Executor):
 
     def _send(self, task: PickledTask) -> str:
         """Send the task to the workers, unless they have it, and return its name there."""
-        if task.digest not in self._sent:
-            name = f"vtbdrake-{task.digest}-{uuid.uuid4().hex}"
-            try:
-                self._client.register_plugin(TaskPlugin(task), name=name)
-            except _GONE as error:
+        name = self._sent.use(task.digest)
+        if name is not None:
+            return name
+        name = f"vtbdrake-{task.digest}-{uuid.uuid4().hex}"
+        try:
+            self._client.register_plugin(TaskPlugin(task), name=name)
+        except _GONE as error:
+            raise _given_up(error) from error
+        except Exception as error:
+            if self._client.status != "running":
                 raise _given_up(error) from error
-            except Exception as error:
-                if self._client.status != "running":
-                    raise _given_up(error) from error
-                raise WorkerError(
-                    f"the Dask workers cannot read the problem ({error_text(error)}): they need the same "
-                    "vtbdrake as this process"
-                ) from error
-            self._sent[task.digest] = name
-            if len(self._sent) > _TASKS:
-                self._forget(self._sent.popitem(last=False)[1])
-        self._sent.move_to_end(task.digest)
-        return self._sent[task.digest]
+            raise WorkerError(
+                f"the Dask workers cannot read the problem ({error_text(error)}): they need the same vtbdrake as this "
+                "process"
+            ) from error
+        dropped = self._sent.add(task.digest, name)
+        if dropped is not None:
+            self._forget(dropped)
+        return name
 
     def _forget(self, name: str) -> None:
         """Remove a task from the workers; without a scheduler there are none."""

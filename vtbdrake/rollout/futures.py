@@ -7,12 +7,13 @@ import logging
 import pickle
 import queue
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
 
 from vtbdrake.failures import error_text
+from vtbdrake.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.pickled_task import (
     MAX_TASKS,
@@ -157,17 +158,15 @@ class _Worker:
 
     def __init__(self) -> None:
         self._runners = Runners(Testbeds())
-        self._tasks: OrderedDict[str, RolloutTask] = OrderedDict()
+        self._tasks: LruDict[str, RolloutTask] = LruDict(MAX_TASKS)
         self._lock = threading.Lock()
 
     def run(self, pickled: PickledTask, point: bytes, start: bytes) -> RolloutResult:
         with self._lock:
-            if pickled.digest not in self._tasks:
-                self._tasks[pickled.digest] = unpack(pickled.content)
-                if len(self._tasks) > MAX_TASKS:
-                    self._tasks.popitem(last=False)
-            self._tasks.move_to_end(pickled.digest)
-            task = self._tasks[pickled.digest]
+            task = self._tasks.use(pickled.digest)
+            if task is None:
+                task = unpack(pickled.content)
+                self._tasks.add(pickled.digest, task)
         return self._runners.run(task, unpack(point), start=unpack_start(start))
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.lru import LruDict
 from vtbdrake.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
@@ -36,7 +36,7 @@ class TaskPickler:
     """Pickles tasks, and keeps the bytes of those used last."""
 
     def __init__(self) -> None:
-        self._pickled: OrderedDict[int, tuple[RolloutTask, PickledTask]] = OrderedDict()
+        self._pickled: LruDict[int, tuple[RolloutTask, PickledTask]] = LruDict(MAX_TASKS)
 
     def pickle(self, task: RolloutTask) -> PickledTask:
         """Return the pickled task. A task is known by its identity.
@@ -44,12 +44,11 @@ class TaskPickler:
         Raises:
             WorkerError: It cannot be pickled.
         """
-        if id(task) not in self._pickled:
-            self._pickled[id(task)] = (task, _pickle(task))
-            if len(self._pickled) > MAX_TASKS:
-                self._pickled.popitem(last=False)
-        self._pickled.move_to_end(id(task))
-        return self._pickled[id(task)][1]
+        entry = self._pickled.use(id(task))
+        if entry is None:
+            entry = (task, _pickle(task))
+            self._pickled.add(id(task), entry)
+        return entry[1]
 
 
 def _pickle(task: RolloutTask) -> PickledTask:

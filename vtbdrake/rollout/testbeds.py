@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.lru import LruDict
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import RolloutRunner, values_key
 from vtbdrake.rollout.start import Start
@@ -56,7 +56,7 @@ class Testbeds:
             raise ValueError(f"at least one testbed must be kept, not {max_testbeds}")
         self.max_testbeds = max_testbeds
         self._permanent = permanent
-        self._built: OrderedDict[Hashable, VirtualTestbed] = OrderedDict()
+        self._built: LruDict[Hashable, VirtualTestbed] = LruDict(max_testbeds)
         self._lock = threading.Lock()
         self._building = threading.Lock()
 
@@ -72,22 +72,19 @@ class Testbeds:
                 return testbed
             testbed = scenario.build()
             with self._lock:
-                self._built[key] = testbed
-                dropped = self._built.popitem(last=False) if len(self._built) > self.max_testbeds else None
+                dropped = self._built.add(key, testbed)
             del dropped  # Here, so that it is taken apart while nothing is built, and without the lock.
             return testbed
 
     def _used(self, key: Hashable) -> VirtualTestbed | None:
         with self._lock:
-            if key in self._built:
-                self._built.move_to_end(key)
-            return self._built.get(key)
+            return self._built.use(key)
 
     def touch(self, testbed: VirtualTestbed) -> None:
         """Mark ``testbed`` as just used."""
         with self._lock:
             for key in [key for key, built in self._built.items() if built is testbed]:
-                self._built.move_to_end(key)
+                self._built.use(key)
 
     def __contains__(self, testbed: object) -> bool:
         with self._lock:
@@ -116,21 +113,19 @@ class Runners:
             BuildError: No testbed can be built with these fields for another reason.
             SnapshotError: The task starts from a snapshot of the scenario without these fields.
         """
-        mine: OrderedDict[Hashable, tuple[RolloutTask, RolloutRunner]]
-        mine = self._threads.__dict__.setdefault("runners", OrderedDict())
+        runners: LruDict[Hashable, tuple[RolloutTask, RolloutRunner]]
+        runners = self._threads.__dict__.setdefault("runners", LruDict(_MAX_RUNNERS))
         # By identity: comparing tasks can take longer than running them.
         key = (id(task), values_key(fields))
-        if key not in mine:
-            mine[key] = (task, self._make(task, fields))
-            # Other threads may have dropped the new one's testbed already: it is used all the same.
-            for old in [k for k, (_, runner) in mine.items() if k != key and runner.testbed not in self._testbeds]:
-                del mine[old]
-            if len(mine) > _MAX_RUNNERS:
-                mine.popitem(last=False)
-        mine.move_to_end(key)
-        runner = mine[key][1]
-        self._testbeds.touch(runner.testbed)
-        return runner
+        entry = runners.use(key)
+        if entry is None:
+            entry = (task, self._make(task, fields))
+            for stale in [k for k, (_, runner) in runners.items() if runner.testbed not in self._testbeds]:
+                del runners[stale]
+            # Other threads may have dropped its testbed already: it is used all the same.
+            runners.add(key, entry)
+        self._testbeds.touch(entry[1].testbed)
+        return entry[1]
 
     def _make(self, task: RolloutTask, fields: Mapping[str, Any]) -> RolloutRunner:
         if not fields:
