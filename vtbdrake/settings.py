@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from inspect import getdoc
 from math import inf, isfinite
 from numbers import Integral, Real
@@ -286,29 +286,36 @@ def _object_schema(config: Any) -> dict[str, Any]:
 
 
 def _schema(annotation: Any, limits: Setting, default: Any) -> dict[str, Any]:
-    about = {"description": limits.doc, "unit": limits.unit}
-    if field_types(default):
-        return {**_object_schema(default), **{key: text for key, text in about.items() if text}}
+    described = _object_schema(default) if field_types(default) else _type_schema(annotation, limits)
+    described |= {key: text for key, text in (("description", limits.doc), ("unit", limits.unit)) if text}
+    if _is_json(default):
+        described["default"] = default
+    return described
+
+
+def _type_schema(annotation: Any, limits: Setting) -> dict[str, Any]:
     types = _known(_alternatives(annotation))
     names = list(dict.fromkeys(_TYPES[each.name][2] for each in types))
-    described: dict[str, Any] = {**about, "type": names[0] if len(names) == 1 else names}
+    described: dict[str, Any] = {"type": names[0] if len(names) == 1 else names} if names else {}
+    bounds = {
+        "exclusiveMinimum": limits.gt,
+        "minimum": limits.ge,
+        "exclusiveMaximum": limits.lt,
+        "maximum": limits.le,
+    }
     for each in types:
-        # Ranges and choices are those of the entries.
-        kind, inner = _TYPES[each.name][2], replace(limits, doc="", unit="")
+        kind = _TYPES[each.name][2]
         if kind == "array":
-            described["items"] = _schema(each.entry(0), inner, None)
+            described["items"] = _type_schema(each.entry(0), limits)
             if each.is_sized:
                 described |= {"minItems": len(each.entries), "maxItems": len(each.entries)}
         elif kind == "object":
-            described["additionalProperties"] = _schema(each.entry(0), inner, None)
+            described["additionalProperties"] = _type_schema(each.entry(0), limits)
+        elif limits.choices:
+            described["enum"] = [*limits.choices]
         elif kind in ("integer", "number"):
-            described |= {"exclusiveMinimum": limits.gt, "minimum": limits.ge}
-            described |= {"exclusiveMaximum": limits.lt, "maximum": limits.le}
-        if kind not in ("array", "object"):
-            described["enum"] = list(limits.choices)
-    if types and _is_json(default):
-        described["default"] = default
-    return {key: entry for key, entry in described.items() if entry not in (None, "", [])}
+            described |= {key: bound for key, bound in bounds.items() if bound is not None}
+    return described
 
 
 def _is_json(value: Any) -> bool:

@@ -101,18 +101,18 @@ def test_hub_without_scenario_does_not_import_drake() -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--port", 70000), "port must be between 0 and 65535, not 70000"),
-        (("--port", 0, "--max-message", 64), "max_queue must be between"),
-        (("--port", 0, "--max-message", 0), "max-message"),
+        (("--port", 70000), "port must be a whole number from 0 to 65535, not 70000"),
+        (("--port", 0, "--max-message", 64), "max_queue must be at least"),
+        (("--port", 0, "--max-message", 0), "max_message must be a whole number from 1 to"),
         (("--port", 0, "--max-queue", "inf"), "'inf' is not a valid integer"),
         (("--port", 0, "--protect", "VTB_HUB"), "cannot protect 'VTB_HUB'"),
-        (("--port", 0, "--lease", 0), "lease must be a positive time"),
+        (("--port", 0, "--lease", 0), "lease must be a finite number above 0 s"),
         (("--port", 0, "--user", "no such user"), "no user 'no such user'"),
-        (("--port", 0, "--max-memory", 1), "max_memory must be between"),
-        (("--port", 0, "--max-clients", 0), "max-clients"),
+        (("--port", 0, "--max-memory", 1), "max_memory must be at least max_queue"),
+        (("--port", 0, "--max-clients", 0), "max_clients must be a whole number of at least 1"),
         (("--port", 0, "nowhere.at_all:Scenario"), "cannot import nowhere.at_all"),
         (("--port", 0, "tests.testbeds:PendulumScenario"), "has no protocol for its machine"),
-        (("--port", 0, "--cpu", -1), "cpus must be processor numbers"),
+        (("--port", 0, "--cpu", -1), "cpus[0] must be a whole number of at least 0"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: tuple[object, ...], named: str) -> None:

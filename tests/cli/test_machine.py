@@ -70,7 +70,7 @@ def test_machine_dies_on_request(hub: Hub) -> None:
     ("scenario", "options", "code", "message"),
     [
         (ACROBOT, (), 2, "AcrobotScenario has no protocol for its machine"),
-        (ROBOT, ("--perturb", "2"), 2, "perturb of a machine must be a relative change"),
+        (ROBOT, ("--perturb", "2"), 2, "perturb must be a number from 0 to below 1, not 2.0"),
         (ROBOT, ("--lock-step", "--sense-latency", "3"), 2, "a machine has no sense_latency, unlike 0.003 s"),
         (ROBOT, ("--noise", "torque=1"), 2, "noise is added to vector sensor signals"),
         (ROBOT, ("--noise", "position=[1,2]"), 2, "one standard deviation"),

@@ -1,20 +1,69 @@
 """``vtbdrake variables``, ``diagram`` and ``rollout`` show what the library computes."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
 
 from tests.cli.program import ACROBOT, ANGLE, PENDULUM, run
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake import Snapshot
 from vtbdrake.rollout import RolloutRunner, RolloutTask
+from vtbdrake.testbed import ScenarioError, load_scenario
+from vtbdrake_diagrams.satellite import SatelliteScenario
+
+SATELLITE = "vtbdrake_diagrams.satellite:SatelliteScenario"
 
 
 def test_variables_are_those_of_the_testbed() -> None:
     testbed = PendulumScenario().build()
     expected = testbed.variables().table(testbed.default_context(), pattern="theta")
     assert run("variables", PENDULUM, "--match", "theta").stdout == expected + "\n"
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_valid"),
+    [
+        ({}, True),
+        ({"tumble_deg": 30.0, "image_width": 1, "perception": "camera", "scanner": {"rows": 16}}, True),
+        ({"tumble_deg": 30.1}, False),
+        ({"distance": "far"}, False),
+        ({"image_width": 0}, False),
+        ({"perception": "sonar"}, False),
+        ({"wheels": 1}, False),
+        ({"tumble": 1.0}, False),
+        ({"camera_errors": {"dropout": 1.5}}, False),
+        ({"light": {"color": [1.0, 1.0, 2.0]}}, False),
+        ({"scanner": {"divergence": 0.5}}, False),
+    ],
+)
+def test_schema_accepts_the_files_that_load(tmp_path: Path, changes: dict[str, Any], is_valid: bool) -> None:
+    """The schema is judged by the reference implementation of JSON Schema, beside the loader of scenario files."""
+    described = json.loads(run("variables", SATELLITE, "--schema").stdout)
+    Draft202012Validator.check_schema(described)
+    assert Draft202012Validator(described).is_valid(changes) == is_valid
+    file = tmp_path / "scenario.yaml"
+    file.write_text(yaml.safe_dump({SATELLITE: changes}))
+    with nullcontext() if is_valid else pytest.raises(ScenarioError):
+        load_scenario(f"{SATELLITE}@{file}")
+
+
+def test_schema_has_units_and_defaults() -> None:
+    fields = json.loads(run("variables", SATELLITE, "--schema").stdout)["properties"]
+    assert {key: fields["tumble_deg"][key] for key in ("type", "unit", "minimum", "maximum", "default")} == {
+        "type": "number",
+        "unit": "deg/s",
+        "minimum": 0.0,
+        "maximum": 30.0,
+        "default": SatelliteScenario().tumble_deg,
+    }
+    assert fields["scanner"]["properties"]["frequency"]["unit"] == "Hz"
+    assert fields["scanner"]["properties"]["frequency"]["default"] == SatelliteScenario().scanner.frequency
 
 
 def test_variables_as_json() -> None:

@@ -412,18 +412,18 @@ def test_period_of_an_unknown_channel_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"period": 0.0}, "period of a machine must be a positive time in seconds, not 0.0"),
-        ({"perturb": 1.0}, "perturb of a machine must be a relative change from 0 to below 1, not 1.0"),
-        ({"noise": {"position": -1.0}}, "noise of position"),
+        ({"period": 0.0}, "MachineConfig.period must be a finite number above 0 s or None, not 0.0"),
+        ({"perturb": 1.0}, "perturb must be a number from 0 to below 1, not 1.0"),
+        ({"noise": {"position": -1.0}}, r"noise.position. must be a finite number of at least 0, not -1.0"),
         ({"noise": {"torque": 1.0}}, "vector sensor signals \\(position, velocity\\), not to 'torque'"),
-        ({"brake": "soft"}, "brake of a machine must be one of hold, idle, lock, not 'soft'"),
-        ({"act_latency": -1.0}, "act_latency of a machine"),
+        ({"brake": "soft"}, "brake must be one of empty, hold, idle, lock, not 'soft'"),
+        ({"act_latency": -1.0}, "act_latency must be a finite number of at least 0 s, not -1.0"),
         (
             {"max_latency": 0.0},
-            "max_latency of a machine must be a positive time in seconds, or inf to accept any, not 0.0",
+            "max_latency must be a number above 0 s, not 0.0",
         ),
         ({"values": {"sim.sys.Acrobot.elbow.pos": 1.0}}, "did you mean sim.sys.Acrobot.elbow.position"),
-        ({"seed": -1}, "seed of a machine must be a whole number from 0 on, not -1"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, not -1"),
     ],
 )
 def test_config_that_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.cli.options import converted, option, parse_scenario
+from vtbdrake.cli.options import config_option, converted, option, parse_scenario
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
 from vtbdrake.monitoring.live.messages import RESET, SET
 
@@ -22,42 +21,40 @@ _MEBIBYTE = 1024 * 1024
 _SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
 
 
-def _option(usage: str, text: str, **settings: Any) -> Callable[[Any], Any]:
-    """Return the option that sets a field of `HubConfig`."""
-    field = usage.split()[0].removeprefix("--").replace("-", "_")
-    default = getattr(_DEFAULT, field)
-    return option(usage, text, default=default // _MEBIBYTE if field in _SIZES else default, **settings)
-
-
-_POSITIVE = click.IntRange(min=1)
-
-
 @click.command()
 @click.argument("scenario", required=False, callback=converted(parse_scenario))
-@_option("--host ADDRESS", "Address to listen on; beyond loopback, every machine that reaches it can connect.")
-@_option("--port N", "0: any free port.")
-@option(
+@config_option(_DEFAULT, "--host ADDRESS")
+@config_option(_DEFAULT, "--port N")
+@config_option(
+    _DEFAULT,
     "--protect CHANNEL",
     "Let only one client publish on this channel: the first one, until another requests it on "
     "VTB_HUB_TAKE/CHANNEL while the owner pauses. May be repeated.",
     multiple=True,
 )
 @option("--unprotected", "Protect only the channels given by --protect.", is_flag=True)
-@option("--user NAME", "Name or id of a user that may connect, too. May be repeated.", name="users", multiple=True)
-@option("--all-users", "Let every user of this machine connect.", is_flag=True)
-@_option("--lease S", "Seconds after the owner's last message during which no other client can take over.")
-@_option("--max-message MIB", "Largest message.", type=_POSITIVE)
-@_option("--max-queue MIB", "Largest backlog of a client; beyond it, the oldest messages are dropped.", type=_POSITIVE)
-@_option(
-    "--max-memory MIB",
-    "Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
-    type=_POSITIVE,
+@config_option(
+    _DEFAULT,
+    "--user NAME",
+    "Name or id of a user that may connect. May be repeated.",
+    field="users",
+    multiple=True,
 )
-@_option("--max-clients N", "Maximum number of clients at a time.", type=_POSITIVE)
-@_option("--patience S", "Seconds until a client is disconnected that does not read or complete a message.")
-@_option("--priority N", "Priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it; 0: none.")
-@option(
-    "--cpu N", "Processor to run on, if the system grants it. May be repeated.", name="cpus", type=int, multiple=True
+@config_option(_DEFAULT, "--all-users", is_flag=True)
+@config_option(_DEFAULT, "--lease S")
+@config_option(_DEFAULT, "--max-message MIB", per=_MEBIBYTE)
+@config_option(_DEFAULT, "--max-queue MIB", per=_MEBIBYTE)
+@config_option(_DEFAULT, "--max-memory MIB", per=_MEBIBYTE)
+@config_option(_DEFAULT, "--max-clients N")
+@config_option(_DEFAULT, "--patience S")
+@config_option(_DEFAULT, "--priority N")
+@config_option(
+    _DEFAULT,
+    "--cpu N",
+    "Processor to run on, if the system grants it. May be repeated.",
+    field="cpus",
+    type=int,
+    multiple=True,
 )
 def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP, for networks without multicast.

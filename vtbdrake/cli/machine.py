@@ -11,6 +11,7 @@ import click
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
+    config_option,
     option,
     parse_setting,
     scenario_argument,
@@ -42,41 +43,24 @@ def _parse_noise(text: str) -> tuple[str, float]:
 @click.command()
 @scenario_argument
 @url_option
-@option(
-    "--period S",
-    "The period of a cycle, in seconds; each cycle publishes the state once.  [default: that of the deployment]",
-    type=float,
-)
+@config_option(_DEFAULT, "--period S")
 @option("--lock-step", "Begin a cycle with a command on every channel, not by the clock.", is_flag=True)
 @option("--cycles N", "End after N cycles.  [default: endless]", type=click.IntRange(min=0))
 @set_option
-@option(
-    "--perturb R",
-    "Multiply masses, damping, friction and rotor inertias by random factors from 1 - R to 1 + R.",
-    default=_DEFAULT.perturb,
-)
-@option(
+@config_option(_DEFAULT, "--perturb R")
+@config_option(
+    _DEFAULT,
     "--noise SIGNAL=STD",
     "Add normal noise to a sensor signal, in its unit. May be repeated.",
     parse=_parse_noise,
     multiple=True,
 )
-@option("--seed N", "The seed of all random numbers.", type=int, default=_DEFAULT.seed)
+@config_option(_DEFAULT, "--seed N")
 @option("--sense-latency MS", "The latency of sensor messages, in milliseconds; whole cycles.", default=0.0)
 @option("--act-latency MS", "The latency of commands, in milliseconds; whole cycles.", default=0.0)
-@option("--timeout S", "Brake after S seconds without a command.", default=_DEFAULT.timeout)
-@option(
-    "--max-latency S",
-    "Reject commands that took S seconds longer than the quickest one, by their sender's clock; inf rejects none. "
-    "Not in lock-step.",
-    default=_DEFAULT.max_latency,
-)
-@option(
-    "--brake",
-    "Lock the joints (default for a discrete plant), apply the idle commands (default for a continuous one) "
-    "or hold the last commands.",
-    type=click.Choice(BRAKES),
-)
+@config_option(_DEFAULT, "--timeout S")
+@config_option(_DEFAULT, "--max-latency S")
+@config_option(_DEFAULT, "--brake", type=click.Choice(BRAKES), default=None)
 @option(
     "--priority N",
     "The priority of real-time scheduling (SCHED_FIFO), 1 to 99, if the system grants it.",

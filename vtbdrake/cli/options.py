@@ -12,6 +12,8 @@ from urllib.parse import urlsplit
 
 import click
 
+from vtbdrake.settings import declared_settings
+
 if TYPE_CHECKING:
     from vtbdrake.optimization import Choice, Parameter
     from vtbdrake.state import Snapshot
@@ -70,6 +72,30 @@ def grouped(name: str, *options: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return with_group
 
     return decorate
+
+
+def config_option(
+    config: Any, usage: str, text: str = "", *, field: str = "", per: int = 1, **settings: Any
+) -> Callable[[Any], Any]:
+    """Return the option that sets a field of a configuration; default, help, unit and range are those of the field.
+
+    Args:
+        config: The configuration with the default values.
+        usage: As in `option`.
+        text: Replaces the help of the field.
+        field: The field; by default that of the option's name.
+        per: A whole multiple of the field's unit, in which the option counts instead.
+        settings: Further arguments of `option`.
+    """
+    field = field or usage.split()[0].removeprefix("--").replace("-", "_")
+    declared, default = declared_settings(type(config))[field], getattr(config, field)
+    if not text:
+        text = f"{declared.doc[:-1]} ({declared.range})." if declared.range and per == 1 else declared.doc
+    if default is None:
+        settings.setdefault("type", float)
+    elif not settings.get("multiple"):
+        settings.setdefault("default", default if per == 1 else default // per)
+    return option(usage, text, name=field, **settings)
 
 
 def _assignment(text: str, form: str) -> tuple[str, str]:

@@ -27,6 +27,7 @@ from vtbdrake.cli.options import (
 from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
 from vtbdrake.failures import one_line
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
+from vtbdrake.settings import schema
 from vtbdrake.state import Snapshot, Variable, Variables
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.testbed import MODES
@@ -42,8 +43,9 @@ _MANY = 64
 @scenario_argument
 @option("--match TEXT", "Show only addresses that contain TEXT.", default="")
 @option("--json", "Print a JSON list of objects instead of a table.", name="as_json", is_flag=True)
-def variables(scenario: Scenario, match: str, as_json: bool) -> None:
-    """List the variables of a testbed.
+@option("--schema", "Print the JSON Schema of the scenario's fields instead.", name="as_schema", is_flag=True)
+def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool) -> None:
+    """List the variables of a testbed, or the fields of its scenario.
 
     The table shows address, kind, shape, unit, bounds and the value in s0 of every element of the state. Kind x is the
     dynamic part of the state, kind a the static part. A derived variable can be read, but not set.
@@ -52,6 +54,9 @@ def variables(scenario: Scenario, match: str, as_json: bool) -> None:
     Example:
       vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match payload
     """
+    if as_schema:
+        click.echo(json.dumps(schema(type(scenario)), indent=2))
+        return
     testbed = scenario.build()
     listed = testbed.variables()
     chosen = [variable for variable in listed.values() if match in variable.address]

@@ -11,6 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from vtbdrake.settings import check_settings, setting
+
 SENSE, ACT = "sense", "act"
 
 
@@ -27,9 +29,50 @@ class Packet(NamedTuple):
     due: int  # the cycle of the machine in which it arrives
 
 
-Ranges = Mapping[str, tuple[float, float]]
 Effect = Callable[[Packet], Iterable[Packet]]
 """A function from a packet to the packets that arrive instead, in this order."""
+
+
+def _bits(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
+    corrupted = np.frombuffer(data, np.uint8).copy()
+    flipped = random.choice(8 * len(data), size=int(random.integers(1, 9)), replace=False)
+    np.bitwise_xor.at(corrupted, flipped // 8, (1 << (flipped % 8)).astype(np.uint8))
+    return corrupted.tobytes()
+
+
+def _nan(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
+    try:
+        message = message_type.decode(data)
+    except Exception:  # Another fault has corrupted it.
+        return data
+    return bytes(_with_nan(message, "").encode())
+
+
+def _with_nan(value: Any, typename: str) -> Any:
+    """Return a message, a field of the type ``typename``, or a list of these, with NaN for floating-point numbers."""
+    if isinstance(value, list | tuple):
+        return [_with_nan(entry, typename) for entry in value]
+    if hasattr(value, "__typenames__"):
+        for name, kind in zip(value.__slots__, value.__typenames__, strict=True):
+            setattr(value, name, _with_nan(getattr(value, name), kind))
+        return value
+    return math.nan if typename in ("double", "float") else value
+
+
+CORRUPTIONS: dict[str, Callable[[Any, bytes, np.random.Generator], bytes]] = {
+    "bits": _bits,
+    "truncate": lambda _, data, random: data[: int(random.integers(0, len(data)))],
+    "trailing": lambda _, data, random: data + random.bytes(int(random.integers(1, 65))),
+    "random": lambda _, data, random: random.bytes(len(data)),
+    "type": lambda _, data, random: bytes([data[0] ^ 0xFF]) + data[1:],  # No other type has a fingerprint so close.
+    "nan": _nan,
+}
+"""Functions from a message's type, its bytes and a source of random numbers to the corrupted bytes.
+
+``bits``: one to eight bits are flipped; ``truncate``: the end is missing, from the last byte to all; ``trailing``: 1 to
+64 random bytes follow; ``random``: all bytes are random; ``type``: the fingerprint is wrong; ``nan``: every
+floating-point number is NaN.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,25 +81,15 @@ class InjectedFault:
 
     name: ClassVar[str]
     sides: ClassVar[Sequence[str]] = (SENSE, ACT)
-    ranges: ClassVar[Ranges] = {}  # of fields; those of whole numbers are integers
 
-    side: str = SENSE  # ``sense`` for messages that the machine sends, ``act`` for those that it receives
-    channels: Sequence[str] = ()  # the channels that are affected; all of that side if empty
+    side: str = setting(SENSE, "Messages that the machine sends, or those that it receives.", choices=(SENSE, ACT))
+    channels: Sequence[str] = setting((), "The channels that are affected; all of that side if empty.")
 
     def __post_init__(self) -> None:
+        check_settings(self, name=self.name, error=InjectedFaultError)
         if self.side not in self.sides:
-            self._refuse("side", " or ".join(self.sides))
-        if isinstance(self.channels, str):
-            self._refuse("channels", f"a list, such as [{self.channels!r}]")
+            raise InjectedFaultError(f"{self.name}.side must be {' or '.join(self.sides)}, not {self.side!r}")
         object.__setattr__(self, "channels", tuple(self.channels))
-        for name, (lower, upper) in self.ranges.items():
-            value, whole = getattr(self, name), isinstance(upper, int)
-            valid = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-            if not (valid and lower <= value <= upper):
-                self._refuse(name, f"a {'whole ' if whole else ''}number from {lower:g} to {upper:g}")
-
-    def _refuse(self, name: str, expected: str) -> None:
-        raise InjectedFaultError(f"{name} of the fault {self.name} must be {expected}, not {getattr(self, name)!r}")
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
         """Return the effect on the packets of the channels, from now on.
@@ -82,8 +115,7 @@ class ClockJump(InjectedFault):
 
     name = "clock_jump"
     sides = (SENSE,)
-    ranges: ClassVar[Ranges] = {"seconds": (-1e9, 1e9)}
-    seconds: float
+    seconds: float = setting(doc="The error of the time.", unit="s", ge=-1e9, le=1e9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,14 +142,8 @@ class Corrupt(InjectedFault):
     """Messages arrive corrupted."""
 
     name = "corrupt"
-    ranges: ClassVar[Ranges] = {"fraction": (0.0, 1.0)}
-    kind: str = "bits"  # a key of `CORRUPTIONS`
-    fraction: float = 1.0  # the probability for each message
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.kind not in CORRUPTIONS:
-            self._refuse("kind", f"one of {', '.join(CORRUPTIONS)}")
+    kind: str = setting("bits", "What happens to the bytes, see `CORRUPTIONS`.", choices=tuple(CORRUPTIONS))
+    fraction: float = setting(1.0, "The probability for each message.", ge=0.0, le=1.0)
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
         corrupt = CORRUPTIONS[self.kind]
@@ -135,8 +161,7 @@ class Duplicate(InjectedFault):
     """Every message arrives again, ``copies`` times."""
 
     name = "duplicate"
-    ranges: ClassVar[Ranges] = {"copies": (1, 1000)}
-    copies: int = 1
+    copies: int = setting(1, "How often a message arrives again.", ge=1, le=1000)
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
         return lambda packet: (packet,) * (1 + self.copies)
@@ -147,8 +172,7 @@ class Drop(InjectedFault):
     """Messages are lost, each with the probability ``fraction``."""
 
     name = "drop"
-    ranges: ClassVar[Ranges] = {"fraction": (0.0, 1.0)}
-    fraction: float = 1.0
+    fraction: float = setting(1.0, "The probability for each message.", ge=0.0, le=1.0)
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
         return lambda packet: () if random.random() < self.fraction else (packet,)
@@ -159,8 +183,7 @@ class Delay(InjectedFault):
     """Messages arrive ``seconds`` later, in whole cycles of the machine, rounded up."""
 
     name = "delay"
-    ranges: ClassVar[Ranges] = {"seconds": (0.0, 1e6)}
-    seconds: float
+    seconds: float = setting(doc="The delay.", unit="s", ge=0.0, le=1e6)
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
         cycles = whole_cycles(self.seconds, period)
@@ -269,48 +292,3 @@ class DelayLine:
         while self._waiting and self._waiting[0][0] <= cycle:
             arrived.append(heapq.heappop(self._waiting)[2])
         return arrived
-
-
-# -- corrupted messages
-
-
-def _bits(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
-    corrupted = np.frombuffer(data, np.uint8).copy()
-    flipped = random.choice(8 * len(data), size=int(random.integers(1, 9)), replace=False)
-    np.bitwise_xor.at(corrupted, flipped // 8, (1 << (flipped % 8)).astype(np.uint8))
-    return corrupted.tobytes()
-
-
-def _nan(message_type: Any, data: bytes, random: np.random.Generator) -> bytes:
-    try:
-        message = message_type.decode(data)
-    except Exception:  # Another fault has corrupted it.
-        return data
-    return bytes(_with_nan(message, "").encode())
-
-
-def _with_nan(value: Any, typename: str) -> Any:
-    """Return a message, a field of the type ``typename``, or a list of these, with NaN for floating-point numbers."""
-    if isinstance(value, list | tuple):
-        return [_with_nan(entry, typename) for entry in value]
-    if hasattr(value, "__typenames__"):
-        for name, kind in zip(value.__slots__, value.__typenames__, strict=True):
-            setattr(value, name, _with_nan(getattr(value, name), kind))
-        return value
-    return math.nan if typename in ("double", "float") else value
-
-
-CORRUPTIONS: dict[str, Callable[[Any, bytes, np.random.Generator], bytes]] = {
-    "bits": _bits,
-    "truncate": lambda _, data, random: data[: int(random.integers(0, len(data)))],
-    "trailing": lambda _, data, random: data + random.bytes(int(random.integers(1, 65))),
-    "random": lambda _, data, random: random.bytes(len(data)),
-    "type": lambda _, data, random: bytes([data[0] ^ 0xFF]) + data[1:],  # No other type has a fingerprint so close.
-    "nan": _nan,
-}
-"""Functions from a message's type, its bytes and a source of random numbers to the corrupted bytes.
-
-``bits``: one to eight bits are flipped; ``truncate``: the end is missing, from the last byte to all; ``trailing``: 1 to
-64 random bytes follow; ``random``: all bytes are random; ``type``: the fingerprint is wrong; ``nan``: every
-floating-point number is NaN.
-"""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 from typing import Any
 
@@ -25,6 +25,7 @@ from vtbdrake.machine.injected_faults import (
     Packet,
     whole_cycles,
 )
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state.variables import A
 from vtbdrake.testbed import Scenario, WorldAlone
 
@@ -46,34 +47,52 @@ class MachineConfig:
         ValueError: A value is out of its range.
     """
 
-    period: float | None = None  # s, of a cycle; None: that of the scenario's deployment
-    values: Mapping[str, Any] = field(default_factory=dict)  # variables of the world to set, by address
-    perturb: float = 0.0  # largest relative change, see `perturbed_values`; `values` are set afterwards
-    noise: Mapping[str, float] = field(default_factory=dict)  # vector sensor signal -> standard deviation, in its unit
-    seed: int = 0  # of perturbation, noise and faults
-    sense_latency: float = 0.0  # s, of messages to the controller, rounded up to whole cycles
-    act_latency: float = 0.0  # s, of messages from the controller, rounded up to whole cycles
-    timeout: float = 0.1  # s without an actuator command after which the machine brakes
-    max_latency: float = 0.1  # s, of an actuator command beyond that of the quickest one, by the clock of its sender
-    brake: str = ""  # hold, idle or lock (see `HoldingBrake`); empty: lock if the plant is discrete, else idle
-    control_channel: str = "VTB_MACHINE"  # the LCM channel of requests
-    status_channel: str = "VTB_MACHINE_STATUS"  # the LCM channel of the status
-    status_period: float = 0.1  # s
+    period: float | None = setting(
+        None,
+        "The period of a cycle, which publishes the state once; by default that of the deployment.",
+        unit="s",
+        gt=0.0,
+    )
+    values: Mapping[str, Any] = setting(
+        default_factory=dict, doc="Variables of the world to set, by address, after the perturbation."
+    )
+    perturb: float = setting(
+        0.0,
+        "Multiply masses, damping, friction and rotor inertias by random factors from 1 - R to 1 + R.",
+        ge=0.0,
+        lt=1.0,
+    )
+    noise: Mapping[str, float] = setting(
+        default_factory=dict, doc="Vector sensor signal -> standard deviation of its normal noise, in its unit.", ge=0.0
+    )
+    seed: int = setting(0, "The seed of perturbation, noise and faults.", ge=0)
+    sense_latency: float = setting(
+        0.0, "The latency of messages to the controller, rounded up to whole cycles.", unit="s", ge=0.0
+    )
+    act_latency: float = setting(
+        0.0, "The latency of messages from the controller, rounded up to whole cycles.", unit="s", ge=0.0
+    )
+    timeout: float = setting(0.1, "Time without an actuator command after which the machine brakes.", unit="s", gt=0.0)
+    max_latency: float = setting(
+        0.1,
+        "Reject commands that took so much longer than the quickest one, by their sender's clock; inf rejects none. "
+        "Not in lock-step.",
+        unit="s",
+        gt=0.0,
+        finite=False,
+    )
+    brake: str = setting(
+        "",
+        "Lock the joints (default for a discrete plant), apply the idle commands (default for a continuous one) or "
+        "hold the last commands.",
+        choices=("", *BRAKES),
+    )
+    control_channel: str = setting("VTB_MACHINE", "The LCM channel of requests.")
+    status_channel: str = setting("VTB_MACHINE_STATUS", "The LCM channel of the status.")
+    status_period: float = setting(0.1, "The time between messages of the status.", unit="s", gt=0.0)
 
     def __post_init__(self) -> None:
-        positive, finite = "must be a positive time in seconds", "must be a time of at least 0 s"
-        self._check(self.period is None or 0.0 < self.period < inf, "period", positive)
-        for name in ("timeout", "status_period"):
-            self._check(0.0 < getattr(self, name) < inf, name, positive)
-        self._check(self.max_latency > 0.0, "max_latency", f"{positive}, or inf to accept any")
-        for name in ("sense_latency", "act_latency"):
-            self._check(0.0 <= getattr(self, name) < inf, name, finite)
-        self._check(0.0 <= self.perturb < 1.0, "perturb", "must be a relative change from 0 to below 1")
-        self._check(self.seed >= 0, "seed", "must be a whole number from 0 on")
-        self._check(self.brake in ("", *BRAKES), "brake", f"must be one of {', '.join(BRAKES)}")
-        for name, deviation in self.noise.items():
-            if not 0.0 <= deviation < inf:
-                raise ValueError(f"the noise of {name} must be a standard deviation from 0 on, not {deviation!r}")
+        check_settings(self)
 
     def check_lock_step(self) -> None:
         """Check that a machine with this configuration can run in lock-step.
@@ -87,10 +106,6 @@ class MachineConfig:
                 "state that the command it waits for answers; give the latency to the sensors of the scenario "
                 "(ErrorModel(latency=...)), or let the clock begin the cycles"
             )
-
-    def _check(self, valid: bool, name: str, expected: str) -> None:
-        if not valid:
-            raise ValueError(f"{name} of a machine {expected}, not {getattr(self, name)!r}")
 
 
 @dataclass

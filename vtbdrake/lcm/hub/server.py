@@ -11,12 +11,12 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf
 
 from vtbdrake.lcm.hub import tcpq
 from vtbdrake.lcm.hub.clients import SLICE, ClientConnection
 from vtbdrake.lcm.hub.routing import HubStatistics, Router
 from vtbdrake.lcm.hub.tcpq import KEEP_PREFIX, LOOPBACK, MAX_CHANNEL, STATUS_CHANNEL, TAKE_PREFIX, TcpqError
+from vtbdrake.settings import check_settings, setting
 
 MEBIBYTE = 1024 * 1024
 
@@ -69,53 +69,59 @@ class HubConfig:
         ValueError: A value is out of range.
     """
 
-    host: str = "127.0.0.1"  # IPv4 address or name to listen on
-    port: int = 7700  # LCM's default; 0: any free port
-    protect: Sequence[str] = ()  # channels with one publisher at a time (names, no patterns)
-    lease: float = 0.5  # s after the owner's last publication during which no other client can take over
-    max_message: int = 16 * MEBIBYTE  # largest data of a message, in bytes
-    max_queue: int = 32 * MEBIBYTE  # largest backlog of a client, in bytes
-    max_memory: int = 512 * MEBIBYTE  # largest sum of all backlogs and incomplete messages, in bytes
-    max_clients: int = 128  # of another user at most a quarter, of all others three quarters
-    users: Sequence[str | int] = ()  # names or ids of users that may connect besides the hub's own and root
-    all_users: bool = False  # whether every user of this machine may connect
-    # s after which a client is disconnected that does not greet, does not read its backlog, or does not complete a
-    # message (for which it has another second for each MiB of it)
-    patience: float = 5.0
-    status_period: float = 1.0  # s between messages on the status channel
-    priority: int = 0  # of SCHED_FIFO, 1 to 99, if the system grants it; 0: ordinary scheduling
-    cpus: Sequence[int] = ()  # processors to run on, if the system grants them; empty: any
+    host: str = setting(
+        "127.0.0.1", "IPv4 address or name to listen on; beyond loopback, every machine that reaches it can connect."
+    )
+    port: int = setting(7700, "TCP port, by default LCM's; 0: any free port.", ge=0, le=65535)
+    protect: Sequence[str] = setting((), "Channels with one publisher at a time (names, no patterns).")
+    lease: float = setting(
+        0.5, "Time after the owner's last message during which no other client can take over.", unit="s", gt=0.0
+    )
+    max_message: int = setting(16 * MEBIBYTE, "Largest message.", unit="bytes", ge=1, le=256 * MEBIBYTE)  # as LCM's
+    max_queue: int = setting(
+        32 * MEBIBYTE, "Largest backlog of a client; beyond it, the oldest messages are dropped.", unit="bytes", ge=1
+    )
+    max_memory: int = setting(
+        512 * MEBIBYTE,
+        "Largest sum of all backlogs and incomplete messages; beyond it, the client with the most is disconnected.",
+        unit="bytes",
+        ge=1,
+    )
+    # Of another user at most a quarter, of all others three quarters.
+    max_clients: int = setting(128, "Maximum number of clients at a time.", ge=1)
+    users: Sequence[str | int] = setting((), "Names or ids of users that may connect besides the hub's own and root.")
+    all_users: bool = setting(False, "Let every user of this machine connect.")
+    # For a message, a client has another second for each MiB of it.
+    patience: float = setting(
+        5.0,
+        "Time until a client is disconnected that does not greet, read its backlog, or complete a message.",
+        unit="s",
+        gt=0.0,
+    )
+    status_period: float = setting(1.0, "Time between messages on the status channel.", unit="s", gt=0.0)
+    priority: int = setting(
+        0, "Priority of real-time scheduling (SCHED_FIFO), if the system grants it; 0: none.", ge=0, le=99
+    )
+    cpus: Sequence[int] = setting((), "Processors to run on, if the system grants them; empty: any.", ge=0)
 
     def __post_init__(self) -> None:
-        for name in ("protect", "users", "cpus"):
-            value = getattr(self, name)
-            if isinstance(value, str):
-                raise ValueError(f"{name} must be a sequence, such as [{value!r}], not a string")
-            object.__setattr__(self, name, tuple(map(_user_id, value)) if name == "users" else tuple(value))
+        check_settings(self)
+        for name in ("protect", "cpus"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "users", tuple(map(_user_id, self.users)))
         longest = MAX_CHANNEL - max(len(TAKE_PREFIX), len(KEEP_PREFIX))
         for channel in self.protect:
             if channel == STATUS_CHANNEL or channel.startswith((TAKE_PREFIX, KEEP_PREFIX)):
                 raise ValueError(f"cannot protect {channel!r}, one of the hub's own channels")
             if not 0 < len(channel.encode()) <= longest:
                 raise ValueError(f"the name of a protected channel must have 1 to {longest} bytes, not {channel!r}")
-        if any(not isinstance(cpu, int) or cpu < 0 for cpu in self.cpus):
-            raise ValueError(f"cpus must be processor numbers 0, 1, ..., not {self.cpus!r}")
-        ranges: dict[str, tuple[float, float]] = {
-            "port": (0, 65535),
-            "max_message": (1, 256 * MEBIBYTE),  # LCM_MAX_MESSAGE_SIZE
-            "max_queue": (self.max_message + 12 + MAX_CHANNEL, inf),
-            "max_memory": (self.max_queue, inf),
-            "max_clients": (1, inf),
-            "priority": (0, 99),
-        }
-        for name, (lower, upper) in ranges.items():
-            value = getattr(self, name)
-            if not lower <= value <= upper:
-                raise ValueError(f"{name} must be between {lower:g} and {upper:g}, not {value!r}")
-        for name in ("lease", "patience", "status_period"):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ValueError(f"{name} must be a positive time in seconds, not {value!r}")
+        least = self.max_message + 12 + MAX_CHANNEL
+        if self.max_queue < least:
+            raise ValueError(f"HubConfig.max_queue must be at least {least} bytes, one message, not {self.max_queue!r}")
+        if self.max_memory < self.max_queue:
+            raise ValueError(
+                f"HubConfig.max_memory must be at least max_queue, {self.max_queue} bytes, not {self.max_memory!r}"
+            )
 
 
 def _user_id(user: str | int) -> int:
