@@ -5,9 +5,9 @@ What a reader cannot use without a kernel is left out: recordings in 3D (they ar
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import click
 import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
@@ -49,9 +49,11 @@ def strip(notebook: NotebookNode) -> None:
         cell.outputs = outputs
 
 
-def main() -> None:
-    """Run the notebooks that are named, or all, and store them."""
-    for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
+@click.command()
+@click.argument("names", nargs=-1)
+def main(names: tuple[str, ...]) -> None:
+    """Run the notebooks NAMES, or all, and store them."""
+    for name in names or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
         path = FOLDER / f"{name}.ipynb"
         notebook = run(nbformat.read(path, as_version=4))
         strip(notebook)

@@ -11,6 +11,7 @@ from contextlib import closing, suppress
 from dataclasses import replace
 from typing import Any
 
+import click
 import numpy as np
 
 from vtbdrake.child_process import ChildProcess
@@ -270,6 +271,7 @@ def _torque(values: np.ndarray) -> str:
     return "[" + " ".join(f"{value:.1f}" for value in values) + "] N m"
 
 
+@click.command()
 def main() -> None:
     """Run the demo with each control law on a machine in another process."""
     logging.disable(logging.ERROR)  # The demo prints what the guards would log.

@@ -6,12 +6,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import click
+
 from vtbdrake.visualization import make_meshcat, show_motions
 from vtbdrake_diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
 
 OUT = Path("out")
 
 
+@click.command()
 def main() -> None:
     """Print the answer, and write the plot and the recording."""
     begin = time.perf_counter()

@@ -18,13 +18,13 @@ The criteria, fixed before any of the forests from `SEED` on was driven:
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from typing import TypeVar
 
+import click
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
@@ -526,31 +526,41 @@ def scores(found: Sequence[Mapping[str, Track]]) -> dict[str, Score]:
     return {name: score([tracks[name] for tracks in found], deviation=MAPS[name].position) for name in GOALS}
 
 
-def main() -> None:
+def _source_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each source; without one, it is a scanner."""
+    for name, description in reversed(SOURCES.items()):
+        command = click.option(
+            f"--{name}",
+            "source",
+            flag_value=name,
+            default=name == "scanner",
+            show_default=False,
+            help=f"{description}.",
+        )(command)
+    return command
+
+
+@click.command(context_settings={"show_default": True})
+@click.option("--forests", default=20, help="Number of forests.")
+@click.option("--seed", default=SEED, help="Seed of the first forest.")
+@click.option("--bias", default=0.0, help="Bias of the scanner's ranges, in m.")
+@click.option("--full", is_flag=True, help="500 m in each forest instead of 50 m.")
+@_source_options
+@click.option("--workers", default=2, help="Number of processes.")
+def main(forests: int, seed: int, bias: float, full: bool, source: str, workers: int) -> None:
     """Run the drives, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--forests", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--bias", type=float, default=0.0, help="of the scanner's ranges, in m")
-    parser.add_argument("--full", action="store_true", help="500 m in each forest instead of 50 m")
-    parser.set_defaults(source="scanner")
-    source = parser.add_mutually_exclusive_group()
-    for name, description in SOURCES.items():
-        source.add_argument(f"--{name}", dest="source", action="store_const", const=name, help=description)
-    parser.add_argument("--workers", type=int, default=2)
-    chosen = parser.parse_args()
-    if chosen.source == "stereo" and chosen.bias:
-        parser.error("--bias is one of the scanner's ranges: leave it out with --stereo")
-    drives = Drives(500.0 if chosen.full else 50.0, chosen.bias, chosen.source)
-    found, seeds = [], range(chosen.seed, chosen.seed + chosen.forests)
-    for tracks in drives.through(seeds, workers=chosen.workers):
+    if source == "stereo" and bias:
+        raise click.UsageError("--bias is one of the scanner's ranges: leave it out with --stereo")
+    drives = Drives(500.0 if full else 50.0, bias, source)
+    found, seeds = [], range(seed, seed + forests)
+    for tracks in drives.through(seeds, workers=workers):
         found.append(tracks)
         errors = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
         print(f"drive {len(found)}: {errors}", flush=True)
     results = scores(found)
     print(table(HEADER, [row(name, one) for name, one in results.items()]))
     path = next(iter(results.values())).path
-    print(f"{len(found)} drives, {path:.0f} m of path, range bias {chosen.bias:g} m")
+    print(f"{len(found)} drives, {path:.0f} m of path, range bias {bias:g} m")
     driven = {seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}
     tilts = 1e3 * np.concatenate([drive.tilts for drive in driven.values()])
     if len(tilts):

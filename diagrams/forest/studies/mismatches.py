@@ -19,11 +19,11 @@ Stands are natural (Poisson with a least distance), clustered, windthrown, or pl
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,17 +168,16 @@ def row(kind: str, found: list[Pair]) -> tuple[str, ...]:
 HEADER = ("kind", "pairs", "wrong and sure", "largest ln L", "nearest to what is required, without a rival")
 
 
-def main() -> None:
+@click.command(context_settings={"show_default": True})
+@click.option("--pairs", "count", default=10_000, help="Number of pairs.")
+@click.option("--seed", default=SEED, help="Seed of the pairs.")
+def main(count: int, seed: int) -> None:
     """Match pairs, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--pairs", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=SEED)
-    chosen = parser.parse_args()
     has_recordings = (FOLDER / "fortls_rioja").is_dir()
     if not has_recordings:
         print(f"no recordings in {FOLDER}: simulated stands only")
     results: dict[str, list[Pair]] = {}
-    for pair in pairs(chosen.pairs, seed=chosen.seed, recordings=has_recordings):
+    for pair in pairs(count, seed=seed, recordings=has_recordings):
         results.setdefault(pair.kind, []).append(pair)
     print(table(HEADER, [row(kind, found) for kind, found in results.items()]))
     every = [pair for found in results.values() for pair in found]

@@ -24,9 +24,9 @@ true errors of all routes, and in the end the gains of the choices. The criteria
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, field, fields, replace
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -245,14 +245,13 @@ def _mean(values: Array) -> str:
     return f"{values.mean():.3f} m, with a standard error of {spread:.3f} m"
 
 
-def main() -> None:
+@click.command(context_settings={"show_default": True})
+@click.option("--forests", default=12, help="Number of forests.")
+@click.option("--seed", "first", default=SEED, help="Seed of the first forest.")
+def main(forests: int, first: int) -> None:
     """Decide in some forests, and print the expected and the true errors."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--forests", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=SEED)
-    chosen = parser.parse_args()
     answers = {}
-    for seed in range(chosen.seed, chosen.seed + chosen.forests):
+    for seed in range(first, first + forests):
         found = decide_and_drive(seed)
         if found is None:
             print(f"forest {seed}: the carrier is not localized after {FOUND:g} s\n", flush=True)

@@ -9,11 +9,10 @@ of other seeds.
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -123,14 +122,13 @@ def report(trials: StereoTrials) -> str:
     return f"{table(head, rows)}\nprocessor time per pair of images: {1e3 * trials.seconds:.1f} ms"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--forests", type=int, default=4)
-    parser.add_argument("--views", type=int, default=12, help="pairs of images of each forest")
-    parser.add_argument("--seed", type=int, default=SEED)
-    chosen = parser.parse_args(arguments)
-    print(report(run(forests=chosen.forests, views=chosen.views, seed=chosen.seed)))
+@click.command(context_settings={"show_default": True})
+@click.option("--forests", default=4, help="Number of forests.")
+@click.option("--views", default=12, help="Pairs of images of each forest.")
+@click.option("--seed", default=SEED, help="Seed of the first forest.")
+def main(forests: int, views: int, seed: int) -> None:
+    """Detect trunks in simulated images, and print the errors by distance."""
+    print(report(run(forests=forests, views=views, seed=seed)))
 
 
 if __name__ == "__main__":

@@ -18,11 +18,11 @@ The criteria, fixed before any result was seen:
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -222,14 +222,13 @@ def verdicts(results: Sequence[tuple[Case, Sequence[Trial]]]) -> list[tuple[str,
     return found
 
 
-def main() -> None:
+@click.command(context_settings={"show_default": True})
+@click.option("--trials", "count", default=40, help="Number of trials per case, of which there are 35.")
+@click.option("--seed", default=SEED, help="Seed of the trials.")
+def main(count: int, seed: int) -> None:
     """Run the trials, and print their table and whether the goals are met."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--trials", type=int, default=40, help="per case, of which there are 35")
-    parser.add_argument("--seed", type=int, default=SEED)
-    chosen = parser.parse_args()
     results, rows = [], []
-    for case, found in trials(cases(), count=chosen.trials, seed=chosen.seed):
+    for case, found in trials(cases(), count=count, seed=seed):
         results.append((case, found))
         rows.append(row(case, found))
         print("  ".join(rows[-1]), flush=True)

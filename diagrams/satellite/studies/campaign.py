@@ -14,7 +14,6 @@ The criteria of success, fixed before any result was seen:
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from functools import lru_cache
 from typing import Any
 
 import casadi
+import click
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
@@ -175,21 +175,20 @@ def _gripper() -> Kernel:
     return Kernel("gripper", [q], pose, compile=False)
 
 
-def main() -> None:
+@click.command(context_settings={"show_default": True})
+@click.option("--captures", "count", default=40, help="Number of captures.")
+@click.option("--perception", default="camera+scanner", help="What the tracker follows.")
+@click.option("--wheels", is_flag=True, help="Hold the base's attitude by wheels.")
+@click.option("--workers", default=2, help="Number of processes.")
+@click.option("--seed", default=1000, help="Seed of the first capture.")
+def main(count: int, perception: str, wheels: bool, workers: int, seed: int) -> None:
     """Run the campaign, and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--captures", type=int, default=40)
-    parser.add_argument("--perception", default="camera+scanner")
-    parser.add_argument("--wheels", action="store_true", help="hold the base's attitude by wheels")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=1000)
-    chosen = parser.parse_args()
-    scenario = SatelliteScenario(perception=chosen.perception, wheels=chosen.wheels)
+    scenario = SatelliteScenario(perception=perception, wheels=wheels)
     found: dict[int, Capture] = {}
-    with ProcessExecutor(chosen.workers) as executor:
-        for index, capture in captures(scenario, executor, count=chosen.captures, seed=chosen.seed):
+    with ProcessExecutor(workers) as executor:
+        for index, capture in captures(scenario, executor, count=count, seed=seed):
             found[index] = capture
-            print(f"{len(found)} of {chosen.captures}: {capture.failure or 'captured'}", flush=True)
+            print(f"{len(found)} of {count}: {capture.failure or 'captured'}", flush=True)
     print(report([found[index] for index in sorted(found)]))
 
 
