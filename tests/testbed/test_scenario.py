@@ -2,6 +2,8 @@
 
 import os
 import pickle
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from vtbdrake.state import AddressError, Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, ScenarioError, load_scenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
+ROOT = Path(__file__).resolve().parents[2]
 NAME = "tests.testbeds:AcrobotScenario"
 # Ten lines that stand for ten thousand million entries.
 LAUGHS = "  x0: &x0 1\n" + "".join(f"  x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 10)}]\n" for i in range(1, 11))
@@ -279,6 +282,17 @@ def test_a_scenario_with_drake_configs_pickles():
     copied = pickle.loads(pickle.dumps(scenario))
     assert copied == scenario
     assert copied.plant_config.contact_model == "point"
+
+
+def test_a_scenario_is_sent_to_a_process_pool_before_anything_else_was():
+    program = (
+        "from concurrent.futures import ProcessPoolExecutor as Pool; from multiprocessing import get_context\n"
+        "from vtbdrake_diagrams.space_climber import SpaceClimberScenario as Scenario\n"
+        "pool = Pool(1, mp_context=get_context('spawn'))\n"
+        "print(pool.submit(Scenario.record, Scenario(gravity=3.71)).result() == Scenario(gravity=3.71).record())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.stdout == "True\n", done.stderr
 
 
 def test_scenarios_that_differ_inside_a_config_are_unequal():

@@ -82,10 +82,13 @@ class Scenario(ABC):
         """Show the class and the fields that differ from their defaults."""
         return _changed_fields(self)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Already here, since multiprocessing copies the table of copyreg before it pickles anything.
+        _make_picklable(value)
+        super().__setattr__(name, value)
+
     def __reduce_ex__(self, protocol: Any) -> Any:
-        # Drake's configs do not pickle by themselves.
-        for kind in set(_drake_types(self.__dict__)):
-            copyreg.pickle(kind, _reduce_config)
+        _make_picklable(self.__dict__)  # A list may have got another config since.
         return super().__reduce_ex__(protocol)
 
     @abstractmethod
@@ -328,6 +331,12 @@ def _drake_types(value: Any) -> Iterator[type]:
     if isinstance(value, list | tuple):
         for item in value:
             yield from _drake_types(item)
+
+
+def _make_picklable(value: Any) -> None:
+    """Register the types of all of Drake's configs inside with copyreg: they do not pickle by themselves."""
+    for kind in set(_drake_types(value)):
+        copyreg.pickle(kind, _reduce_config)
 
 
 def _reduce_config(config: Any) -> tuple[Any, ...]:

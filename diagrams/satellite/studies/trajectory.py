@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
 import click
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.components.compiled_plant import rotation_angle
 from vtbdrake.optimization import Problem
+from vtbdrake.rollout.executor import cores
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Servicer
@@ -44,7 +47,7 @@ Array = NDArray[np.float64]
 # How far starts are from the stowed pose, and goals from the middle of the workspace, at most; in rad.
 _START_SPREAD, _GOAL_SPREAD = 0.2, 0.6
 # Fixed before the pairs were drawn: the factor that answers the question; how many pairs are asked, and their seed.
-_FACTOR, _PAIRS, _PAIRS_FULL, _SEED = 10.0, 20, 100, 2027
+_FACTOR, _PAIRS, _PAIRS_FULL, _SEED = 10.0, 100, 400, 2027
 # Starts of the solver for a pair.
 _STARTS = 2
 # What the servos add to the rates of the plan, and to its largest deviation; shares.
@@ -310,15 +313,17 @@ class Survey:
 def survey(scenarios: Sequence[ArmMotionScenario], *, echo: Callable[[str], None] = lambda line: None) -> Survey:
     """Return what the best plans by the momentum model make of some motions, in the full testbed.
 
+    The motions are planned and simulated in processes, one per core.
+
     Args:
         scenarios: The motions.
-        echo: Gets a line for each motion.
+        echo: Gets a line for each motion, in their order.
     """
     comparisons = []
-    for scenario in scenarios:
-        comparison = compare(scenario)
-        comparisons.append(comparison)
-        echo(str(comparison))
+    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
+        for comparison in pool.map(compare, scenarios):
+            comparisons.append(comparison)
+            echo(str(comparison))
     return Survey(tuple(comparisons))
 
 
@@ -368,7 +373,10 @@ def plot(courses: dict[str, Course]) -> Figure:
 def main(figure: str, pairs: int | None, seed: int) -> None:
     """Simulate the straight path and the decision on board, and write the plot FIGURE."""
     if pairs:
-        click.echo(str(survey(random_scenarios(pairs, seed=seed), echo=click.echo)))
+        everything = survey(random_scenarios(pairs, seed=seed), echo=click.echo)
+        click.echo(str(everything))
+        for index, kind in enumerate(("From near the stowed pose to the workspace", "From any pose to any")):
+            click.echo(f"{kind}: {Survey(everything.comparisons[index::2])}")
         return
     comparison = compare(ArmMotionScenario(onboard=True))
     plot({"straight path": comparison.straight, "decided on board": comparison.best}).savefig(figure, dpi=120)
