@@ -42,7 +42,7 @@ def localization_update_p50(scans: int = 40, pairs: int = 20, starts: int = 10) 
 
 def _update(name: str, scenario: ForestScenario, count: int, *, goal: float | None, size: str = "") -> Benchmark:
     """CPU time of the localizer's function at the beginning of a drive."""
-    period = 1.0 / (scenario.stereo.rate if scenario.perception == "stereo" else scenario.scanner.frequency)
+    period = 1.0 / (scenario.stereo.fps if scenario.perception == "stereo" else scenario.scanner.frequency)
     testbed = scenario.build()
     (part,) = slow_parts(testbed.diagram).values()
     context = testbed.default_context()

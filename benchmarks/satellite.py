@@ -44,7 +44,7 @@ def _real_time_factor(
         begin = time.process_time()
         simulator.AdvanceTo(duration)
         factors.append(duration / (time.process_time() - begin))
-    size = f"{scenario.image_width} x {scenario.image_height} pixels, {scenario.camera_rate:g} images/s, "
+    size = f"{scenario.image_width} x {scenario.image_height} pixels, {scenario.camera_fps:g} images/s, "
     return Benchmark(
         name=name,
         value=float(np.median(factors)),

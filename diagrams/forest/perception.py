@@ -61,7 +61,7 @@ class ScanLandmarks:
 
     Attributes:
         detect: The detector, such as `detect_trunks`.
-        settings: The second argument of ``detect``, such as a `TrunkDetector`.
+        settings: The second argument of ``detect``, such as a `TrunkDetectorConfig`.
         X_BL: Pose of the scanner in the DPS.
     """
 

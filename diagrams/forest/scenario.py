@@ -16,10 +16,10 @@ from pydrake.systems.framework import Diagram
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import HISTORY_LENGTH, DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
-from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
-from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector
+from vtbdrake.components.localization.rocks import RockDetectorConfig, detect_rocks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig
 from vtbdrake.components.localization.tracking import Tracker
-from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
+from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
 from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
@@ -410,7 +410,7 @@ class ForestScenario(CarrierScenario):
 
     @property
     def perception_period(self) -> float:
-        return super().perception_period if self.perception == "scanner" else 1.0 / self.stereo.rate
+        return super().perception_period if self.perception == "scanner" else 1.0 / self.stereo.fps
 
     def perception_signals(self) -> list[Signal]:
         if self.perception == "scanner":
@@ -422,15 +422,15 @@ class ForestScenario(CarrierScenario):
 
     def detector(self) -> Callable[..., Landmarks]:
         if self.perception == "scanner":
-            return ScanLandmarks(detect_trunks, TrunkDetector(**self.scanner_accuracy()), self.X_BL)
+            return ScanLandmarks(detect_trunks, TrunkDetectorConfig(**self.scanner_accuracy()), self.X_BL)
         X_BC = self.X_BL @ self.stereo.poses()[IMAGES[0]]
-        return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetector(), X_BC)
+        return StereoLandmarks(self.stereo.camera(), self.stereo.matcher(), StereoTrunkDetectorConfig(), X_BC)
 
     def unit(self, world_map: WorldModel) -> LocalizationUnit:
         unit = super().unit(world_map)
         if self.perception == "scanner":
             return unit
-        tracker = replace(unit.tracker, field_of_view=self.stereo.camera().field_of_view)
+        tracker = replace(unit.tracker, field_of_view=self.stereo.camera().fov_x)
         return replace(unit, tracker=tracker, begins_with_submap=True)
 
     def deployment(self) -> Deployment:
@@ -483,7 +483,7 @@ class PlainScenario(CarrierScenario):
         return self.rock_field().map(errors, seed=self.map_seed)
 
     def detector(self) -> ScanLandmarks:
-        return ScanLandmarks(detect_rocks, RockDetector(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
+        return ScanLandmarks(detect_rocks, RockDetectorConfig(**self.scanner_accuracy(), least_height=0.1), self.X_BL)
 
     def add_landscape(self, plant: MultibodyPlant) -> None:
         from vtbdrake_diagrams.plain.geometry import add_plain

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.localization.dead_reckoning import body_rotation, carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
 from vtbdrake.settings import check_settings, setting
 
@@ -34,11 +34,11 @@ _R_LC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 class StereoConfig:
     """Two cameras side by side, which look along x of the frame L, and the matching of their images."""
 
-    rate: float = setting(2.0, "Pairs of images per second.", unit="Hz", gt=0.0)
+    fps: float = setting(2.0, "Pairs of images per second.", unit="Hz", gt=0.0)
     # The size of an image.
     width: int = setting(320, unit="pixels", ge=1)
     height: int = setting(240, unit="pixels", ge=1)
-    field_of_view: float = setting(
+    fov_y: float = setting(
         1.08, "The field of view from top to bottom: from left to right, it is 77 deg.", unit="rad", gt=0.0, lt=np.pi
     )
     baseline: float = setting(0.3, "Distance of the cameras.", unit="m")
@@ -62,7 +62,7 @@ class StereoConfig:
         """Return size and intrinsics of each camera."""
         from pydrake.systems.sensors import CameraInfo
 
-        return CameraInfo(self.width, self.height, self.field_of_view)
+        return CameraInfo(self.width, self.height, self.fov_y)
 
     def camera(self) -> StereoCamera:
         """Return the geometry of the pair."""
@@ -91,7 +91,7 @@ class StereoLandmarks:
 
     camera: StereoCamera
     matcher: StereoMatcher
-    detector: StereoTrunkDetector
+    detector: StereoTrunkDetectorConfig
     X_BC: RigidTransform
 
     def prepare(self) -> None:
@@ -140,7 +140,7 @@ def add_stereo(builder: VirtualTestbedBuilder, frame: Frame, config: StereoConfi
         camera = Camera(
             builder.plant,
             frame,
-            period=1.0 / config.rate,
+            period=1.0 / config.fps,
             info=config.info(),
             X_FC=X_LC,
             errors=ErrorModel(noise=config.noise, seed=config.seed),

@@ -21,8 +21,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
-from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetector, detect_markers, pose_from_markers
-from vtbdrake.components.perception.registration import Faces, Registration, deskew, misfit, register_points
+from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetectorConfig, detect_markers, pose_from_markers
+from vtbdrake.components.perception.registration import Faces, RegistrationConfig, deskew, misfit, register_points
 from vtbdrake.components.perception.tracking import (
     STATE_SIZE,
     STATUS_SIZE,
@@ -67,8 +67,8 @@ def target_motion() -> MotionModel:
 class PerceptionConfig:
     """The configuration of the perception of the target."""
 
-    detector: MarkerDetector = field(default_factory=MarkerDetector)
-    registration: Registration = field(default_factory=Registration)
+    detector: MarkerDetectorConfig = field(default_factory=MarkerDetectorConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     motion: MotionModel = field(default_factory=target_motion)
     # Whether the points of a scan are corrected by the estimated motion of the target during the scan.
     deskew: bool = True
@@ -123,7 +123,7 @@ class MarkerPose:
     board: MarkerBoard
     X_BC: RigidTransform
     intrinsics: Array
-    detector: MarkerDetector
+    detector: MarkerDetectorConfig
     period: float
 
     def prepare(self) -> None:
@@ -158,7 +158,7 @@ class ScanPose:
 
     faces: Faces
     X_BL: RigidTransform
-    registration: Registration
+    registration: RegistrationConfig
     deskew: bool
     attitude: RotationMatrix | None
     period: float

@@ -79,8 +79,8 @@ class SatelliteScenario(Scenario):
     )
     image_width: int = setting(320, "Width of the images of the docking camera.", unit="pixels", gt=0)
     image_height: int = setting(240, "Height of these images.", unit="pixels", gt=0)
-    field_of_view: float = setting(0.9, "Field of view of the camera from top to bottom.", unit="rad", gt=0.0, lt=np.pi)
-    camera_rate: float = setting(5.0, "Images per second.", unit="Hz", gt=0.0, le=0.5 / PERIOD)
+    fov_y: float = setting(0.9, "Field of view of the camera from top to bottom.", unit="rad", gt=0.0, lt=np.pi)
+    camera_fps: float = setting(5.0, "Images per second.", unit="Hz", gt=0.0, le=0.5 / PERIOD)
     # Errors of the images, in counts.
     camera_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=1.0))
     # The laser scanner, and the errors of its ranges in m.
@@ -119,7 +119,7 @@ class SatelliteScenario(Scenario):
         """Size and intrinsics of the docking camera."""
         from pydrake.systems.sensors import CameraInfo
 
-        return CameraInfo(self.image_width, self.image_height, self.field_of_view)
+        return CameraInfo(self.image_width, self.image_height, self.fov_y)
 
     def mental(self) -> Self:
         """Return what the servicer simulates when it reasons: a pose sensor in place of what it sees with.
@@ -165,7 +165,7 @@ class SatelliteScenario(Scenario):
             from pydrake.systems.sensors import ImageRgba8U
 
             image = ImageRgba8U(self.image_width, self.image_height)
-            signals.append(Signal("image", model_value=image, max_age=5.0 / self.camera_rate))
+            signals.append(Signal("image", model_value=image, max_age=5.0 / self.camera_fps))
         if "scanner" in self.aboard:
             signals.append(Signal("scan", model_value=Scan.empty(), max_age=5.0 / self.scanner.frequency))
         return signals
@@ -176,7 +176,7 @@ class SatelliteScenario(Scenario):
             aboard=self.aboard,
             config=self.evaluation,
             image=self.camera_info if "camera" in self.aboard else None,
-            image_latency=self.camera_errors.latency / self.camera_rate,
+            image_latency=self.camera_errors.latency / self.camera_fps,
             pose_latency=self.pose_errors.latency * POSE_PERIOD,
         )
         return make_dps(sensing, wheels=self.wheels)
@@ -189,7 +189,7 @@ class SatelliteScenario(Scenario):
         sense = [_lcm_map(signal, signal.name) for signal in reversed(self.interface().sense)]
         periods = {"TARGET_POSE": POSE_PERIOD}
         if "camera" in self.aboard:
-            periods["IMAGE"] = 1.0 / self.camera_rate
+            periods["IMAGE"] = 1.0 / self.camera_fps
         if "scanner" in self.aboard:
             periods["SCAN"] = 1.0 / self.scanner.frequency
         act = [_lcm_map(signal, f"{signal.name}_command") for signal in self.interface().act]
@@ -266,7 +266,7 @@ class SatelliteScenario(Scenario):
             camera = Camera(
                 plant,
                 plant.GetFrameByName("camera"),
-                period=1.0 / self.camera_rate,
+                period=1.0 / self.camera_fps,
                 info=self.camera_info,
                 supersampling=2,
                 errors=self.camera_errors,

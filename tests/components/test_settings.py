@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.rocks import RockDetector
-from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector
+from vtbdrake.components.localization.rocks import RockDetectorConfig
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig
 from vtbdrake.components.localization.tracking import Tracker
-from vtbdrake.components.localization.trunks import TrunkDetector
+from vtbdrake.components.localization.trunks import TrunkDetectorConfig
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.settings import check_settings
@@ -43,8 +43,8 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "distortion_gate": "(0, 1)",
         },
     ),
-    "TrunkDetector": (
-        TrunkDetector,
+    "TrunkDetectorConfig": (
+        TrunkDetectorConfig,
         {
             "azimuth_step": "(0, 0.1)",
             "elevation_step": "(0, 0.5)",
@@ -63,8 +63,8 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "diameter_floor": "[0, inf)",
         },
     ),
-    "RockDetector": (
-        RockDetector,
+    "RockDetectorConfig": (
+        RockDetectorConfig,
         {
             "reach": "(0, 200]",
             "cell": "[0.0125, inf)",  # a 2000th of the reach
@@ -75,8 +75,8 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "elongation": "[0, 1)",
         },
     ),
-    "StereoTrunkDetector": (
-        StereoTrunkDetector,
+    "StereoTrunkDetectorConfig": (
+        StereoTrunkDetectorConfig,
         {
             "extent": "(0, 2.8)",  # the height of the slice
             "reach": "(0, inf)",
@@ -142,7 +142,7 @@ def test_setting_is_accepted_within_its_interval_and_refused_beyond(
     [
         ("Tracker", "most", 1),
         ("Tracker", "patience", 1),
-        ("RockDetector", "least_points", 2),
+        ("RockDetectorConfig", "least_points", 2),
         ("ErrorModel", "latency", 0),
         ("ErrorModel", "max_latency", 0),
         ("ErrorModel", "seed", 0),

@@ -1,4 +1,4 @@
-"""Rendering: whether this machine can, and scenes of a camera's own that are rendered under its own light.
+"""Rendering: whether this machine can, scenes of a camera's own under its own light, and their images and shadows.
 
 Drake keeps the renderers of a SceneGraph where a simulation cannot change them. So a camera renders a copy of the
 geometry with a perception role, whose light follows from numbers in the Context. It renders nothing between its images,
@@ -11,12 +11,20 @@ import copy
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
+from scipy.ndimage import minimum_filter
 
 from vtbdrake.components.environment.light import LIGHT, light_sources
+from vtbdrake.components.shadows import sunlit
 
 if TYPE_CHECKING:
     from pydrake.geometry import GeometryVersion, QueryObject, RenderEngine, SceneGraphInspector
@@ -26,6 +34,8 @@ _CHECKED = "VTBDRAKE_RENDERING"
 _PROBE_TIMEOUT = 60.0  # s
 # The renderers in the scene of a camera.
 SUN, FILL = "sun", "fill"
+FULL_SCALE = 255.0
+"""The counts of a saturated pixel."""
 # Shapes with an inside, in which a camera sees nothing.
 _WITH_INSIDE = {"Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"}
 
@@ -192,3 +202,95 @@ class RenderedScene:
         self._context = scene_graph.CreateDefaultContext()
         self._version, self._illumination = copy.copy(inspector.geometry_version()), None
         self._renderers = []
+
+
+class RenderedView:
+    """Colour and depth of a scene as one camera sees it, in counts and metres."""
+
+    def __init__(
+        self,
+        scene: RenderedScene,
+        view: QueryObject,
+        info: CameraInfo,
+        limits: tuple[float, float],
+        X_WC: RigidTransform,
+        *,
+        points: int,
+    ) -> None:
+        self.view, self._scene, self._info, self._limits, self.X_WC = view, scene, info, limits, X_WC
+        self._points = points
+        self._world = view.inspector().world_frame_id()
+
+    def _core(self, renderer: str, info: CameraInfo) -> RenderCameraCore:
+        return RenderCameraCore(renderer, info, ClippingRange(*self._limits), RigidTransform())
+
+    def color(self, renderer: str, bracket: Sequence[float]) -> NDArray[np.float32]:
+        """Return the counts of a renderer, shape (h, w, 3); 255 if too bright for the smallest exposure.
+
+        Args:
+            renderer: `SUN` or `FILL`.
+            bracket: Increasing numbers by which the exposure is divided for what was too bright.
+        """
+        counts = self._counts(renderer).astype(np.float32)
+        for factor in bracket:
+            if counts.max() < factor / 4.0 * FULL_SCALE:
+                break
+            darker = np.float32(factor) * self._counts(self._scene.darker(renderer, factor))
+            # Brighter by more than rounding explains: saturated, or at an edge the mean of something saturated.
+            counts = np.where(darker > counts + 0.75 * factor, darker, counts)
+        k = self._points
+        if k == 1:
+            return counts
+        mean = np.zeros((self._info.height(), self._info.width(), 3), np.float32)
+        for i in range(k):
+            for j in range(k):
+                mean += counts[i::k, j::k]
+        mean /= k * k
+        return mean
+
+    def _counts(self, renderer: str) -> NDArray[np.uint8]:
+        """Return the counts of all points of the pixels, shape (k h, k w, 3)."""
+        k, info = self._points, self._info
+        intrinsics = (k * x for x in (info.focal_x(), info.focal_y(), info.center_x(), info.center_y()))
+        core = self._core(renderer, CameraInfo(k * info.width(), k * info.height(), *intrinsics))
+        return self.view.RenderColorImage(ColorRenderCamera(core, False), self._world, self.X_WC).data[..., :3]
+
+    def depth(self) -> NDArray[np.float32]:
+        """Return the depth image, shape (h, w)."""
+        camera = DepthRenderCamera(self._core(SUN, self._info), DepthRange(*self._limits))
+        return np.array(self.view.RenderDepthImage(camera, self._world, self.X_WC).data[..., 0])
+
+    @property
+    def focal(self) -> float:
+        """Return the larger focal length, in pixels."""
+        return float(max(self._info.focal_x(), self._info.focal_y()))
+
+    @cached_property
+    def rays_C(self) -> NDArray[np.float64]:
+        """Return the ray of each pixel up to z_C = 1, shape (3, h, w)."""
+        info = self._info
+        x = (np.arange(info.width()) + 0.5 - info.center_x()) / info.focal_x()
+        y = (np.arange(info.height()) + 0.5 - info.center_y()) / info.focal_y()
+        return np.stack((*np.meshgrid(x, y), np.ones((y.size, x.size))))
+
+
+def shade(
+    color: NDArray[np.float32],
+    camera: RenderedView,
+    depth: NDArray[np.float32],
+    *,
+    direction: Sequence[float],
+    reach: float,
+) -> None:
+    """Darken the pixels of ``color`` that are in shadow, in place."""
+    # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
+    depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
+    visible = (color[..., 0] > 0.0) | (color[..., 1] > 0.0) | (color[..., 2] > 0.0)
+    bright = np.flatnonzero(visible & np.isfinite(depth) & (depth > 0.0))
+    points_C = camera.rays_C.reshape(3, -1)[:, bright] * depth.ravel()[bright]
+    points_W = camera.X_WC.rotation().matrix() @ points_C + camera.X_WC.translation()[:, np.newaxis]
+    spacing = depth.ravel()[bright].astype(float) / camera.focal
+    share = sunlit(camera.view, renderer=FILL, points_W=points_W, spacing=spacing, direction=direction, reach=reach)
+    shaded = bright[share < 1.0]
+    pixels = color.reshape(-1, 3)
+    pixels[shaded] *= share[share < 1.0, np.newaxis]

@@ -3,8 +3,8 @@
 ``python -m vtbdrake_diagrams.forest.studies.stereo_trials [--forests N] [--views N] [--seed S]`` takes pairs of images
 along the routes of forests, detects trunks in them, compares each with the tree that fits best by the covariance of the
 detection, and prints a table by distance. A detection with a squared error of more than 25 (of 2 degrees of freedom)
-counts as false: it shows a crown, or several trees. The constants of `StereoTrunkDetector` were calibrated with forests
-of other seeds.
+counts as false: it shows a crown, or several trees. The constants of `StereoTrunkDetectorConfig` were calibrated with
+forests of other seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
-from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.forest.scenario import ForestScenario
@@ -81,7 +81,7 @@ def run(*, forests: int = 4, views: int = 12, seed: int = SEED) -> StereoTrials:
         scenario = ForestScenario(seed=number, perception="stereo")
         testbed, rng = scenario.build(), np.random.default_rng(number)
         context = testbed.default_context()
-        camera, matcher, detector = scenario.stereo.camera(), scenario.stereo.matcher(), StereoTrunkDetector()
+        camera, matcher, detector = scenario.stereo.camera(), scenario.stereo.matcher(), StereoTrunkDetectorConfig()
         trees, routes = map_landmarks(scenario.truth()), scenario.routes()
         for _ in range(views):
             route = routes[rng.integers(len(routes))]

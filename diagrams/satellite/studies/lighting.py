@@ -154,8 +154,8 @@ class LightingScenario(SatelliteScenario):
     # Without them the arm's reaction turns the base, until the target leaves the image.
     wheels: bool = True
     # Slow, because images are what a capture costs.
-    camera_rate: float = 2.0
-    # What the detector's adaptive threshold subtracts from the mean, see `MarkerDetector`.
+    camera_fps: float = 2.0
+    # What the detector's adaptive threshold subtracts from the mean, see `MarkerDetectorConfig`.
     threshold: float = 7.0
 
     def make_dps(self) -> Diagram:

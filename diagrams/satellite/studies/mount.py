@@ -157,7 +157,7 @@ def mount_problem(
     own = scenario()
     upper = float(len(Target().tags))
     # The count that f reads is of an image that is at most a period of the camera old.
-    memory = 1.0 / own.camera_rate + 0.02
+    memory = 1.0 / own.camera_fps + 0.02
     return vtb.Problem(
         scenario=own,
         parameters=list(parameters),

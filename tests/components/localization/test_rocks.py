@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.components.localization.scans import Scene, flat, hills, pairs
-from vtbdrake.components.localization.rocks import RockDetector, detect_rocks
+from vtbdrake.components.localization.rocks import RockDetectorConfig, detect_rocks
 
 pytestmark = pytest.mark.one_python
 
 EYE = np.array([0.1, 0.2, 1.5])
 # For waves of 0.2 m.
-HIGH = RockDetector(least_height=0.2)
+HIGH = RockDetectorConfig(least_height=0.2)
 
 
 def waves(places):
@@ -32,7 +32,7 @@ def plain(seed: int, *, count: int = 30, elongation: float = 1.3, height=waves) 
     return Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.column_stack(rocks), height=height)
 
 
-def seen(scene: Scene, detector: RockDetector = HIGH, *, seed: int = 0):
+def seen(scene: Scene, detector: RockDetectorConfig = HIGH, *, seed: int = 0):
     points, hit = scene.scan(EYE, noise=0.02, seed=seed)
     return detect_rocks(points, detector, p_HoLo_H=EYE), points, hit
 
@@ -76,7 +76,7 @@ def test_low_rounded_tops_do_not_displace_the_middle(away):
     shapes = np.tile([0.0, 0.4, 0.4, 0.4, 0.0], (16, 1))
     scene = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.column_stack([places, shapes]))
     points, _ = scene.scan(EYE, rows=64)
-    rocks = detect_rocks(points, RockDetector(elevation_step=np.pi / 6 / 64), p_HoLo_H=EYE)
+    rocks = detect_rocks(points, RockDetectorConfig(elevation_step=np.pi / 6 / 64), p_HoLo_H=EYE)
     which, truth = pairs(rocks.positions, places, within=0.3)
     assert len(which) == 16
     too_far = np.hypot(*(rocks.positions[which] - EYE[:2]).T) - away
@@ -88,7 +88,7 @@ def test_small_rocks_are_found_on_even_ground():
     # Half a metre wide, and a hand's breadth over the ground.
     scene.ellipsoids[:, 3:5], scene.ellipsoids[:, 5] = 0.25, 0.15
     scene.ellipsoids[:, :2] = EYE[:2] + 0.5 * (scene.ellipsoids[:, :2] - EYE[:2])
-    rocks, points, hit = seen(scene, RockDetector())
+    rocks, points, hit = seen(scene, RockDetectorConfig())
     which, truth = pairs(rocks.positions, scene.ellipsoids[:, :2], within=0.2)
     assert len(which) == len(rocks)
     clear = np.bincount(hit[(hit >= 0) & (points[:, 2] > 0.08)], minlength=20) >= 5
@@ -112,6 +112,6 @@ def test_ground_alone_has_no_rocks():
 
 def test_bad_input_is_rejected():
     with pytest.raises(ValueError, match="finite numbers"):
-        detect_rocks(np.full((3, 3), np.inf), RockDetector(), p_HoLo_H=EYE)
+        detect_rocks(np.full((3, 3), np.inf), RockDetectorConfig(), p_HoLo_H=EYE)
     with pytest.raises(ValueError, match="least_points must be a whole number of at least 2, not 1"):
-        RockDetector(least_points=1)
+        RockDetectorConfig(least_points=1)

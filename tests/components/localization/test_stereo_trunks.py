@@ -19,14 +19,14 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetector, detect_stereo_trunks
+from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
 from vtbdrake.components.textures import grain, tiled_mesh
 
 Array = NDArray[np.float64]
 
 CAMERA = StereoCamera(640, 480, 400.0, 320.0, 240.0, 0.3)
-EXACT = StereoTrunkDetector(fattening=0.0)
+EXACT = StereoTrunkDetectorConfig(fattening=0.0)
 # C looks along x of H.
 R_HC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 LEVEL = RigidTransform(R_HC, [0.4, 0.1, 2.0])
@@ -146,7 +146,7 @@ def test_neither_ground_nor_stumps_nor_walls_are_trunks() -> None:
 
 
 def test_far_trunks_are_left_out() -> None:
-    near = StereoTrunkDetector(reach=8.0)
+    near = StereoTrunkDetectorConfig(reach=8.0)
     found = detect_stereo_trunks(disparity(TREES, LEVEL), CAMERA, near, X_HC=LEVEL)
     assert sorted(np.round(found.positions[:, 0])) == [5.0, 6.0]
 
@@ -187,7 +187,7 @@ def test_rendered_trunks_are_found_within_their_covariances() -> None:
         x, slope = rng.uniform(4.0, 12.0, count), np.linspace(-0.6, 0.6, count)
         trees = np.column_stack([x, slope * x, rng.uniform(0.15, 0.4, count)])
         disparities = matcher.disparity(*photographed(trees, info, camera.baseline))
-        found = detect_stereo_trunks(disparities, camera, StereoTrunkDetector(), X_HC=LEVEL)
+        found = detect_stereo_trunks(disparities, camera, StereoTrunkDetectorConfig(), X_HC=LEVEL)
         assert len(found) >= count - 3
         errors = found.positions[:, None] - trees[:, :2]
         each = np.einsum("nmi,nij,nmj->nm", errors, np.linalg.inv(found.covariances), errors)
@@ -208,4 +208,4 @@ def test_rendered_trunks_are_found_within_their_covariances() -> None:
 )
 def test_impossible_detectors_are_refused(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        StereoTrunkDetector(**values)
+        StereoTrunkDetectorConfig(**values)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.components.localization.scans import BREAST, Scene, hills, pairs, raster, trunk_ranges
-from vtbdrake.components.localization.trunks import TrunkDetector, detect_trunks
+from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
 
 pytestmark = pytest.mark.one_python
 
 EYE = np.array([0.2, -0.1, 2.0])
 # The cylinders of these tests have neither bark nor a bend.
-EXACT = TrunkDetector(roughness=0.0, position_floor=0.0, diameter_floor=0.0)
+EXACT = TrunkDetectorConfig(roughness=0.0, position_floor=0.0, diameter_floor=0.0)
 
 
 def ring(seed: int, *, count: int = 12, distance: tuple[float, float] = (3.0, 20.0), **options) -> Scene:
@@ -117,7 +117,7 @@ def test_leaning_trunks_are_found_at_breast_height():
     leans = np.array([[0.08, 0.0], [0.0, 0.08], [-0.06, 0.06], [0.0, -0.1]])
     places = EYE[:2] + 5.0 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     points, _ = Scene(places, np.full(4, 0.25), leans).scan(EYE, noise=0.01)
-    trunks = detect_trunks(points, TrunkDetector(range_noise=0.01), p_HoLo_H=EYE)
+    trunks = detect_trunks(points, TrunkDetectorConfig(range_noise=0.01), p_HoLo_H=EYE)
     which, truth = pairs(trunks.positions, places, within=0.06)
     assert sorted(truth) == [0, 1, 2, 3]
     np.testing.assert_allclose(trunks.diameters[which], 0.25, atol=0.03)
@@ -143,7 +143,7 @@ def test_stands_on_uneven_ground(bushes, recall, precision):
     for seed in range(4):
         scene = stand(seed, bushes=bushes)
         points, hit = scene.scan(EYE, noise=0.02, seed=seed)
-        trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+        trunks = detect_trunks(points, TrunkDetectorConfig(), p_HoLo_H=EYE)
         # Those in sight: by at least ten points in a slice that is a little smaller than that of the detector.
         over = points[:, 2] - hills(points[:, :2])
         counts = np.bincount(hit[(hit >= 0) & (over > 0.9) & (over < 2.5)], minlength=len(scene.places))
@@ -162,9 +162,9 @@ def test_a_hidden_edge_is_not_an_edge_of_the_trunk():
     places = np.array([[5.0, 0.2], [10.0, 0.2]]) + EYE[:2]
     diameters = np.array([0.2, 0.4])
     points, _ = Scene(places, diameters).scan(EYE, noise=0.02)
-    trunks = detect_trunks(points, TrunkDetector(position_floor=0.0), p_HoLo_H=EYE)
+    trunks = detect_trunks(points, TrunkDetectorConfig(position_floor=0.0), p_HoLo_H=EYE)
     alone, _ = Scene(places[1:], diameters[1:]).scan(EYE, noise=0.02)
-    (whole,) = detect_trunks(alone, TrunkDetector(position_floor=0.0), p_HoLo_H=EYE).covariances
+    (whole,) = detect_trunks(alone, TrunkDetectorConfig(position_floor=0.0), p_HoLo_H=EYE).covariances
     (far,) = np.flatnonzero(trunks.positions[:, 0] > 8.0)
     error = trunks.positions[far] - places[1]
     assert error @ np.linalg.solve(trunks.covariances[far], error) < 9.21
@@ -179,7 +179,7 @@ def test_hidden_edges_are_found_behind_the_carrier_too():
         R = np.array([[np.cos(bearing), -np.sin(bearing)], [np.sin(bearing), np.cos(bearing)]])
         places = EYE[:2] + np.array([[5.0, -0.2], [10.0, -0.2]]) @ R.T
         points, _ = Scene(places, np.array([0.2, 0.4])).scan(EYE, noise=0.02, turn=bearing)
-        trunks = detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+        trunks = detect_trunks(points, TrunkDetectorConfig(), p_HoLo_H=EYE)
         (far,) = np.flatnonzero(np.linalg.norm(trunks.positions - EYE[:2], axis=1) > 8.0)
         deviations.append(trunks.diameter_deviations[far])
     np.testing.assert_allclose(deviations, deviations[0], rtol=0.02)
@@ -193,7 +193,7 @@ def test_branches_beside_a_trunk_do_not_widen_it():
     sides = np.concatenate([np.linspace(0.11, 0.25, 12), -np.linspace(0.11, 0.25, 12)])
     branches = np.column_stack([np.full(24, place[0]), place[1] + sides, rows])
     for seen in (points, np.vstack([points, branches])):
-        (diameter,) = detect_trunks(seen, TrunkDetector(range_noise=0.01), p_HoLo_H=EYE).diameters
+        (diameter,) = detect_trunks(seen, TrunkDetectorConfig(range_noise=0.01), p_HoLo_H=EYE).diameters
         assert abs(diameter - 0.2) < 0.025
 
 
@@ -202,14 +202,14 @@ def test_other_objects_are_not_found():
     ground, _ = nothing.scan(EYE, noise=0.02)
     wall = np.stack(np.meshgrid([6.0], np.linspace(-2, 2, 60), np.linspace(0, 3, 20)), axis=-1).reshape(-1, 3)
     for points in (np.zeros((0, 3)), ground, np.vstack([ground, wall]), wall[:1]):
-        assert len(detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)) == 0
+        assert len(detect_trunks(points, TrunkDetectorConfig(), p_HoLo_H=EYE)) == 0
 
 
 def test_the_order_of_points_does_not_matter():
     scene = ring(3)
     points, _ = scene.scan(EYE, noise=0.02)
     mixed = np.random.default_rng(0).permutation(points)
-    one, other = (detect_trunks(some, TrunkDetector(), p_HoLo_H=EYE) for some in (points, mixed))
+    one, other = (detect_trunks(some, TrunkDetectorConfig(), p_HoLo_H=EYE) for some in (points, mixed))
     np.testing.assert_allclose(one.positions, other.positions, atol=1e-9)
 
 
@@ -217,15 +217,15 @@ def test_bad_input_is_rejected():
     points = np.ones((3, 3))
     points[1, 1] = np.nan
     with pytest.raises(ValueError, match="finite numbers"):
-        detect_trunks(points, TrunkDetector(), p_HoLo_H=EYE)
+        detect_trunks(points, TrunkDetectorConfig(), p_HoLo_H=EYE)
     with pytest.raises(ValueError, match="shape"):
-        detect_trunks(np.ones((3, 2)), TrunkDetector(), p_HoLo_H=EYE)
-    with pytest.raises(ValueError, match="TrunkDetector.range_noise must be a finite number above 0 m, not 0"):
-        TrunkDetector(range_noise=0.0)
+        detect_trunks(np.ones((3, 2)), TrunkDetectorConfig(), p_HoLo_H=EYE)
+    with pytest.raises(ValueError, match="TrunkDetectorConfig.range_noise must be a finite number above 0 m, not 0"):
+        TrunkDetectorConfig(range_noise=0.0)
     with pytest.raises(ValueError, match="heights must be the lower one, then the upper one"):
-        TrunkDetector(heights=(2.0, 1.0))
+        TrunkDetectorConfig(heights=(2.0, 1.0))
     with pytest.raises(ValueError, match="cell must be at least 0.02 m, a 2000th of the reach, not 0.01"):
-        TrunkDetector(reach=40.0, cell=0.01)
+        TrunkDetectorConfig(reach=40.0, cell=0.01)
 
 
 def test_scan_with_the_ground_above_shows_nothing():

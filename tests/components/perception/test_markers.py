@@ -25,7 +25,7 @@ from vtbdrake.components.environment import Light, LightConfig
 from vtbdrake.components.perception.markers import (
     Detections,
     MarkerBoard,
-    MarkerDetector,
+    MarkerDetectorConfig,
     add_markers,
     check_marker_size,
     detect_markers,
@@ -92,7 +92,7 @@ def test_rendered_corners_are_where_the_pinhole_equations_say(world: Diagram) ->
 
 @pytest.mark.parametrize(("refinement", "limit"), [("lines", 0.2), ("none", 1.0)])
 def test_refinement_decides_the_accuracy(world: Diagram, refinement: str, limit: float) -> None:
-    found = detect_markers(photograph(world, OBLIQUE), MarkerDetector(refinement=refinement))
+    found = detect_markers(photograph(world, OBLIQUE), MarkerDetectorConfig(refinement=refinement))
     expected = project(board().corners[board().find(found.ids)].reshape(-1, 3), OBLIQUE, INTRINSICS)
     rms = np.sqrt(np.mean((found.corners.reshape(-1, 2) - expected) ** 2))
     assert limit / 5.0 < rms < limit
@@ -140,7 +140,7 @@ def test_errors_of_poses_are_as_large_as_their_covariances_say(photographed: tup
         collect(diagram).write(context, {"camera.seed": seed})
         Simulator(diagram, context).Initialize()
         image = camera.GetOutputPort("color_image").Eval(camera.GetMyContextFromRoot(context))
-        seen = detect_markers(image, MarkerDetector(min_perimeter=0.05)).on(board())
+        seen = detect_markers(image, MarkerDetectorConfig(min_perimeter=0.05)).on(board())
         if len(seen.ids) < 3:
             continue
         expected = project(board().corners[board().find(seen.ids)].reshape(-1, 3), X_CT, INTRINSICS)
@@ -283,7 +283,7 @@ def test_impossible_board_is_rejected(ids: list[int], size: float, message: str)
 
 def test_impossible_detector_is_rejected() -> None:
     with pytest.raises(ValueError, match="refinement is one of lines, subpixel, none, not 'apriltag'"):
-        MarkerDetector(refinement="apriltag")
+        MarkerDetectorConfig(refinement="apriltag")
 
 
 def test_missing_opencv_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

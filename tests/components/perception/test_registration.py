@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
-from vtbdrake.components.perception.registration import Faces, Registration, deskew, register_points
+from vtbdrake.components.perception.registration import Faces, RegistrationConfig, deskew, register_points
 
 pytestmark = pytest.mark.one_python
 
@@ -54,7 +54,7 @@ def near(X: RigidTransform, *, angle: float, distance: float, seed: int) -> Rigi
 
 
 def register(points: np.ndarray, start: RigidTransform, *, noise: float = 0.01) -> PoseEstimate:
-    settings = Registration(range_noise=noise, systematic=0.0)
+    settings = RegistrationConfig(range_noise=noise, systematic=0.0)
     return register_points(points, FACES, start, eye=EYE, time=2.0, registration=settings)
 
 

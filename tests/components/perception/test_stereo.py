@@ -96,7 +96,7 @@ def oblique() -> Scene:
 def test_field_of_view_reaches_from_edge_to_edge() -> None:
     camera = StereoCamera(width=300, height=200, focal_length=100.0, center_x=100.0, center_y=90.0, baseline=0.3)
     # The left edge is at 45 deg from the axis, the right one at atan(2).
-    assert np.degrees(camera.field_of_view) == pytest.approx(45.0 + 63.434949)
+    assert np.degrees(camera.fov_x) == pytest.approx(45.0 + 63.434949)
 
 
 def test_depth_errors_grow_with_the_square_of_depth(oblique: Scene) -> None:

@@ -379,7 +379,7 @@ def test_camera_inside_a_body_is_refused() -> None:
     ("wrong", "match"),
     [
         ({"period": 0.0}, "period is positive"),
-        ({"near": 2.0, "far": 1.0}, "0 < near < far"),
+        ({"clipping_near": 2.0, "clipping_far": 1.0}, "0 < clipping_near < clipping_far"),
         ({"photon_noise": -1.0}, "standard deviation"),
         ({"supersampling": 0}, "whole number of points"),
         ({"errors": ErrorModel(bias=1.0)}, "no bias"),
@@ -467,7 +467,7 @@ def test_shadows_on_ground_up_to_the_horizon_are_right_to_a_pixel(direction: tup
     plant.Finalize()
     X_WC = RigidTransform(RollPitchYaw(-np.pi / 2 - 0.1, 0.0, -np.pi / 2), [0.0, 0.0, 2.0])
     info = CameraInfo(320, 240, 0.8)
-    camera = Camera(plant, plant.world_frame(), X_FC=X_WC, period=PERIOD, info=info, depth=True, far=400.0)
+    camera = Camera(plant, plant.world_frame(), X_FC=X_WC, period=PERIOD, info=info, depth=True, clipping_far=400.0)
     builder.AddNamedSystem("camera", camera)
     light = builder.AddNamedSystem("light", Light(LightConfig(direction=list(direction))))
     connect_camera(builder, camera, scene_graph, light=light)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.world_model import (
-    LifeCycle,
+    LifeCycleConfig,
     Quantity,
     Sighting,
     WorldModel,
@@ -142,7 +142,7 @@ def test_model_of_many_updates_is_consistent() -> None:
     sigma = np.array([0.1, 0.05, 0.3])
     for _ in range(10):
         sightings = [seen(place + sigma * rng.normal(size=3), deviation=sigma) for place in truth]
-        model = observe(model, sightings, rules=LifeCycle(gate=1.0 - 1e-9))
+        model = observe(model, sightings, rules=LifeCycleConfig(gate=1.0 - 1e-9))
     assert len(model) == 200
     errors = [model[f"t{k}"].p_WoOo_W - truth[k] for k in range(200)]
     nees = sum(e @ np.linalg.solve(model[f"t{k}"].pose.covariance[3:, 3:], e) for k, e in enumerate(errors))

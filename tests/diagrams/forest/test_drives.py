@@ -124,7 +124,7 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
 def test_recorded_cameras_see_trees_where_they_are() -> None:
     scenario = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
     drive = recorded_drive(scenario, length=0.2)
-    assert np.diff(drive.times) == pytest.approx(1.0 / scenario.stereo.rate)
+    assert np.diff(drive.times) == pytest.approx(1.0 / scenario.stereo.fps)
     squares = []
     for pose, landmarks in zip(drive.truth, drive.landmarks, strict=True):
         trees = map_landmarks(scenario.truth()).seen_from(inverse(pose)).positions

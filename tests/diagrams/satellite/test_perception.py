@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
-from vtbdrake.components.perception.registration import Registration
+from vtbdrake.components.perception.registration import RegistrationConfig
 from vtbdrake.components.perception.tracking import STATE_SIZE, body_state
 from vtbdrake.scan import Scan
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
@@ -69,7 +69,7 @@ def scan_pose(*, deskew: bool, stamp: float = 2.0, clock: float = 0.0) -> PoseEs
     function = ScanPose(
         faces=target_faces(),
         X_BL=Servicer().X_BL,
-        registration=Registration(),
+        registration=RegistrationConfig(),
         deskew=deskew,
         attitude=None,
         period=PERIOD,
@@ -105,7 +105,7 @@ def test_raw_scan_of_a_moving_target_is_distorted() -> None:
 
 
 def test_scan_without_a_track_or_an_attitude_is_no_estimate() -> None:
-    function = ScanPose(target_faces(), Servicer().X_BL, Registration(), True, None, PERIOD)
+    function = ScanPose(target_faces(), Servicer().X_BL, RegistrationConfig(), True, None, PERIOD)
     history, lost = history_until(2.0), np.array([0.0, np.inf, np.inf, np.inf])
     scan = scan_until(2.0, duration=0.1)
     estimate, _ = function(
@@ -124,7 +124,7 @@ def test_scan_without_a_track_or_an_attitude_is_no_estimate() -> None:
 def start(*, deskew: bool, scans: int) -> PoseEstimate:
     """Return the estimate from the last of some scans of half a second, while nothing is tracked."""
     attitude = target_at(2.0).rotation() @ RotationMatrix(RollPitchYaw(0.2, -0.3, 0.2))
-    function = ScanPose(target_faces(), Servicer().X_BL, Registration(), deskew, attitude, PERIOD)
+    function = ScanPose(target_faces(), Servicer().X_BL, RegistrationConfig(), deskew, attitude, PERIOD)
     lost, memory = np.array([0.0, np.inf, np.inf, np.inf]), PoseEstimate.missing()
     for stamp in 2.0 - 0.5 * np.arange(scans)[::-1]:
         shown, memory = function(

@@ -19,15 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
-from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetector, Scene
+from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
 from vtbdrake.settings import setting
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RockDetector(ScanDetector):
-    """Settings of the detector of rocks, beside those of `ScanDetector`.
+class RockDetectorConfig(ScanDetectorConfig):
+    """Settings of the detector of rocks, beside those of `ScanDetectorConfig`.
 
     Raises:
         ValueError: A setting is outside of its range.
@@ -60,10 +60,10 @@ class RockDetector(ScanDetector):
         super().__post_init__()
         if not self.least_width < self.largest_width:
             most = f"below the largest_width, {self.largest_width:g} m"
-            raise ValueError(f"RockDetector.least_width must be {most}, not {self.least_width!r}")
+            raise ValueError(f"RockDetectorConfig.least_width must be {most}, not {self.least_width!r}")
 
 
-def detect_rocks(points_H: ArrayLike, detector: RockDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:
+def detect_rocks(points_H: ArrayLike, detector: RockDetectorConfig, *, p_HoLo_H: ArrayLike) -> Landmarks:
     """Find the rocks in the points of a scan.
 
     Args:
@@ -86,7 +86,7 @@ def detect_rocks(points_H: ArrayLike, detector: RockDetector, *, p_HoLo_H: Array
     return _outlines(Clusters(standing, rows, owners), detector, np.asarray(p_HoLo_H)[:2])
 
 
-def _outlines(clusters: Clusters, detector: RockDetector, origin: Array) -> Landmarks:
+def _outlines(clusters: Clusters, detector: RockDetectorConfig, origin: Array) -> Landmarks:
     """Return the clusters that are rocks, if the scanner is at ``origin`` (2,)."""
     step, starts = detector.azimuth_step, clusters.starts
     right, left = (extreme.reduceat(clusters.azimuths, starts) for extreme in (np.minimum, np.maximum))

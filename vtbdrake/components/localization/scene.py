@@ -26,7 +26,7 @@ _ON_GROUND, _GROUND_SHARE = 0.2, 0.15
 
 
 @dataclass(frozen=True)
-class ScanDetector:
+class ScanDetectorConfig:
     """Settings that all detectors of landmarks in scans have; angles and noise must be those of the scanner.
 
     Raises:
@@ -74,7 +74,7 @@ class Scene:
     heights: Array
 
     @classmethod
-    def of(cls, points_H: ArrayLike, p_HoLo_H: ArrayLike, detector: ScanDetector) -> Scene:
+    def of(cls, points_H: ArrayLike, p_HoLo_H: ArrayLike, detector: ScanDetectorConfig) -> Scene:
         """Return the points within the reach of a detector, as the scanner sees them.
 
         If a scan shows the ground above the scanner, the scene is empty: the elevations have the wrong sign, as when
@@ -206,7 +206,7 @@ class Clusters:
         total: Array = np.add.reduceat(values, self.starts, axis=0)
         return total
 
-    def hidden_edges(self, detector: ScanDetector, *, gap: float) -> NDArray[np.bool_]:
+    def hidden_edges(self, detector: ScanDetectorConfig, *, gap: float) -> NDArray[np.bool_]:
         """Return whether something nearer begins where a cluster ends, to the right and to the left, (k, 2).
 
         Args:

@@ -7,7 +7,7 @@ disparity gives its distance. In columns and disparities the errors are the same
 Ground, which is spread over many disparities, and twigs need no model: their cells have too few pixels.
 
 The errors of the disparities of one trunk are correlated: that of its distance does not vanish with the number of
-pixels. The standard deviations in `StereoTrunkDetector` are calibrated.
+pixels. The standard deviations in `StereoTrunkDetectorConfig` are calibrated.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FACE = pi / 4.0
 
 
 @dataclass(frozen=True)
-class StereoTrunkDetector:
+class StereoTrunkDetectorConfig:
     """Settings of the detector of trunks in disparities.
 
     Raises:
@@ -81,18 +81,18 @@ class StereoTrunkDetector:
         low, high = self.heights
         if not low < high:
             raise ValueError(
-                f"StereoTrunkDetector.heights must be the lower one, then the upper one, not {self.heights!r}"
+                f"StereoTrunkDetectorConfig.heights must be the lower one, then the upper one, not {self.heights!r}"
             )
         if not self.extent < high - low:
             most = f"below the height of the slice, {high - low:g} m"
-            raise ValueError(f"StereoTrunkDetector.extent must be {most}, not {self.extent!r}")
+            raise ValueError(f"StereoTrunkDetectorConfig.extent must be {most}, not {self.extent!r}")
         if not self.least_diameter < self.largest_diameter:
             most = f"below the largest_diameter, {self.largest_diameter:g} m"
-            raise ValueError(f"StereoTrunkDetector.least_diameter must be {most}, not {self.least_diameter!r}")
+            raise ValueError(f"StereoTrunkDetectorConfig.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
 def detect_stereo_trunks(
-    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetector, *, X_HC: RigidTransform
+    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetectorConfig, *, X_HC: RigidTransform
 ) -> Landmarks:
     """Find the trunks in the disparities of an image.
 
@@ -117,7 +117,7 @@ def detect_stereo_trunks(
 
 
 def _level(
-    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetector, X_HC: RigidTransform
+    disparity: NDArray[np.floating], camera: StereoCamera, detector: StereoTrunkDetectorConfig, X_HC: RigidTransform
 ) -> tuple[Array, Array, float]:
     """Return the points of the slice as a level camera sees them: ahead and to its right (m), and its heading in H."""
     axis_H = X_HC.rotation().matrix()[:, 2]
@@ -183,7 +183,7 @@ class _Grid:
 
 
 def _measured(
-    trunk: _Trunk, camera: StereoCamera, detector: StereoTrunkDetector
+    trunk: _Trunk, camera: StereoCamera, detector: StereoTrunkDetectorConfig
 ) -> tuple[float, float, float, float] | None:
     """Return distance (m) and bearing to the right (rad) of an axis, its diameter (m), and 1 if all of it is seen."""
     f, width = camera.focal_length, max(trunk.width - detector.fattening, 0.5)
@@ -206,7 +206,7 @@ def _landmarks(
     diameter: Array,
     is_whole: NDArray[np.bool_],
     camera: StereoCamera,
-    detector: StereoTrunkDetector,
+    detector: StereoTrunkDetectorConfig,
     X_HC: RigidTransform,
 ) -> Landmarks:
     """Return landmarks in H at distances (m) in directions (rad) from the camera."""

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
-from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetector, Scene
+from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
 from vtbdrake.settings import setting
 
 Array = NDArray[np.float64]
@@ -54,8 +54,8 @@ _NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
-class TrunkDetector(ScanDetector):
-    """Settings of the detector of trunks, beside those of `ScanDetector`.
+class TrunkDetectorConfig(ScanDetectorConfig):
+    """Settings of the detector of trunks, beside those of `ScanDetectorConfig`.
 
     Trunks whose bark is less than two cells apart become one object, which is mostly rejected.
 
@@ -103,13 +103,15 @@ class TrunkDetector(ScanDetector):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.heights[0] < self.heights[1]:
-            raise ValueError(f"TrunkDetector.heights must be the lower one, then the upper one, not {self.heights!r}")
+            raise ValueError(
+                f"TrunkDetectorConfig.heights must be the lower one, then the upper one, not {self.heights!r}"
+            )
         if not self.least_diameter < self.largest_diameter:
             most = f"below the largest_diameter, {self.largest_diameter:g} m"
-            raise ValueError(f"TrunkDetector.least_diameter must be {most}, not {self.least_diameter!r}")
+            raise ValueError(f"TrunkDetectorConfig.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
-def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: ArrayLike) -> Landmarks:
+def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_H: ArrayLike) -> Landmarks:
     """Find the trunks in the points of a scan.
 
     Args:
@@ -130,7 +132,7 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetector, *, p_HoLo_H: Arr
     return _Fit(clusters, detector).trunks(np.asarray(p_HoLo_H)[:2])
 
 
-def _upright(scene: Scene, detector: TrunkDetector) -> Clusters:
+def _upright(scene: Scene, detector: TrunkDetectorConfig) -> Clusters:
     """Return the points that stand above each other in the slice."""
     low, high = detector.heights
     chosen = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
@@ -161,7 +163,7 @@ class _Fit:
     [x, y, r, l_x, l_y]: its axis at the reference height, its radius, its lean.
     """
 
-    def __init__(self, clusters: Clusters, detector: TrunkDetector) -> None:
+    def __init__(self, clusters: Clusters, detector: TrunkDetectorConfig) -> None:
         self._clusters, self._detector = clusters, detector
         # Heights over the reference height.
         self._heights = clusters.scene.heights[clusters.rows] - detector.reference_height

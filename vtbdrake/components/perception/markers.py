@@ -173,7 +173,7 @@ REFINEMENTS = ("lines", "subpixel", "none")
 
 
 @dataclass
-class MarkerDetector:
+class MarkerDetectorConfig:
     """Settings of the detection of markers in an image.
 
     Attributes:
@@ -226,7 +226,7 @@ class Detections:
         return Detections(self.ids[known], self.corners[known])
 
 
-def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetector | None = None) -> Detections:
+def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetectorConfig | None = None) -> Detections:
     """Find the markers of the family 36h11 in an image; there may be none.
 
     Args:
@@ -236,7 +236,7 @@ def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetec
     Raises:
         ImportError: OpenCV is missing.
     """
-    aruco, detector = _aruco(), detector or MarkerDetector()
+    aruco, detector = _aruco(), detector or MarkerDetectorConfig()
     grey = _grey(image)
     parameters = aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = 3

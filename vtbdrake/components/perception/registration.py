@@ -144,7 +144,7 @@ def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: 
 
 
 @dataclass
-class Registration:
+class RegistrationConfig:
     """Noise and limits of the registration of laser points.
 
     Attributes:
@@ -170,7 +170,7 @@ class Registration:
     def __post_init__(self) -> None:
         if not (self.range_noise > 0.0 and self.basin > 4.0 * self.range_noise and self.systematic >= 0.0):
             raise ValueError(
-                "a Registration needs a positive range_noise and a basin of more than 4 times that, not "
+                "a RegistrationConfig needs a positive range_noise and a basin of more than 4 times that, not "
                 f"{self.range_noise} and {self.basin}; systematic is not negative"
             )
 
@@ -188,7 +188,7 @@ def register_points(
     *,
     eye: ArrayLike,
     time: float,
-    registration: Registration | None = None,
+    registration: RegistrationConfig | None = None,
     deviation: tuple[float, float] = (0.3, 0.3),
 ) -> PoseEstimate:
     r"""Estimate the pose X_AT of a body from points on its surface, by the iterated closest point algorithm.
@@ -214,7 +214,7 @@ def register_points(
     Returns:
         An estimate of X_AT; a missing one if too few points lie on the body.
     """
-    settings = registration or Registration()
+    settings = registration or RegistrationConfig()
     points, eye = np.asarray(points, dtype=float).reshape(-1, 3), np.asarray(eye, dtype=float)
     R, p = start.rotation().matrix(), start.translation()
     near = _within(points, p, faces, settings.basin)

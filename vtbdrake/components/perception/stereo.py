@@ -70,7 +70,7 @@ class StereoCamera:
         return cls(info.width(), info.height(), info.focal_x(), info.center_x(), info.center_y(), baseline)
 
     @property
-    def field_of_view(self) -> float:
+    def fov_x(self) -> float:
         """The angle from the left edge of the images to the right one, in rad."""
         return atan(self.center_x / self.focal_length) + atan((self.width - self.center_x) / self.focal_length)
 

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    QueryObject,
-    RenderCameraCore,
-)
+from pydrake.geometry import QueryObject
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     AbstractStateIndex,
@@ -27,14 +18,21 @@ from pydrake.systems.framework import (
     State,
 )
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
-from scipy.ndimage import minimum_filter
 
 from vtbdrake.components.environment.haze import HAZE, hazed
 from vtbdrake.components.environment.light import LIGHT
-from vtbdrake.components.rendering import FILL, SUN, Illumination, RenderedScene, RenderingError
+from vtbdrake.components.rendering import (
+    FILL,
+    FULL_SCALE,
+    SUN,
+    Illumination,
+    RenderedScene,
+    RenderedView,
+    RenderingError,
+    shade,
+)
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream, uniform_noise
-from vtbdrake.components.shadows import sunlit
 from vtbdrake.settings import check_settings
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
@@ -49,7 +47,6 @@ if TYPE_CHECKING:
 
 # Channels of a camera's stream of random numbers.
 _PIXEL_CHANNEL, _DROPOUT_CHANNEL = 0, 2
-_FULL_SCALE = 255.0
 # What is too bright is rendered again with these parts of the exposure.
 _BRACKET = (4.0, 16.0, 64.0)
 
@@ -95,8 +92,8 @@ class Camera(AddressedSystem):
     The world is rendered by VTK in the light of the port ``light`` (without it, a white light from the camera, before
     Drake's sky), which is scaled by exposure and gain before it becomes 8 bits: dark images keep their detail. The sun
     throws shadows that are right to about a pixel (`sunlit`); a lamp and the Earth throw none. Exposure times have no
-    length: there is no motion blur. Haze veils by the distance along each ray. A surface within the distance ``near``
-    of the camera is not seen.
+    length: there is no motion blur. Haze veils by the distance along each ray. A surface within ``clipping_near`` of
+    the camera is not seen.
 
     The count y of a pixel is that of the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
     count m, n of N(0, 1), full scale S = 255, and g the gain:
@@ -130,8 +127,8 @@ class Camera(AddressedSystem):
         info: CameraInfo | None = None,
         depth: bool = False,
         X_FC: RigidTransform | None = None,
-        near: float = 0.05,
-        far: float = 200.0,
+        clipping_near: float = 0.05,
+        clipping_far: float = 200.0,
         supersampling: int = 1,
         photon_noise: float = 0.0,
         stream: int | None = None,
@@ -147,8 +144,8 @@ class Camera(AddressedSystem):
                 from top to bottom.
             depth: Whether there is a depth image, too.
             X_FC: Pose of the camera in F; by default the two are the same.
-            near: Distance along z_C in metres below which nothing is seen.
-            far: Distance along z_C in metres beyond which nothing is seen.
+            clipping_near: Distance along z_C in metres below which nothing is seen.
+            clipping_far: Distance along z_C in metres beyond which nothing is seen.
             supersampling: How many points across and down a pixel is the mean of.
             photon_noise: Standard deviation of the shot noise at full scale, in counts.
             stream: Number of the random stream, as in `SampledSensor`.
@@ -165,8 +162,11 @@ class Camera(AddressedSystem):
                 raise ValueError(f"Camera: images have no {name}; leave it out of the errors")
         if not 0.0 < period < inf:
             raise ValueError(f"Camera: the period is positive, in s, not {period!r}")
-        if not 0.0 < near < far < inf:
-            raise ValueError(f"Camera: near and far are distances in m, 0 < near < far, not {near!r} and {far!r}")
+        if not 0.0 < clipping_near < clipping_far < inf:
+            raise ValueError(
+                "Camera: clipping_near and clipping_far are distances in m, 0 < clipping_near < clipping_far, not "
+                f"{clipping_near!r} and {clipping_far!r}"
+            )
         if not (supersampling >= 1 and supersampling == int(supersampling)):
             raise ValueError(f"Camera: supersampling is a whole number of points, at least 1, not {supersampling!r}")
         if not (isfinite(photon_noise) and photon_noise >= 0.0):
@@ -176,7 +176,8 @@ class Camera(AddressedSystem):
         info = info or CameraInfo(320, 240, np.pi / 4)
         self._width, self._height = info.width(), info.height()
         self._period, self._stream = float(period), random_stream(self, stream)
-        self._near, self._far, self._supersampling = float(near), float(far), int(supersampling)
+        self._clipping_near, self._clipping_far = float(clipping_near), float(clipping_far)
+        self._supersampling = int(supersampling)
         # The number of the frame, because the id of a plant keeps it alive.
         self._frame_number = plant.GetBodyFrameIdOrThrow(frame.body().index()).get_value()
         self._declare_parameters(
@@ -272,7 +273,9 @@ class Camera(AddressedSystem):
         X_WC = _pose_of(query, self._frame_number) @ pose_from_array(settings.pose)
         self._check_outside(view, X_WC.translation())
         info = CameraInfo(self._width, self._height, *settings.intrinsics)
-        camera = _RenderCamera(scene, view, info, (self._near, self._far), X_WC, points=self._supersampling)
+        camera = RenderedView(
+            scene, view, info, (self._clipping_near, self._clipping_far), X_WC, points=self._supersampling
+        )
         # Where nothing changes a pixel that is saturated, there is no need to know how bright it is.
         unsaturated = illumination.shadows or haze.extinction or settings.noise or settings.photon_noise
         bracket = _BRACKET if unsaturated else ()
@@ -280,19 +283,19 @@ class Camera(AddressedSystem):
         depth = camera.depth() if illumination.shadows or haze.extinction or self._depth is not None else None
         if depth is not None and illumination.shadows:
             direction = LIGHT.view(np.asarray(light)).direction
-            _shade(expected, camera, depth, direction=direction, reach=self._far)
+            shade(expected, camera, depth, direction=direction, reach=self._clipping_far)
         if illumination.fills:
             expected += camera.color(FILL, bracket)
         if depth is not None and haze.extinction:
             distance = depth * np.linalg.norm(camera.rays_C, axis=0)
-            airlight = _FULL_SCALE * illumination.exposure * haze.airlight
+            airlight = FULL_SCALE * illumination.exposure * haze.airlight
             veiled = hazed(expected, distance=distance, extinction=haze.extinction, airlight=airlight)
             expected = veiled.astype(np.float32)
         return expected, depth if self._depth is not None else None
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
         for found in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
-            if found.distance < -self._near:
+            if found.distance < -self._clipping_near:
                 name = view.inspector().GetName(found.id_G).partition(" ")[2]
                 raise RenderingError(
                     f"camera {self.get_name()} is {-found.distance:.3g} m inside {name}, where it sees nothing: change "
@@ -307,7 +310,7 @@ class Camera(AddressedSystem):
         if noise or photon_noise:
             seed = int(settings.seed)
             generator = noise_generator(seed=seed, stream=self._stream(), tick=tick, channel=_PIXEL_CHANNEL)
-            sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / _FULL_SCALE * expected)
+            sigma = np.sqrt((gain * noise) ** 2 + gain * photon_noise**2 / FULL_SCALE * expected)
             expected += sigma * generator.standard_normal(expected.shape, np.float32)
         return _counts(expected), np.zeros((0, 0), np.float32) if depth is None else depth
 
@@ -372,97 +375,5 @@ def _pose_of(query: QueryObject, frame_number: int) -> RigidTransform:
 def _counts(expected: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return what opaque pixels count, (h, w, 4): saturated and rounded. The argument is used up."""
     counts = np.full((*expected.shape[:2], 4), 255, np.uint8)
-    counts[..., :3] = np.rint(np.clip(expected, 0.0, _FULL_SCALE, out=expected), out=expected)
+    counts[..., :3] = np.rint(np.clip(expected, 0.0, FULL_SCALE, out=expected), out=expected)
     return counts
-
-
-class _RenderCamera:
-    """Renders colour and depth of a scene with one camera."""
-
-    def __init__(
-        self,
-        scene: RenderedScene,
-        view: QueryObject,
-        info: CameraInfo,
-        limits: tuple[float, float],
-        X_WC: RigidTransform,
-        *,
-        points: int,
-    ) -> None:
-        self.view, self._scene, self._info, self._limits, self.X_WC = view, scene, info, limits, X_WC
-        self._points = points
-        self._world = view.inspector().world_frame_id()
-
-    def _core(self, renderer: str, info: CameraInfo) -> RenderCameraCore:
-        return RenderCameraCore(renderer, info, ClippingRange(*self._limits), RigidTransform())
-
-    def color(self, renderer: str, bracket: Sequence[float]) -> NDArray[np.float32]:
-        """Return the counts of a renderer, shape (h, w, 3); 255 if too bright for the smallest exposure.
-
-        Args:
-            renderer: `SUN` or `FILL`.
-            bracket: Increasing numbers by which the exposure is divided for what was too bright.
-        """
-        counts = self._counts(renderer).astype(np.float32)
-        for factor in bracket:
-            if counts.max() < factor / 4.0 * _FULL_SCALE:
-                break
-            darker = np.float32(factor) * self._counts(self._scene.darker(renderer, factor))
-            # Brighter by more than rounding explains: saturated, or at an edge the mean of something saturated.
-            counts = np.where(darker > counts + 0.75 * factor, darker, counts)
-        k = self._points
-        if k == 1:
-            return counts
-        mean = np.zeros((self._info.height(), self._info.width(), 3), np.float32)
-        for i in range(k):
-            for j in range(k):
-                mean += counts[i::k, j::k]
-        mean /= k * k
-        return mean
-
-    def _counts(self, renderer: str) -> NDArray[np.uint8]:
-        """Return the counts of all points of the pixels, shape (k h, k w, 3)."""
-        k, info = self._points, self._info
-        intrinsics = (k * x for x in (info.focal_x(), info.focal_y(), info.center_x(), info.center_y()))
-        core = self._core(renderer, CameraInfo(k * info.width(), k * info.height(), *intrinsics))
-        return self.view.RenderColorImage(ColorRenderCamera(core, False), self._world, self.X_WC).data[..., :3]
-
-    def depth(self) -> NDArray[np.float32]:
-        """Return the depth image, shape (h, w)."""
-        camera = DepthRenderCamera(self._core(SUN, self._info), DepthRange(*self._limits))
-        return np.array(self.view.RenderDepthImage(camera, self._world, self.X_WC).data[..., 0])
-
-    @property
-    def focal(self) -> float:
-        """Return the larger focal length, in pixels."""
-        return float(max(self._info.focal_x(), self._info.focal_y()))
-
-    @cached_property
-    def rays_C(self) -> NDArray[np.float64]:
-        """Return the ray of each pixel up to z_C = 1, shape (3, h, w)."""
-        info = self._info
-        x = (np.arange(info.width()) + 0.5 - info.center_x()) / info.focal_x()
-        y = (np.arange(info.height()) + 0.5 - info.center_y()) / info.focal_y()
-        return np.stack((*np.meshgrid(x, y), np.ones((y.size, x.size))))
-
-
-def _shade(
-    color: NDArray[np.float32],
-    camera: _RenderCamera,
-    depth: NDArray[np.float32],
-    *,
-    direction: Sequence[float],
-    reach: float,
-) -> None:
-    """Darken the pixels of ``color`` that are in shadow, in place."""
-    # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
-    depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
-    visible = (color[..., 0] > 0.0) | (color[..., 1] > 0.0) | (color[..., 2] > 0.0)
-    bright = np.flatnonzero(visible & np.isfinite(depth) & (depth > 0.0))
-    points_C = camera.rays_C.reshape(3, -1)[:, bright] * depth.ravel()[bright]
-    points_W = camera.X_WC.rotation().matrix() @ points_C + camera.X_WC.translation()[:, np.newaxis]
-    spacing = depth.ravel()[bright].astype(float) / camera.focal
-    share = sunlit(camera.view, renderer=FILL, points_W=points_W, spacing=spacing, direction=direction, reach=reach)
-    shaded = bright[share < 1.0]
-    pixels = color.reshape(-1, 3)
-    pixels[shaded] *= share[share < 1.0, np.newaxis]

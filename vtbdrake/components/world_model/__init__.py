@@ -6,12 +6,12 @@ from vtbdrake.components.world_model.geometry import Part, add_to_plant
 from vtbdrake.components.world_model.local_frame import LocalFrame
 from vtbdrake.components.world_model.model import WORLD_MODEL_CODEC, WorldModel
 from vtbdrake.components.world_model.objects import Quantity, Relation, WorldObject, position_estimate
-from vtbdrake.components.world_model.observing import LifeCycle, fused, observe
+from vtbdrake.components.world_model.observing import LifeCycleConfig, fused, observe
 
 __all__ = [
     "WORLD_MODEL_CODEC",
     "GeoJsonError",
-    "LifeCycle",
+    "LifeCycleConfig",
     "LocalFrame",
     "Part",
     "Quantity",

@@ -24,7 +24,7 @@ from vtbdrake.components.world_model.objects import (
 
 
 @dataclass(frozen=True)
-class LifeCycle:
+class LifeCycleConfig:
     """When objects are confirmed, revised and retired. The defaults are assumed, not taken from data.
 
     Attributes:
@@ -53,7 +53,7 @@ class LifeCycle:
             raise ValueError(f"revise_within is a distance of at least 0 m, not {self.revise_within}")
 
 
-DEFAULT_LIFE_CYCLE = LifeCycle()
+DEFAULT_LIFE_CYCLE = LifeCycleConfig()
 
 
 def observe(
@@ -61,7 +61,7 @@ def observe(
     sightings: Sequence[Sighting],
     *,
     expected: Collection[str] = (),
-    rules: LifeCycle = DEFAULT_LIFE_CYCLE,
+    rules: LifeCycleConfig = DEFAULT_LIFE_CYCLE,
 ) -> WorldModel:
     """Return the model after an observation: the sightings of one instant, and the objects expected to be seen.
 
@@ -176,7 +176,7 @@ def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[
     return attributes
 
 
-def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
     hits = one.hits + 1
     return replace(
         one,
@@ -189,7 +189,7 @@ def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
     )
 
 
-def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: LifeCycle) -> dict[str, Sighting]:
+def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: LifeCycleConfig) -> dict[str, Sighting]:
     """Return the sighting nearest to each object that was expected elsewhere; one to one, by horizontal distance."""
     gain = np.zeros((len(unseen), len(left)))
     for i, world_object in enumerate(unseen):
@@ -200,7 +200,7 @@ def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: L
     return {unseen[i].identity: left[j] for i, j in zip(*one_to_one(gain), strict=True)}
 
 
-def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
     if one.conflicts + 1 < rules.revise:
         return replace(one, conflicts=one.conflicts + 1)
     return replace(
@@ -215,7 +215,7 @@ def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycle) -> WorldOb
     )
 
 
-def _new(identity: str, sighting: Sighting, rules: LifeCycle) -> WorldObject:
+def _new(identity: str, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
     return WorldObject(
         identity,
         sighting.kind,
