@@ -533,7 +533,7 @@ def _source_options(command: Callable[..., None]) -> Callable[..., None]:
             f"--{name}",
             "source",
             flag_value=name,
-            default=name == "scanner",
+            default="scanner",
             show_default=False,
             help=f"{description}.",
         )(command)

@@ -19,6 +19,7 @@ from vtbdrake_diagrams.forest.studies.drives import (
     Track,
     forest,
     localize,
+    main,
     nees_bounds,
     plain,
     recorded_drive,
@@ -151,6 +152,11 @@ def test_worlds_differ_and_are_reproducible(world: Callable[..., CarrierScenario
 def test_forests_are_of_both_kinds() -> None:
     assert {forest(seed).stand_kind for seed in range(3)} == {"natural", "clustered"}
     assert forest(1).stereo.seed != forest(2).stereo.seed
+
+
+@pytest.mark.parametrize(("arguments", "source"), [([], "scanner"), *(([f"--{name}"], name) for name in SOURCES)])
+def test_option_names_the_source(arguments: list[str], source: str) -> None:
+    assert main.make_context("drives", arguments).params["source"] == source
 
 
 @pytest.mark.parametrize("source", SOURCES)
