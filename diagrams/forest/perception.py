@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 from threadpoolctl import ThreadpoolController
 
 from vtbdrake.components.arrival import Arrival
@@ -39,8 +39,7 @@ from vtbdrake.components.localization.unit import (
     UnitState,
 )
 from vtbdrake.scan import Scan
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed.slow_part import SlowPart
 
 Array = NDArray[np.float64]
@@ -154,7 +153,7 @@ def shown(landmarks: Landmarks) -> Array:
     return rows.ravel()
 
 
-class PresentPose(LeafSystem):
+class PresentPose(AddressedSystem):
     r"""The present pose of the carrier on the map: the last pose of the localizer, continued by dead reckoning.
 
     .. pydrake_system::
@@ -181,8 +180,6 @@ class PresentPose(LeafSystem):
     last pose is older than the parameter ``patience`` (s), the status is `LOST`.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, drift: DriftModel, axle: float) -> None:
         """Declare the system.
 
@@ -193,37 +190,37 @@ class PresentPose(LeafSystem):
         """
         super().__init__()
         self._drift, self._axle = drift, axle
-        sizes = {"motion": MOTION, "pose": 3, "covariance": 9, "status": 1, "odometry": 3, "time": 1}
+        sizes = {"motion": MOTION.size, "pose": 3, "covariance": 9, "status": 1, "odometry": 3, "time": 1}
         self._ports = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
         first = Localization.unknown()
-        estimate = self.DeclareDiscreteState(np.array([0.0, *first.pose, *first.covariance.ravel(), first.status]))
-        self.DeclareStateOutputPort("pose_estimate", estimate)
-        index = int(estimate)
-        patience = self.DeclareNumericParameter(BasicVector([_PATIENCE]))
-        self.variables = (
-            parameter("patience", int(patience), unit="s", bounds=(0.0, 3600.0)),
-            discrete_state("time", index, unit="s"),
-            discrete_state("position", index, start=1, shape=(2,), unit="m"),
-            discrete_state("heading", index, start=3, unit="rad"),
-            discrete_state("covariance", index, start=4, shape=(3, 3), unit="m^2, rad^2"),
-            discrete_state("status", index, start=13),
+        self._settings = self.declare_parameters(patience=Quantity(_PATIENCE, "s", (0.0, 3600.0)))
+        self._estimate = self.declare_discrete_state(
+            time=Quantity(0.0, "s"),
+            position=Quantity(first.pose[:2], "m"),
+            heading=Quantity(first.pose[2], "rad"),
+            covariance=Quantity(first.covariance, "m^2, rad^2"),
+            status=Quantity(first.status),
         )
+        self.DeclareStateOutputPort("pose_estimate", self._estimate.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         motion, pose, covariance, status, X_OH, time = (port.Eval(context) for port in self._ports.values())
         now = context.get_time()
-        if np.isfinite(covariance).all() and now - time[0] > context.get_numeric_parameter(0).value()[0]:
+        if np.isfinite(covariance).all() and now - time[0] > self._settings.view(context).patience:
             lost = Localization.unknown(LOST)
             pose, covariance, status = lost.pose, lost.covariance, [lost.status]
         elif np.isfinite(covariance).all():
-            since, _, _, x, y, heading, speed, turn_rate = motion.tolist()
-            X_OA = compose([x, y, heading], [self._axle, 0.0, 0.0])
-            X_OA_now = compose(X_OA, chord(speed * (now - since), turn_rate * (now - since)))
+            last = MOTION.view(motion)
+            elapsed = now - last.time
+            X_OA = compose([*last.position.tolist(), last.heading], [self._axle, 0.0, 0.0])
+            X_OA_now = compose(X_OA, chord(last.speed * elapsed, last.turn_rate * elapsed))
             X_OH_now = compose(X_OA_now, [-self._axle, 0.0, 0.0])
             X_HH_now = compose(inverse(X_OH), X_OH_now)
             pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - float(time[0]))
-        state.set_value(0, [now, *pose, *covariance.ravel(), status[0]])
+        estimate = self._estimate.mutable(state)
+        estimate.time, estimate.position, estimate.heading = now, pose[:2], pose[2]
+        estimate.covariance, estimate.status = np.reshape(covariance, (3, 3)), status[0]
 
 
 def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, duration: float) -> tuple[Array, Array]:

@@ -103,7 +103,7 @@ class Calibration(AddressedSystem):
             gyro_bias=Quantity(np.zeros(3), "rad/s", (-1.0, 1.0)),
             accelerometer_bias=Quantity(np.zeros(3), "m/s^2", (-1.0, 1.0)),
             encoder_offset=Quantity(np.zeros(joints), "rad", (-0.1, 0.1)),
-            _contact_offset=Quantity(np.zeros(feet)),
+            contact_offset=Quantity(np.zeros(feet), addressed=False),
             imu_time_constant=Quantity(0.02, "s", (0.0, 10.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)

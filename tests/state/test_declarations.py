@@ -19,7 +19,9 @@ class Counter(AddressedSystem):
     def __init__(self):
         super().__init__()
         self.settings = self.declare_parameters(
-            gain=Quantity([1.0, 3.0], unit="N", bounds=(0.0, 10.0)), _step=Quantity(2.0), factor=Quantity(0.5)
+            gain=Quantity([1.0, 3.0], unit="N", bounds=(0.0, 10.0)),
+            step=Quantity(2.0, addressed=False),
+            factor=Quantity(0.5),
         )
         self.memory = self.declare_discrete_state(count=Quantity(0.0, unit="s"), direction=Quantity([[1.0, 2.0]]))
         self.doubled = self.declare_cache("2 gain", self._calc_doubled, {self.all_parameters_ticket()})
@@ -34,7 +36,7 @@ class Counter(AddressedSystem):
 
     def _update(self, context, state):
         memory = self.memory.mutable(state)
-        memory.count += self.settings.view(context)._step
+        memory.count += self.settings.view(context).step
         memory.direction = 2.0 * memory.direction
 
 
@@ -64,7 +66,7 @@ def test_quantities_are_variables_at_their_entries():
 def test_updates_read_and_write_by_name():
     diagram, system = counting()
     simulator = Simulator(diagram)
-    system.settings.mutable(system.GetMyMutableContextFromRoot(simulator.get_mutable_context()))._step = 4.0
+    system.settings.mutable(system.GetMyMutableContextFromRoot(simulator.get_mutable_context())).step = 4.0
     simulator.AdvanceTo(2.5)
     context = system.GetMyContextFromRoot(simulator.get_context())
     np.testing.assert_array_equal(context.get_discrete_state(0).value(), [12.0, 8.0, 16.0])

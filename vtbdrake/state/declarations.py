@@ -58,6 +58,7 @@ class Quantity:
     default: ArrayLike = 0.0  # a number, or an array of the shape of the quantity
     unit: str = "1"  # SI unit; ``"1"`` if it has none
     bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for every entry
+    addressed: bool = True  # whether it is a variable of the Diagram
 
 
 class NamedView:
@@ -94,7 +95,7 @@ class NamedVector:
     shapes, defaults, units and bounds.
 
     Attributes:
-        quantities: The quantities by name. One whose name begins with ``_`` has no address.
+        quantities: The quantities by name.
         size: Number of entries.
     """
 
@@ -127,7 +128,7 @@ class NamedVector:
     def elements(self, group: str, index: int) -> Iterator[Element]:
         """Yield the pieces of the numeric group ``index`` that this vector describes."""
         for name, quantity in self.quantities.items():
-            if not name.startswith("_"):
+            if quantity.addressed:
                 shape, start = self._defaults[name].shape, self._starts[name]
                 yield Element(name, group, index, shape, start, quantity.unit, quantity.bounds)
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import atan2
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,16 +42,12 @@ from pydrake.multibody.tree import FixedOffsetFrame, RigidBody, SpatialInertia
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    DiscreteStateIndex,
     DiscreteValues,
-    LeafSystem,
-    ValueProducer,
 )
 
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.forest.world.ground import Ground
 
 Array = NDArray[np.float64]
@@ -173,7 +170,19 @@ def standing_pose(
     return RigidTransform(RollPitchYaw(roll, pitch, heading), [position[0], position[1], float(heights.mean())])
 
 
-class Wheels(LeafSystem):
+class _Contact(NamedTuple):
+    """What the ground does to the four wheels."""
+
+    # The tyres' deflections at the end of the step, (4, 2) in m.
+    deflections: Array
+    # Force in N and moment about Bo in N m on the carrier, in W, (3,) each.
+    force: Array
+    moment: Array
+    # The forces by which the ground presses on the wheels, (4,) in N.
+    loads: Array
+
+
+class Wheels(AddressedSystem):
     """The forces of the ground on the wheels of a `Carrier` (equations in the module), and its drive and steering.
 
     .. pydrake_system::
@@ -193,8 +202,6 @@ class Wheels(LeafSystem):
     The system is stepped with the plant's period. A force is computed from the deflection at the end of the step, which
     makes the spring of a tyre as stable as the plant's own semi-implicit step.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(self, plant: MultibodyPlant, body: RigidBody, carrier: Carrier, ground: Ground) -> None:
         """Declare the system.
@@ -221,48 +228,40 @@ class Wheels(LeafSystem):
         tyre = carrier.cornering * load / carrier.relaxation_length
         # A quarter of critical damping of the tyres' own oscillation.
         self._tyre = (tyre, 0.5 * (tyre * carrier.mass / 4.0) ** 0.5)
-        self._limits = (carrier.acceleration * self._step, carrier.curvature_rate * self._step)
+        # In one step.
+        self._speed_change = carrier.acceleration * self._step
+        self._curvature_change = carrier.curvature_rate * self._step
         self._largest_curvature = carrier.largest_curvature
 
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self._controls = self.DeclareVectorInputPort("controls", 2)
-        drive = DiscreteStateIndex(self.DeclareDiscreteState(2))
-        tyres = DiscreteStateIndex(self.DeclareDiscreteState(8))
-        self.DeclareNumericParameter(BasicVector([carrier.friction]))
-        self.variables = (
-            discrete_state("speed", int(drive), unit="m/s"),
-            discrete_state("curvature", int(drive), start=1, unit="1/m"),
-            discrete_state("deflection", int(tyres), shape=(4, 2), unit="m"),
-            parameter("friction", 0, bounds=(0.0, np.inf)),
-        )
+        self._drive = self.declare_discrete_state(speed=Quantity(0.0, "m/s"), curvature=Quantity(0.0, "1/m"))
+        self._tyres = self.declare_discrete_state(deflection=Quantity(np.zeros((4, 2)), "m"))
+        self._settings = self.declare_parameters(friction=Quantity(carrier.friction, bounds=(0.0, np.inf)))
         sources = {
             self._state.ticket(),
-            self.discrete_state_ticket(drive),
-            self.discrete_state_ticket(tyres),
+            self.discrete_state_ticket(self._drive.index),
+            self.discrete_state_ticket(self._tyres.index),
             self.all_parameters_ticket(),
         }
-        forces = ValueProducer(allocate=lambda: Value(object()), calc=weakly(self, Wheels._calc_contact))
-        self._contact = self.DeclareCacheEntry("contact", forces, sources).cache_index()
+        self._contact = self.declare_cache("contact", self._calc_contact, sources)
         self.DeclareAbstractOutputPort(
             "spatial_force",
             lambda: Value([ExternallyAppliedSpatialForce()]),
-            weakly(self, Wheels._calc_force),
+            self._calc_force,
             prerequisites_of_calc=sources,
         )
         self.DeclareVectorOutputPort(
             "speed",
             1,
-            weakly(self, Wheels._calc_speed),
-            prerequisites_of_calc={self.discrete_state_ticket(drive)},
+            self._calc_speed,
+            prerequisites_of_calc={self.discrete_state_ticket(self._drive.index)},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(self._step, 0.0, self._update)
 
-    def _calc_contact(self, context: Context, output: Value) -> None:  # type: ignore[valid-type]
-        """Compute the tyres' deflections at the end of the step, (4, 2), and force and moment about Bo, (3,) each."""
-        x = self._state.Eval(context)
-        speed, curvature = context.get_discrete_state(0).value().tolist()
-        friction = context.get_numeric_parameter(0).value().item()
-        deflections = context.get_discrete_state(1).value().reshape(4, 2)
+    def _calc_contact(self, context: Context) -> _Contact:
+        x, drive = self._state.Eval(context), self._drive.view(context)
+        friction, deflections = self._settings.view(context).friction, self._tyres.view(context).deflection
 
         R_WB = quaternion_matrix(x[self._q : self._q + 4])
         p_WBo, w_WB, v_WBo = x[self._q + 4 : self._q + 7], x[self._v : self._v + 3], x[self._v + 3 : self._v + 6]
@@ -277,7 +276,7 @@ class Wheels(LeafSystem):
         pressed = self._load + self._stiffness * approach - self._damping * (velocities * normals).sum(axis=1)
         N = np.maximum(pressed, 0.0)
 
-        forward, treads = self._rolling(R_WB, speed, curvature)
+        forward, treads = self._rolling(R_WB, drive.speed, drive.curvature)
         along = forward - (forward * normals).sum(axis=1)[:, np.newaxis] * normals
         along /= np.sqrt((along**2).sum(axis=1))[:, np.newaxis]
         left = _cross(normals, along)
@@ -292,7 +291,7 @@ class Wheels(LeafSystem):
         # A sliding tyre is deflected as far as its force, which is limited by friction, deflects it.
         u = np.where(share < 1.0, -F / tyre, u)
         forces = N[:, np.newaxis] * normals + F[:, :1] * along + F[:, 1:] * left
-        output.set_value((u, forces.sum(axis=0), _cross(arms, forces).sum(axis=0), N))  # type: ignore[attr-defined]
+        return _Contact(u, forces.sum(axis=0), _cross(arms, forces).sum(axis=0), N)
 
     def _rolling(self, R_WB: Array, speed: float, curvature: float) -> tuple[Array, Array]:
         """Return the directions in which the wheels roll, in W, (4, 3), and the speeds of their treads (m/s), (4,)."""
@@ -303,34 +302,29 @@ class Wheels(LeafSystem):
         return (ways / lengths[:, np.newaxis]) @ R_WB[:, :2].T, speed * lengths
 
     def _calc_force(self, context: Context, output: Value) -> None:  # type: ignore[valid-type]
-        _, force, moment, _ = self.get_cache_entry(self._contact).Eval(context)
+        contact: _Contact = self._contact(context)
         applied = ExternallyAppliedSpatialForce()
         applied.body_index = self._body
-        applied.F_Bq_W = SpatialForce(tau=moment, f=force)
+        applied.F_Bq_W = SpatialForce(tau=contact.moment, f=contact.force)
         output.set_value([applied])  # type: ignore[attr-defined]
 
     def _calc_speed(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state(0).value().item(0))
+        output.SetAtIndex(0, self._drive.view(context).speed)
 
     def wheel_loads(self, context: Context) -> Array:
         """Return the forces in N by which the ground presses on the wheels, (4,), in the order of `Carrier.p_BoC_B`."""
-        loads: Array = self.get_cache_entry(self._contact).Eval(context)[3]
-        return loads
+        contact: _Contact = self._contact(context)
+        return contact.loads
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        deflections = self.get_cache_entry(self._contact).Eval(context)[0]
-        present = context.get_discrete_state(0).value().tolist()
+        contact: _Contact = self._contact(context)
         speed, curvature = self._controls.Eval(context).tolist()
         largest = self._largest_curvature
-        wanted = (speed, min(max(curvature, -largest), largest))
-        state.set_value(
-            0,
-            [
-                now + min(max(goal - now, -limit), limit)
-                for now, goal, limit in zip(present, wanted, self._limits, strict=True)
-            ],
-        )
-        state.set_value(1, deflections.ravel())
+        curvature = min(max(curvature, -largest), largest)
+        drive = self._drive.mutable(state)
+        drive.speed += min(max(speed - drive.speed, -self._speed_change), self._speed_change)
+        drive.curvature += min(max(curvature - drive.curvature, -self._curvature_change), self._curvature_change)
+        self._tyres.mutable(state).deflection = contact.deflections
 
 
 def quaternion_matrix(q: Array) -> Array:
@@ -361,8 +355,6 @@ class WheelOdometer(SampledSensor):
     which the sensor computes it, over the true one. The carrier is faster or slower by the slip.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, scale: float = 1.0, errors: ErrorModel | None = None) -> None:
         """Declare the sensor.
 
@@ -374,9 +366,8 @@ class WheelOdometer(SampledSensor):
         noise = {"noise": (1, "m/s")}
         super().__init__("odometry", default=[0.0], period=period, unit="m/s", noise=noise, errors=errors)
         self._speed = self.DeclareVectorInputPort("speed", 1)
-        self._scale = int(self.DeclareNumericParameter(BasicVector([scale])))
-        self.variables += (parameter("scale", self._scale, bounds=(0.0, np.inf)),)
+        self._settings = self.declare_parameters(scale=Quantity(scale, bounds=(0.0, np.inf)))
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        measured: Array = self._speed.Eval(context) * context.get_numeric_parameter(self._scale).value()
+        measured: Array = self._speed.Eval(context) * self._settings.view(context).scale
         return measured

@@ -7,10 +7,9 @@ from math import cos, hypot, sin
 
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.forest.world.carrier import quaternion_matrix
 from vtbdrake_diagrams.forest.world.routes import Route
 
@@ -21,7 +20,7 @@ _LOOK_AHEAD, _LOST = 3.0, 2.5
 _SAME_ROAD = 0.2
 
 
-class Driver(LeafSystem):
+class Driver(AddressedSystem):
     """A driver who follows the advised route by the true pose, as a human does who sees the road.
 
     .. pydrake_system::
@@ -43,8 +42,6 @@ class Driver(LeafSystem):
 
     The driver is sampled. State: ``route``, the distance ``along`` it (m), ``lap``, and the controls.
     """
-
-    __slots__ = NO_DICT
 
     def __init__(
         self,
@@ -77,44 +74,41 @@ class Driver(LeafSystem):
         self._q = body.floating_positions_start()
         self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         self._advice = self.DeclareVectorInputPort("route", 1)
-        progress = int(self.DeclareDiscreteState([float(route), along, 0.0]))
-        controls = DiscreteStateIndex(self.DeclareDiscreteState(2))
-        self.DeclareStateOutputPort("controls", controls)
-        self.DeclareNumericParameter(BasicVector([speed]))
-        self.variables = (
-            discrete_state("route", progress, bounds=(0.0, len(self._routes) - 1.0)),
-            discrete_state("along", progress, start=1, unit="m"),
-            discrete_state("lap", progress, start=2),
-            discrete_state("wanted_speed", int(controls), unit="m/s"),
-            discrete_state("wanted_curvature", int(controls), start=1, unit="1/m"),
-            parameter("speed", 0, unit="m/s", bounds=(0.0, 3.0)),
+        self._progress = self.declare_discrete_state(
+            route=Quantity(route, bounds=(0.0, len(self._routes) - 1.0)), along=Quantity(along, "m"), lap=Quantity(0.0)
         )
+        self._controls = self.declare_discrete_state(
+            wanted_speed=Quantity(0.0, "m/s"), wanted_curvature=Quantity(0.0, "1/m")
+        )
+        self.DeclareStateOutputPort("controls", self._controls.index)
+        self._settings = self.declare_parameters(speed=Quantity(speed, "m/s", (0.0, 3.0)))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        number, along, lap = context.get_discrete_state(0).value().tolist()
+        progress, controls = self._progress.mutable(state), self._controls.mutable(state)
         x = self._state.Eval(context)[self._q : self._q + 7]
         forward = quaternion_matrix(x[:4])[:2, 0]
         forward = forward / hypot(*forward.tolist())
         place = x[4:6] - self._rear * forward
 
-        number = self._chosen(int(number), along, self._advice.Eval(context).item(0))
+        number = self._next_route(int(progress.route), progress.along, self._advice.Eval(context).item(0))
         route = self._routes[number]
-        heading = route.heading(along)
-        off = place - route.position(along)
+        heading = route.heading(progress.along)
+        off = place - route.position(progress.along)
         if hypot(*off.tolist()) > _LOST:
-            along = route.nearest(place)
+            progress.along = route.nearest(place)
         else:
-            along += float(off @ (cos(heading), sin(heading)))
-        if along >= route.length:
-            along, lap = along - route.length, lap + 1.0
-        ahead = route.position(along + _LOOK_AHEAD) - place
+            progress.along += float(off @ (cos(heading), sin(heading)))
+        if progress.along >= route.length:
+            progress.along -= route.length
+            progress.lap += 1.0
+        progress.route = number
+        ahead = route.position(progress.along + _LOOK_AHEAD) - place
         sideways = forward[0] * ahead[1] - forward[1] * ahead[0]
-        speed = 0.0 if lap >= self._laps else context.get_numeric_parameter(0).value().item()
-        state.set_value(0, [number, along, lap])
-        state.set_value(1, [speed, 2.0 * float(sideways) / float(ahead @ ahead)])
+        controls.wanted_speed = 0.0 if progress.lap >= self._laps else self._settings.view(context).speed
+        controls.wanted_curvature = 2.0 * float(sideways) / float(ahead @ ahead)
 
-    def _chosen(self, present: int, along: float, advised: float) -> int:
+    def _next_route(self, present: int, along: float, advised: float) -> int:
         """Return the number of the route to follow from here."""
         number = min(max(round(advised), 0), len(self._routes) - 1)
         if number == present:

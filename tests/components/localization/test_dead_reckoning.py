@@ -308,4 +308,4 @@ def test_drift_is_finite_and_not_negative(name):
 
 
 def test_motion_has_the_declared_size():
-    assert DeadReckoning(period=T).GetOutputPort("motion").size() == MOTION
+    assert DeadReckoning(period=T).GetOutputPort("motion").size() == MOTION.size

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.components.casadi_system.kernel import Expression, Kernel
-from vtbdrake.state.declarations import Element, discrete_state, parameter
+from vtbdrake.state import declarations
+from vtbdrake.state.declarations import Element
 
 NEXT = "_next"
 INPUT, STATE, PARAMETER, TIME = "input", "state", "parameter", "time"
@@ -121,17 +122,17 @@ class Model:
         return list(self.state).index(name)
 
     def _elements(self, units: Mapping[str, str], bounds: Mapping[str, tuple[float, float]]) -> Iterator[Element]:
-        def declared(name: str) -> dict[str, Any]:
+        def described(name: str) -> dict[str, Any]:
             rows, columns = self.shapes[name]
             shape = (rows, columns) if columns > 1 else (rows,) if rows > 1 else ()
             return {"shape": shape, "unit": units.get(name, "1"), "bounds": bounds.get(name, (-inf, inf))}
 
         start = 0
         for name in self.parameters:
-            yield parameter(name, 0, start=start, **declared(name))
+            yield Element(name, declarations.PARAMETER, 0, start=start, **described(name))
             start += self.size(name)
         for index, name in enumerate(self.state):
-            yield discrete_state(name, index, **declared(name))
+            yield Element(name, declarations.DISCRETE, index, **described(name))
 
     def _symbols(self, kind: type) -> dict[str, Expression]:
         return {name: kind.sym(f"a{k}", self.size(name)) for k, name in enumerate(self.shapes)}  # type: ignore[attr-defined]

@@ -14,17 +14,25 @@ from math import atan2, ceil, cos, hypot, inf, sin, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.localization.planar import rotation
 from vtbdrake.scan import Scan
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, NamedVector, Quantity
+from vtbdrake.state.declarations import NamedView
 
 Array = NDArray[np.float64]
 
-MOTION = 8
-"""Size of the port ``motion``: [time (s), roll, pitch (rad), x, y (m), heading (rad), speed (m/s), turn (rad/s)]."""
+MOTION = NamedVector(
+    time=Quantity(unit="s"),
+    roll=Quantity(unit="rad"),
+    pitch=Quantity(unit="rad"),
+    position=Quantity([0.0, 0.0], "m"),
+    heading=Quantity(unit="rad"),
+    speed=Quantity(unit="m/s"),
+    turn_rate=Quantity(unit="rad/s"),
+)
+"""The port ``motion``."""
 POSE = 6
 """Size of an entry of the port ``history``: [time (s), roll, pitch (rad), x, y (m), heading (rad)]."""
 HISTORY_LENGTH = 1.0
@@ -93,7 +101,7 @@ class DriftModel:
         return covariance
 
 
-class DeadReckoning(LeafSystem):
+class DeadReckoning(AddressedSystem):
     r"""Roll, pitch, and the path in the plane, from an IMU and the speed of the wheels.
 
     .. pydrake_system::
@@ -144,8 +152,6 @@ class DeadReckoning(LeafSystem):
     speed and turn rate keep their values.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, *, period: float, axle: float = 0.0) -> None:
         """Declare the system.
 
@@ -166,117 +172,105 @@ class DeadReckoning(LeafSystem):
         past = np.zeros((length, POSE))
         past[:, 0] = -period * np.arange(1, length + 1)
         variance = _BIAS_DEVIATION**2
-        starts = {
-            "motion": np.array([-period, *[0.0] * (MOTION - 1)]),
-            "history": past.ravel(),
-            # Gravity, velocity, and the gyros' bias.
-            "levelling": np.zeros(8),
-            # Variance of u, its covariance with the bias across u, variances of that bias and of the one about u.
-            "variances": np.array([1.0, 0.0, variance, variance]),
-            # Samples, those at rest, those ignored, mean speed and force, mean square of the shaking, its least value.
-            "counts": np.array([*[0.0] * 8, _LARGEST**2]),
-        }
-        groups = {name: self.DeclareDiscreteState(value) for name, value in starts.items()}
-        for port in ("motion", "history"):
-            self.DeclareStateOutputPort(port, groups[port])
-        self._groups = tuple(int(index) for index in groups.values())
-        motion, history, levelling, variances, counts = self._groups
-        settings = self.DeclareNumericParameter(BasicVector([0.1, 0.03, 0.02, 3e-5, 2e-3, axle, 3e-3]))
-        bounds = (0.0, inf)
-        self.variables = (
-            discrete_state("time", motion, unit="s"),
-            discrete_state("roll", motion, start=1, unit="rad"),
-            discrete_state("pitch", motion, start=2, unit="rad"),
-            discrete_state("position", motion, start=3, shape=(2,), unit="m"),
-            discrete_state("heading", motion, start=5, unit="rad"),
-            discrete_state("speed", motion, start=6, unit="m/s"),
-            discrete_state("turn_rate", motion, start=7, unit="rad/s"),
-            discrete_state("history", history, shape=(length, POSE), unit="s, rad, m"),
-            discrete_state("gravity", levelling, shape=(3,), unit="m/s^2"),
-            discrete_state("velocity", levelling, start=3, shape=(2,), unit="m/s"),
-            discrete_state("gyro_bias", levelling, start=5, shape=(3,), unit="rad/s"),
-            discrete_state("levelling_covariance", variances, shape=(3,), unit="rad^2, rad^2/s, rad^2/s^2"),
-            discrete_state("vertical_bias_variance", variances, start=3, unit="rad^2/s^2", bounds=bounds),
-            discrete_state("samples", counts, bounds=bounds),
-            discrete_state("samples_at_rest", counts, start=1, bounds=bounds),
-            discrete_state("ignored", counts, start=2, bounds=bounds),
-            discrete_state("mean_speed", counts, start=3, unit="m/s"),
-            discrete_state("mean_force", counts, start=4, shape=(3,), unit="m/s^2"),
-            discrete_state("shaking", counts, start=7, unit="m^2/s^4", bounds=bounds),
-            discrete_state("least_shaking", counts, start=8, unit="m^2/s^4", bounds=bounds),
-            parameter("sway", settings, unit="m/s^2", bounds=(0.0, 10.0)),
-            parameter("still_speed", settings, start=1, unit="m/s", bounds=(0.0, 1.0)),
-            parameter("still_rate", settings, start=2, unit="rad/s", bounds=(0.0, 1.0)),
-            parameter("bias_drift", settings, start=3, unit="rad/s^1.5", bounds=(0.0, 1.0)),
-            parameter("gyro_noise", settings, start=4, unit="rad/s", bounds=(0.0, 1.0)),
-            parameter("axle", settings, start=5, unit="m", bounds=(-10.0, 10.0)),
-            parameter("still_force", settings, start=6, unit="m/s^2", bounds=(0.0, 10.0)),
+        count = Quantity(bounds=(0.0, inf))
+        self._motion = self.declare_discrete_state(**{**MOTION.quantities, "time": Quantity(-period, "s")})
+        self._history = self.declare_discrete_state(history=Quantity(past, "s, rad, m"))
+        self._levelling = self.declare_discrete_state(
+            gravity=Quantity(np.zeros(3), "m/s^2"),
+            velocity=Quantity(np.zeros(2), "m/s"),
+            gyro_bias=Quantity(np.zeros(3), "rad/s"),
+        )
+        # Variance of u, its covariance with the bias across u, variances of that bias and of the one about u.
+        self._variances = self.declare_discrete_state(
+            levelling_covariance=Quantity([1.0, 0.0, variance], "rad^2, rad^2/s, rad^2/s^2"),
+            vertical_bias_variance=Quantity(variance, "rad^2/s^2", (0.0, inf)),
+        )
+        self._counts = self.declare_discrete_state(
+            samples=count,
+            samples_at_rest=count,
+            ignored=count,
+            mean_speed=Quantity(unit="m/s"),
+            mean_force=Quantity(np.zeros(3), "m/s^2"),
+            shaking=Quantity(0.0, "m^2/s^4", (0.0, inf)),
+            least_shaking=Quantity(_LARGEST**2, "m^2/s^4", (0.0, inf)),
+        )
+        for port, group in (("motion", self._motion), ("history", self._history)):
+            self.DeclareStateOutputPort(port, group.index)
+        self._settings = self.declare_parameters(
+            sway=Quantity(0.1, "m/s^2", (0.0, 10.0)),
+            still_speed=Quantity(0.03, "m/s", (0.0, 1.0)),
+            still_rate=Quantity(0.02, "rad/s", (0.0, 1.0)),
+            bias_drift=Quantity(3e-5, "rad/s^1.5", (0.0, 1.0)),
+            gyro_noise=Quantity(2e-3, "rad/s", (0.0, 1.0)),
+            axle=Quantity(axle, "m", (-10.0, 10.0)),
+            still_force=Quantity(3e-3, "m/s^2", (0.0, 10.0)),
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        motion, past, *inner = (context.get_discrete_state(group).value() for group in self._groups)
-        levelling, variances, counts = (values.tolist() for values in inner)
-        _, roll, pitch, x, y, heading, v_before, turn_rate = motion.tolist()
+        motion, past = self._motion.mutable(state), self._history.array(context)
+        counts, settings = self._counts.mutable(state), self._settings.view(context)
         sample = [*self._imu.Eval(context).tolist(), *self._odometry.Eval(context).tolist()]
-        axle = float(context.get_numeric_parameter(0).value()[5])
         T, now = self._period, context.get_time() - self._period
         # The first sample belongs to an interval before the start.
         begun = now > -T / 2.0
-        v = v_before
+        v = v_before = motion.speed
         if not all(abs(number) < _LARGEST for number in sample):
-            counts[2] += 1.0
+            counts.ignored += 1.0
         elif begun:
             v = sample[6]
-            if not counts[0]:  # How fast the carrier was before the first sample is not known.
+            if not counts.samples:  # How fast the carrier was before the first sample is not known.
                 v_before = v
-            counts = self._counted(context, sample, counts)
-            up, w, levelling, variances = self._levelled(context, sample, levelling, variances, counts)
+            self._count(counts, sample, settings)
+            up, w = self._level(state, sample, counts, settings)
             across = up[1] ** 2 + up[2] ** 2
-            turn_rate = (w[1] * up[1] + w[2] * up[2]) / max(across, 1e-9)
-            roll, pitch = atan2(up[1], up[2]), atan2(-up[0], sqrt(across))
+            motion.turn_rate = (w[1] * up[1] + w[2] * up[2]) / max(across, 1e-9)
+            motion.roll, motion.pitch = atan2(up[1], up[2]), atan2(-up[0], sqrt(across))
         if begun:
-            way, halfway, turned = T * (v_before + v) / 2.0 * cos(pitch), T * turn_rate / 2.0, T * turn_rate
+            x, y = motion.position.tolist()
+            heading, axle, turn_rate = motion.heading, settings.axle, motion.turn_rate
+            way, halfway, turned = T * (v_before + v) / 2.0 * cos(motion.pitch), T * turn_rate / 2.0, T * turn_rate
             x += way * cos(heading + halfway) - axle * (cos(heading + turned) - cos(heading))
             y += way * sin(heading + halfway) - axle * (sin(heading + turned) - sin(heading))
-            heading += turned
-        pose = [now, roll, pitch, x, y, heading]
-        values = ([*pose, v, turn_rate], np.concatenate((pose, past[:-POSE])), levelling, variances, counts)
-        for group, value in zip(self._groups, values, strict=True):
-            state.set_value(group, value)
+            motion.position, motion.heading = (x, y), heading + turned
+        motion.time, motion.speed = now, v
+        pose = self._motion.mutable_array(state)[:POSE]
+        self._history.mutable_array(state)[:] = np.concatenate((pose, past[:-POSE]))
 
-    def _counted(self, context: Context, sample: list[float], counts: list[float]) -> list[float]:
-        """Return the counters and means after a sample, in the order of ``counts``, (9,)."""
-        _, still_speed, still_rate, _, _, _, still_force = context.get_numeric_parameter(0).value().tolist()
-        samples, at_rest, ignored, speed, *force, shaking, least = counts
-        gain = max(self._period / _SETTLING_TIME, 1.0 / (samples + 1.0))
-        speed += gain * (sample[6] - speed)
-        force = [mean + gain * (f - mean) for mean, f in zip(force, sample[3:6], strict=True)]
-        shaking += gain * (sum((f - mean) ** 2 for f, mean in zip(sample[3:6], force, strict=True)) - shaking)
-        if samples * self._period > _SETTLING_TIME:
-            least = min(least, shaking)
-        moves = abs(speed) > still_speed or abs(sample[6]) > 4.0 * still_speed
-        moves = moves or any(abs(rate) > still_rate for rate in sample[:3])
-        moves = moves or shaking > max(4.0 * least, still_force**2)
-        return [samples + 1.0, 0.0 if moves else at_rest + 1.0, ignored, speed, *force, shaking, least]
+    def _count(self, counts: NamedView, sample: list[float], settings: NamedView) -> None:
+        """Bring the counters and means to what they are after a sample."""
+        speed, force = sample[6], sample[3:6]
+        gain = max(self._period / _SETTLING_TIME, 1.0 / (counts.samples + 1.0))
+        mean_speed, shaking = counts.mean_speed, counts.shaking
+        mean_speed += gain * (speed - mean_speed)
+        mean_force = [mean + gain * (f - mean) for mean, f in zip(counts.mean_force.tolist(), force, strict=True)]
+        shaking += gain * (sum((f - mean) ** 2 for f, mean in zip(force, mean_force, strict=True)) - shaking)
+        counts.mean_speed, counts.mean_force, counts.shaking = mean_speed, mean_force, shaking
+        if counts.samples * self._period > _SETTLING_TIME:
+            counts.least_shaking = min(counts.least_shaking, shaking)
+        moves = abs(mean_speed) > settings.still_speed or abs(speed) > 4.0 * settings.still_speed
+        moves = moves or any(abs(rate) > settings.still_rate for rate in sample[:3])
+        moves = moves or shaking > max(4.0 * counts.least_shaking, settings.still_force**2)
+        counts.samples += 1.0
+        counts.samples_at_rest = 0.0 if moves else counts.samples_at_rest + 1.0
 
-    def _levelled(
-        self, context: Context, sample: list[float], levelling: list[float], variances: list[float], counts: list[float]
-    ) -> tuple[list[float], list[float], list[float], list[float]]:
-        """Return the vertical in B, (3,), the angular velocity without bias (rad/s), (3,), and both states after it.
+    def _level(
+        self, state: DiscreteValues, sample: list[float], counts: NamedView, settings: NamedView
+    ) -> tuple[list[float], list[float]]:
+        """Return the vertical in B, (3,), and the angular velocity without bias (rad/s), (3,).
 
         Args:
-            context: The context, for the parameters.
+            state: The state, in which gravity, velocity, bias and variances become those after the sample.
             sample: Angular velocity (rad/s), specific force (m/s^2) and speed (m/s), (7,).
-            levelling: Gravity (m/s^2), velocity (m/s) and bias (rad/s) before, (8,).
-            variances: The variances before, (4,).
-            counts: The result of `_counted` for this sample, (9,).
+            counts: The counters after the sample.
+            settings: The parameters.
         """
-        sway, _, _, bias_drift, gyro_noise, axle, _ = context.get_numeric_parameter(0).value().tolist()
-        T, gravity, before, bias = self._period, levelling[:3], levelling[3:5], levelling[5:]
-        tilt, both, level, vertical = variances
-        vertical += bias_drift**2 * T
-        is_first, at_rest = counts[0] == 1.0, counts[1] * T > _SETTLING_TIME
+        levelling, variances = self._levelling.mutable(state), self._variances.mutable(state)
+        gravity, before, bias = levelling.gravity.tolist(), levelling.velocity.tolist(), levelling.gyro_bias.tolist()
+        tilt, both, level = variances.levelling_covariance.tolist()
+        T, bias_drift, gyro_noise = self._period, settings.bias_drift, settings.gyro_noise
+        vertical = variances.vertical_bias_variance + bias_drift**2 * T
+        is_first, at_rest = counts.samples == 1.0, counts.samples_at_rest * T > _SETTLING_TIME
         if at_rest:
             up = _direction(gravity)
             gain = vertical / max(vertical + gyro_noise**2, _TINY)
@@ -284,7 +278,7 @@ class DeadReckoning(LeafSystem):
             bias = [b + excess * e for b, e in zip(bias, up, strict=True)]
             vertical *= 1.0 - gain
         w = [rate - b for rate, b in zip(sample, bias, strict=False)]
-        velocity = [0.0, 0.0] if counts[1] else [sample[6], -axle * w[2]]
+        velocity = [0.0, 0.0] if counts.samples_at_rest else [sample[6], -settings.axle * w[2]]
         if is_first:
             before = velocity
         change = [(new - old) / T for old, new in zip(before, velocity, strict=True)]
@@ -297,12 +291,14 @@ class DeadReckoning(LeafSystem):
         tilt += T * (2.0 * both + T * level) + (gyro_noise * T) ** 2
         both += T * level
         level += bias_drift**2 * T
-        spread = max(tilt + sway**2 / square, _TINY)
+        spread = max(tilt + settings.sway**2 / square, _TINY)
         gain, learned = tilt / spread, both / spread
         bias = [b + learned * e / square for b, e in zip(bias, _cross(gravity, a), strict=True)]
         gravity = [e + gain * (b - e) for e, b in zip(gravity, a, strict=True)]
-        variances = [(1.0 - gain) * tilt, (1.0 - gain) * both, level - learned * both, vertical]
-        return _direction(gravity), w, [*gravity, *velocity, *bias], variances
+        levelling.gravity, levelling.velocity, levelling.gyro_bias = gravity, velocity, bias
+        variances.levelling_covariance = ((1.0 - gain) * tilt, (1.0 - gain) * both, level - learned * both)
+        variances.vertical_bias_variance = vertical
+        return _direction(gravity), w
 
 
 def _direction(u: list[float]) -> list[float]:

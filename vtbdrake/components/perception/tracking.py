@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import RotationalInertia
-from pydrake.systems.framework import BasicVector, Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
@@ -21,8 +21,7 @@ from vtbdrake.components.perception.estimate import (
     rotation_matrix,
     rotation_vector,
 )
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_to_array
 
 
@@ -240,7 +239,7 @@ def pose_of_state(state: ArrayLike) -> RigidTransform:
     return RigidTransform(Quaternion(x[:4] / np.linalg.norm(x[:4])), x[4:7])
 
 
-class TargetTracker(LeafSystem):
+class TargetTracker(AddressedSystem):
     """The filter of `MotionModel` as a system: the target in the perceived environment.
 
     .. pydrake_system::
@@ -272,8 +271,6 @@ class TargetTracker(LeafSystem):
         motion: The assumed motion of the target.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(
         self, sources: Sequence[str], *, starting: Sequence[str], period: float, motion: MotionModel | None = None
     ) -> None:
@@ -286,82 +283,80 @@ class TargetTracker(LeafSystem):
         self._inputs = [self.DeclareAbstractInputPort(name, Value(PoseEstimate.missing())) for name in sources]
         model = motion or MotionModel()
         model.check()
-        declared = {
-            "rate_noise": (model.rate_noise, "rad/s^1.5", (0.0, 1.0)),
-            "velocity_noise": (model.velocity_noise, "m/s^1.5", (0.0, 1.0)),
-            "first_rate": (model.first_rate, "rad/s", (0.0, 10.0)),
-            "first_velocity": (model.first_velocity, "m/s", (0.0, 10.0)),
-            "gate": (22.5, "", (0.0, 1e3)),
-            "patience": (5.0, "", (1.0, 1e6)),
-            "fewest": (4.0, "", (1.0, 1e6)),
-            "lost_after": (3.0, "s", (0.0, 3600.0)),
-        }
-        self.DeclareNumericParameter(BasicVector([value for value, _, _ in declared.values()]))
-        self._inertia = int(self.DeclareNumericParameter(BasicVector(model.inertia)))
-        self._pose = int(self.DeclareDiscreteState(6))
-        self._state = int(self.DeclareDiscreteState(body_state(RigidTransform(), np.zeros(3), np.zeros(3))))
-        self._status = int(self.DeclareDiscreteState([0.0, inf, inf, inf]))
-        # Estimates fused, left out in succession, left out in all, and when the last one of each source held.
-        self._counts = int(self.DeclareDiscreteState([0.0, 0.0, 0.0, *(-inf for _ in sources)]))
-        self._track = int(self.DeclareDiscreteState(TRACK_SIZE))
-        self.variables = (
-            discrete_state("pose", self._pose, shape=(6,), unit=POSE_UNIT),
-            discrete_state("orientation", self._state, shape=(4,)),
-            discrete_state("position", self._state, start=4, shape=(3,), unit="m"),
-            discrete_state("velocity", self._state, start=7, shape=(6,), unit="rad/s, m/s"),
-            discrete_state("valid", self._status, bounds=(0.0, 1.0)),
-            discrete_state("age", self._status, start=1, unit="s"),
-            discrete_state("attitude_deviation", self._status, start=2, unit="rad"),
-            discrete_state("position_deviation", self._status, start=3, unit="m"),
-            discrete_state("fused", self._counts, bounds=(0.0, inf)),
-            discrete_state("left_out_now", self._counts, start=1, bounds=(0.0, inf)),
-            discrete_state("left_out", self._counts, start=2, bounds=(0.0, inf)),
-            discrete_state("last_times", self._counts, start=3, shape=(len(sources),), unit="s"),
-            discrete_state("track", self._track, shape=(TRACK_SIZE,)),
-            *(
-                parameter(name, 0, start=k, unit=unit, bounds=bounds)
-                for k, (name, (_, unit, bounds)) in enumerate(declared.items())
-            ),
-            parameter("inertia", self._inertia, shape=(6,), unit="kg m^2", bounds=(-1e6, 1e6)),
+        positive = (0.0, inf)
+        self._pose = self.declare_discrete_state(pose=Quantity(np.zeros(6), POSE_UNIT))
+        self._state = self.declare_discrete_state(
+            orientation=Quantity([1.0, 0.0, 0.0, 0.0]),
+            position=Quantity(np.zeros(3), "m"),
+            velocity=Quantity(np.zeros(6), "rad/s, m/s"),
         )
-        self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
-        self.DeclareStateOutputPort("status", DiscreteStateIndex(self._status))
+        self._status = self.declare_discrete_state(
+            valid=Quantity(0.0, bounds=(0.0, 1.0)),
+            age=Quantity(inf, "s"),
+            attitude_deviation=Quantity(inf, "rad"),
+            position_deviation=Quantity(inf, "m"),
+        )
+        # Estimates fused, left out in succession, left out in all, and when the last one of each source held.
+        self._counts = self.declare_discrete_state(
+            fused=Quantity(0.0, bounds=positive),
+            left_out_now=Quantity(0.0, bounds=positive),
+            left_out=Quantity(0.0, bounds=positive),
+            last_times=Quantity(np.full(len(sources), -inf), "s"),
+        )
+        self._track = self.declare_discrete_state(track=Quantity(np.zeros(TRACK_SIZE)))
+        self._settings = self.declare_parameters(
+            rate_noise=Quantity(model.rate_noise, "rad/s^1.5", (0.0, 1.0)),
+            velocity_noise=Quantity(model.velocity_noise, "m/s^1.5", (0.0, 1.0)),
+            first_rate=Quantity(model.first_rate, "rad/s", (0.0, 10.0)),
+            first_velocity=Quantity(model.first_velocity, "m/s", (0.0, 10.0)),
+            gate=Quantity(22.5, "", (0.0, 1e3)),
+            patience=Quantity(5.0, "", (1.0, 1e6)),
+            fewest=Quantity(4.0, "", (1.0, 1e6)),
+            lost_after=Quantity(3.0, "s", (0.0, 3600.0)),
+        )
+        self._inertia = self.declare_parameters(inertia=Quantity(model.inertia, "kg m^2", (-1e6, 1e6)))
+        self.DeclareStateOutputPort("state", self._state.index)
+        self.DeclareStateOutputPort("status", self._status.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        p = context.get_numeric_parameter(0).value().tolist()
-        rate_noise, velocity_noise, first_rate, first_velocity, gate, patience, fewest, lost_after = p
-        inertia = context.get_numeric_parameter(self._inertia).value().tolist()
-        model = MotionModel(rate_noise, velocity_noise, first_rate, first_velocity, inertia)
-        fused, in_succession, left_out, *times = context.get_discrete_state(self._counts).value().tolist()
-        numbers = context.get_discrete_state(self._track).value()
-        track = Track.of(numbers) if fused else None
+        settings, counts = self._settings.view(context), self._counts.mutable(state)
+        model = MotionModel(
+            rate_noise=settings.rate_noise,
+            velocity_noise=settings.velocity_noise,
+            first_rate=settings.first_rate,
+            first_velocity=settings.first_velocity,
+            inertia=self._inertia.array(context).tolist(),
+        )
+        times = counts.last_times
+        track = Track.of(self._track.array(context)) if counts.fused else None
         fresh: list[tuple[float, int, PoseEstimate]] = []
         for k, port in enumerate(self._inputs):
             estimate: PoseEstimate = port.Eval(context)
             # A time in the future is a fault, after which every other estimate would be old.
-            if estimate.valid and times[k] < estimate.time <= context.get_time() + lost_after:
+            if estimate.valid and times[k] < estimate.time <= context.get_time() + settings.lost_after:
                 times[k] = estimate.time
                 fresh.append((estimate.time, k, estimate))
         for _, k, estimate in sorted(fresh, key=lambda entry: entry[:2]):
-            if track is None or (in_succession >= patience and self._starting[k]):
+            if track is None or (counts.left_out_now >= settings.patience and self._starting[k]):
                 if self._starting[k]:
-                    track, fused, in_succession = model.begin(estimate), 1.0, 0.0
+                    track, counts.fused, counts.left_out_now = model.begin(estimate), 1.0, 0.0
                 continue
             candidate, distance = model.fuse(track, estimate)
-            if distance <= gate:
-                track, fused, in_succession = candidate, fused + 1.0, 0.0
+            if distance <= settings.gate:
+                track, counts.fused, counts.left_out_now = candidate, counts.fused + 1.0, 0.0
             else:
-                in_succession, left_out = in_succession + 1.0, left_out + 1.0
-        state.set_value(self._counts, np.array([fused, in_succession, left_out, *times]))
+                counts.left_out_now += 1.0
+                counts.left_out += 1.0
         if track is None:
             return
         if fresh:
-            state.set_value(self._track, track.numbers())
+            self._track.mutable(state).track = track.numbers()
         now, age = max(context.get_time(), track.time), context.get_time() - track.time
         present = model.moved(track, now)
         X_IT = present.X
-        status = [fused >= fewest and age <= lost_after, age, *model.deviations(track, now)]
-        state.set_value(self._state, body_state(X_IT, present.w, track.v))
-        state.set_value(self._pose, pose_to_array(X_IT))
-        state.set_value(self._status, np.array(status, dtype=float))
+        self._state.mutable_array(state)[:] = body_state(X_IT, present.w, track.v)
+        self._pose.mutable(state).pose = pose_to_array(X_IT)
+        status = self._status.mutable(state)
+        status.valid, status.age = counts.fused >= settings.fewest and age <= settings.lost_after, age
+        status.attitude_deviation, status.position_deviation = model.deviations(track, now)
