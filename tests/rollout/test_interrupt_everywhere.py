@@ -118,4 +118,4 @@ def test_ctrl_c_in_many_lines_of_processes(expected):
 @pytest.mark.one_python
 def test_ctrl_c_in_any_line_of_dask(cluster, expected):
     options = {"lines": True, "warm": (True,)}
-    assert survives(lambda: dask.DaskExecutor(cluster.client), expected, dask, **options) > 20
+    assert survives(lambda: dask.DaskExecutor(cluster.client), expected, dask, futures, **options) > 20

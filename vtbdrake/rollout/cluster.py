@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import threading
 import time
 import uuid
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from math import inf
@@ -17,16 +15,14 @@ from typing import Any
 
 from vtbdrake.failures import error_text
 from vtbdrake.lru import LruDict
-from vtbdrake.rollout.executor import Executor, Parameters, WorkerError
-from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack
-from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.start import Starts
-from vtbdrake.rollout.task import RolloutResult, RolloutTask
-from vtbdrake.rollout.testbeds import failed
+from vtbdrake.rollout.executor import WorkerError
+from vtbdrake.rollout.futures import Call, FuturesExecutor
+from vtbdrake.rollout.pickled_task import PickledTask, answer, pack, unpack
+from vtbdrake.rollout.task import RolloutResult
 from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor, checked_time_limit
 
 try:
-    from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
+    from distributed import Client, KilledWorker, WorkerPlugin, as_completed, get_worker
     from distributed.client import ClosedClientError
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("rollouts on a Dask cluster need: pip install 'vtbdrake[cluster]'") from error
@@ -45,7 +41,7 @@ NO_WORKERS = 30.0
 _SIZE_PERIOD = 5.0
 
 
-class DaskExecutor(Executor):
+class DaskExecutor(FuturesExecutor):
     """Rollouts on a Dask cluster, whose workers need the same vtbdrake and what the problem imports.
 
     A task is sent once to every worker, also to those that join later. Each thread of a worker runs its rollouts in a
@@ -68,75 +64,64 @@ class DaskExecutor(Executor):
         WorkerError: The scheduler does not answer.
     """
 
-    cancels = False
+    _name = "a Dask cluster"
+    _loss = KilledWorker
+    _loss_text = "its workers died again and again, also while no other rollout ran"
 
     def __init__(
         self, client: Client | str | None = None, *, time_limit: float = TIME_LIMIT, in_flight: int | None = None
     ) -> None:
-        if in_flight is not None and in_flight < 1:
-            raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
+        super().__init__(client, in_flight=in_flight)
         self._time_limit = checked_time_limit(time_limit)
         self._closes_client = not isinstance(client, Client)
         self._client: Client = client if isinstance(client, Client) else _connected(client)
         if self._client.asynchronous:
             raise ValueError("an asynchronous Dask client cannot be waited for: make it with asynchronous=False")
-        self._limit = in_flight
         self._threads = 0
         self._counted = -inf
-        self._pickler = TaskPickler()
         self._sent: LruDict[str, str] = LruDict(_TASKS)
 
-    def run(
-        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
+    def _run(
+        self, call: Call, indices: Iterable[int], *, retrying: bool = False
     ) -> Iterator[tuple[int, RolloutResult]]:
-        if cutoff is not None:
-            raise ValueError("a Dask cluster cannot cancel rollouts: use executor='processes'")
-        name = self._send(self._pickler.pickle(task))
-        starts = pack_starts(start, len(points))
-        waiting = deque(range(len(points)))
-        suspects: deque[int] = deque()
-        tried: set[int] = set()
-        flying: dict[Future[bytes], int] = {}
-        landed = as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         ended = threading.Event()
         threading.Thread(target=_report_no_workers, args=(self._client, ended), daemon=True).start()
         try:
-            while waiting or flying or suspects:
-                alone = not waiting and not flying
-                room = 1 if alone else self._room() - len(flying)
-                batch = suspects if alone else waiting
-                for _ in range(min(room, len(batch))):
-                    index = batch.popleft()
-                    future = self._submit(name, index, points[index], starts[index])
-                    flying[future] = index
-                    landed.add(future)
-                future, outcome = next(landed)
-                index = flying.pop(future)
-                error = _error(outcome)
-                if isinstance(error, KilledWorker) and index not in tried:
-                    tried.add(index)
-                    suspects.append(index)
-                    _log.warning("rollout %d is tried again, alone: %s", index, error)
-                elif isinstance(error, KilledWorker):
-                    message = f"its workers died again and again, also while no other rollout ran: {error}"
-                    yield index, failed(points[index], message)
-                elif error is not None:
-                    raise error
-                else:
-                    yield index, pickle.loads(outcome)[1]
+            yield from super()._run(call, indices, retrying=retrying)
         finally:
             ended.set()
-            if flying and self._client.status == "running":
-                self._client.cancel(list(flying))
 
-    def _submit(self, name: str, index: int, point: Parameters, start: bytes) -> Future[bytes]:
-        key = f"rollout-{uuid.uuid4().hex}"
+    def _landed(self) -> Any:
+        return as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+
+    def _outcome(self, reply: Any) -> bytes | BaseException:
+        # The status of a future may change after its reply has arrived. An error is (class, error, traceback).
+        if isinstance(reply, BaseException):
+            return _given_up(reply)
+        outcome: bytes | BaseException = reply[1] if isinstance(reply, tuple) else reply
+        return outcome
+
+    def _submit(self, call: Call, index: int) -> Any:
+        name, key = self._send(call.task), f"rollout-{uuid.uuid4().hex}"
+        arguments = name, index, pack(call.points[index]), call.starts[index], self._time_limit
         try:
-            return self._client.submit(
-                run_on_dask, name, index, pack(point), start, self._time_limit, key=key, pure=False
-            )
+            return self._client.submit(run_on_dask, *arguments, key=key, pure=False)
         except _GONE as error:
             raise _given_up(error) from error
+
+    def _cancel(self, futures: Iterable[Any]) -> None:
+        under_way = list(futures)
+        if under_way and self._client.status == "running":
+            self._client.cancel(under_way)
+
+    def _retries(self) -> bool:
+        return True
+
+    def _retry(self, call: Call, lost: Mapping[int, BaseException]) -> Iterator[tuple[int, RolloutResult]]:
+        # One after another: each may be the one that kills its worker.
+        for index, error in lost.items():
+            _log.warning("rollout %d is tried again, alone: %s", index, error)
+            yield from self._run(call, [index], retrying=True)
 
     def _send(self, task: PickledTask) -> str:
         """Send the task to the workers, unless they have it, and return its name there."""
@@ -166,8 +151,8 @@ class DaskExecutor(Executor):
             self._client.unregister_worker_plugin(name)
 
     def _room(self) -> int:
-        if self._limit is not None:
-            return self._limit
+        if self._in_flight is not None:
+            return self._in_flight
         if time.monotonic() >= self._counted + _SIZE_PERIOD:
             try:
                 self._threads = sum(self._client.nthreads().values())
@@ -219,14 +204,6 @@ def _report_no_workers(client: Client, ended: threading.Event) -> None:
 
 def _given_up(error: BaseException) -> WorkerError:
     return WorkerError(f"the Dask scheduler has given up rollouts, or is gone: {error}")
-
-
-def _error(outcome: Any) -> BaseException | None:
-    """Return the error in Dask or in the rollout; the status of a future may change after its outcome has arrived."""
-    if isinstance(outcome, BaseException):
-        return _given_up(outcome)
-    error = outcome[1] if isinstance(outcome, tuple) else pickle.loads(outcome)[1]
-    return error if isinstance(error, BaseException) else None
 
 
 class TaskPlugin(WorkerPlugin):

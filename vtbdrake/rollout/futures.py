@@ -8,9 +8,10 @@ import pickle
 import queue
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
+from typing import Any, NamedTuple
 
 from vtbdrake.failures import error_text
 from vtbdrake.lru import LruDict
@@ -33,7 +34,33 @@ from vtbdrake.rollout.worker_processes import ProcessExecutor
 
 _log = logging.getLogger(__name__)
 
-_Future = concurrent.futures.Future[bytes]
+
+class _RefusedError(WorkerError):
+    """The workers take no more rollouts."""
+
+
+class Call(NamedTuple):
+    """The rollouts of one call of `FuturesExecutor.run`."""
+
+    task: PickledTask
+    points: Sequence[Parameters]
+    starts: Sequence[bytes]
+
+
+class _Landed:
+    """The futures of a pool, as they finish."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[concurrent.futures.Future[bytes]] = queue.SimpleQueue()
+
+    def add(self, future: concurrent.futures.Future[bytes]) -> None:
+        future.add_done_callback(self._queue.put)
+
+    def __next__(self) -> tuple[concurrent.futures.Future[bytes], bytes | BaseException]:
+        future = self._queue.get()
+        if future.cancelled():
+            return future, WorkerError("the pool was shut down while it had rollouts to run")
+        return future, future.exception() or future.result()
 
 
 class FuturesExecutor(Executor):
@@ -55,12 +82,16 @@ class FuturesExecutor(Executor):
     """
 
     cancels = False
+    # What errors call the workers; the error of a rollout whose worker was lost; and why it failed.
+    _name = "a pool of concurrent.futures"
+    _loss: type[Exception] = BrokenExecutor
+    _loss_text = "the pool broke while it had this rollout"
 
-    def __init__(self, pool: concurrent.futures.Executor, *, in_flight: int | None = None) -> None:
+    def __init__(self, pool: concurrent.futures.Executor | Any, *, in_flight: int | None = None) -> None:
         if in_flight is not None and in_flight < 1:
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
+        self._in_flight = in_flight
         self._pool = pool
-        self._in_flight = in_flight if in_flight is not None else 2 * _workers(pool)
         self._pickler = TaskPickler()
         self._rescue: ProcessExecutor | None = None
 
@@ -68,67 +99,95 @@ class FuturesExecutor(Executor):
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
         if cutoff is not None:
-            raise ValueError("a pool of concurrent.futures cannot cancel rollouts: use executor='processes'")
-        pickled = self._pickler.pickle(task)
-        starts = pack_starts(start, len(points))
-        waiting = deque(range(len(points)))
-        flying: dict[_Future, int] = {}
-        landed: queue.SimpleQueue[_Future] = queue.SimpleQueue()
-        lost: list[int] = []
-        trouble: RuntimeError | None = None
-        try:
-            while True:
-                while trouble is None and waiting and len(flying) < self._in_flight:
-                    point = pack(points[waiting[0]])
-                    try:
-                        future = self._pool.submit(run_in_pool, pickled, waiting[0], point, starts[waiting[0]])
-                    except RuntimeError as error:  # It is broken, or was shut down.
-                        trouble = error
-                    else:
-                        flying[future] = waiting.popleft()
-                        future.add_done_callback(landed.put)
-                if not flying:
-                    break
-                future = landed.get()
-                index = flying.pop(future)
-                try:
-                    result = _result(future)
-                except BrokenExecutor as error:
-                    trouble = error
-                    if self._replaceable():
-                        lost.append(index)
-                        continue
-                    reason = f"the pool broke while it had this rollout ({error_text(error)})"
-                    result = failed(points[index], reason)
-                yield index, result
-        finally:
-            for future in flying:
-                future.cancel()
-        rest = [*lost, *waiting]
-        if isinstance(trouble, BrokenExecutor) and self._replaceable() and rest:
-            yield from self._run_without_pool(pickled, points, starts, rest, trouble)
-        elif trouble is not None and rest:
-            name = type(self._pool).__name__
-            raise WorkerError(f"the pool {name} takes no more rollouts: {trouble}") from trouble
+            raise ValueError(f"{self._name} cannot cancel rollouts: use executor='processes'")
+        call = Call(self._pickler.pickle(task), points, pack_starts(start, len(points)))
+        yield from self._run(call, range(len(points)))
 
-    def _replaceable(self) -> bool:
-        """Return whether processes of our own can do what the pool's did."""
+    def _run(
+        self, call: Call, indices: Iterable[int], *, retrying: bool = False
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        """Submit rollouts, as many at a time as keep all workers busy, and yield (index, result) as they finish."""
+        waiting, flying, landed = deque(indices), dict[Any, int](), self._landed()
+        lost: dict[int, BaseException] = {}
+        refusal: _RefusedError | None = None
+        try:
+            while flying or (waiting and refusal is None):
+                try:
+                    while waiting and refusal is None and len(flying) < self._room():
+                        future = self._submit(call, waiting[0])
+                        flying[future] = waiting.popleft()
+                        landed.add(future)
+                except _RefusedError as error:
+                    refusal = error  # Those under way come first.
+                if flying:
+                    future, reply = next(landed)
+                    index, outcome = flying.pop(future), self._outcome(reply)
+                    if isinstance(outcome, self._loss) and self._retries() and not retrying:
+                        lost[index] = outcome
+                    else:
+                        yield index, self._result(call, index, outcome)
+        finally:
+            self._cancel(flying)
+        if refusal is not None:
+            raise refusal
+        if lost:
+            yield from self._retry(call, lost)
+
+    def _result(self, call: Call, index: int, outcome: bytes | BaseException) -> RolloutResult:
+        if isinstance(outcome, self._loss):
+            return failed(call.points[index], f"{self._loss_text} ({error_text(outcome)})")
+        result: RolloutResult | BaseException
+        result = outcome if isinstance(outcome, BaseException) else pickle.loads(outcome)[1]
+        if isinstance(result, BaseException):
+            raise result
+        return result
+
+    # -- what differs with other workers
+
+    def _landed(self) -> Any:
+        """Return an empty collection that yields futures as they finish, each with its reply or error."""
+        return _Landed()
+
+    def _outcome(self, reply: Any) -> bytes | BaseException:
+        """Return what `answer` has returned in the worker, or an error of the workers."""
+        outcome: bytes | BaseException = reply
+        return outcome
+
+    def _room(self) -> int:
+        """Return how many rollouts may be under way."""
+        return self._in_flight or 2 * _workers(self._pool)
+
+    def _submit(self, call: Call, index: int) -> Any:
+        """Return the future of a rollout."""
+        point = pack(call.points[index])
+        try:
+            return self._pool.submit(run_in_pool, call.task, index, point, call.starts[index])
+        except RuntimeError as error:  # It is broken, or was shut down.
+            if isinstance(error, self._loss) and self._retries():
+                future: concurrent.futures.Future[bytes] = concurrent.futures.Future()
+                future.set_exception(error)
+                return future
+            name = type(self._pool).__name__
+            raise _RefusedError(f"the pool {name} takes no more rollouts: {error}") from error
+
+    def _cancel(self, futures: Iterable[Any]) -> None:
+        for future in futures:
+            future.cancel()
+
+    def _retries(self) -> bool:
+        """Return whether rollouts whose worker was lost are tried again: here by processes of our own."""
         local = isinstance(self._pool, ProcessPoolExecutor) or "loky" in type(self._pool).__module__.split(".")
         return local and getattr(self._pool, "_initializer", None) is None
 
-    def _run_without_pool(
-        self,
-        task: PickledTask,
-        points: Sequence[Parameters],
-        starts: Sequence[bytes],
-        rest: Sequence[int],
-        trouble: BrokenExecutor,
-    ) -> Iterator[tuple[int, RolloutResult]]:
+    def _retry(self, call: Call, lost: Mapping[int, BaseException]) -> Iterator[tuple[int, RolloutResult]]:
+        indices = list(lost)
         if self._rescue is None:
-            _log.warning("the pool is broken; processes of vtbdrake take its place (%s)", trouble)
+            error = lost[indices[0]]
+            _log.warning("the pool is broken; processes of vtbdrake take its place (%s)", error)
             self._rescue = ProcessExecutor(_workers(self._pool))
-        for i, result in self._rescue.run_pickled(task, [points[i] for i in rest], [starts[i] for i in rest]):
-            yield rest[i], result
+        points, starts = [call.points[i] for i in indices], [call.starts[i] for i in indices]
+        for k, result in self._rescue.run_pickled(call.task, points, starts):
+            yield indices[k], result
 
     def close(self) -> None:
         """End the processes that replaced a broken pool. The pool itself belongs to the user."""
@@ -140,17 +199,6 @@ class FuturesExecutor(Executor):
 def _workers(pool: concurrent.futures.Executor) -> int:
     """Return the number of workers: that which a pool states, or the private one of the standard library and loky."""
     return int(getattr(pool, "num_workers", None) or getattr(pool, "_max_workers", None) or cores())
-
-
-def _result(future: _Future) -> RolloutResult:
-    try:
-        _, outcome = pickle.loads(future.result())
-    except concurrent.futures.CancelledError as error:
-        raise WorkerError("the pool was shut down while it had rollouts to run") from error
-    if isinstance(outcome, BaseException):
-        raise outcome
-    result: RolloutResult = outcome
-    return result
 
 
 class _Worker:

@@ -112,10 +112,10 @@ class Measure:
             sample = float(self.f(*values))
         except FAILURES as error:
             raise QualityError(f"{self._at(values, time)} raises {error_text(error)}") from error
-        self._check(sample, lambda: self._at(values, time))
+        self._refuse_invalid(sample, lambda: self._at(values, time))
         return sample
 
-    def _check(self, sample: float, where: Callable[[], str]) -> None:
+    def _refuse_invalid(self, sample: float, where: Callable[[], str]) -> None:
         if not isfinite(sample):
             raise QualityError(f"{where()} is {sample}, but it must be finite")
 
@@ -153,7 +153,7 @@ class Quality(Measure):
         if self.minimize and self.upper != inf:
             raise QualityError("the best that a cost can be is 0; upper belongs to a quality that is maximized")
 
-    def _check(self, sample: float, where: Callable[[], str]) -> None:
+    def _refuse_invalid(self, sample: float, where: Callable[[], str]) -> None:
         if not isfinite(sample) or sample < 0.0:
             remedy = (
                 "a cost is finite and not negative: state it so that 0 is the best"
