@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Trajectory
@@ -85,6 +86,36 @@ def test_limited_is_the_nearest_for_one_limit_that_binds() -> None:
     plan = Trajectory("u.plan", 2, 1.0, "linear", lower=-5.0, upper=5.0, rate=1.0)
     np.testing.assert_allclose(plan.limited([0.0, 3.0]), [1.0, 2.0], atol=1e-4)
     np.testing.assert_allclose(plan.limited([0.0, 3.0], start=0.0), [0.0, 1.0], atol=1e-4)
+
+
+def nearest(plan: Trajectory, knots: np.ndarray) -> np.ndarray:
+    """The nearest knots that keep the limits at dense times, by Lawson's and Hanson's least distance programming."""
+    S, step = sampling(plan.order)[::10], TIMES[10] - TIMES[0]
+    columns = []
+    for j in range(2):
+        sides = [
+            (S, np.asarray(plan.upper)[j]),
+            (-S, -np.asarray(plan.lower)[j]),
+            *((sign * np.diff(S, axis=0) / step, np.broadcast_to(plan.rate, 2)[j]) for sign in (1.0, -1.0)),
+            *((sign * np.diff(S, n=2, axis=0) / step**2, np.broadcast_to(plan.acceleration, 2)[j]) for sign in (1.0, -1.0)),
+        ]
+        sides = [(rows, limit) for rows, limit in sides if limit < inf]
+        rows = np.concatenate([rows for rows, _ in sides])
+        room = np.concatenate([np.full(len(rows), limit) for rows, limit in sides]) - rows @ knots[:, j]
+        solution, _ = nnls(np.vstack([-rows.T, -room]), [*np.zeros(9), 1.0])
+        residual = np.vstack([-rows.T, -room]) @ solution - [*np.zeros(9), 1.0]
+        columns.append(knots[:, j] - residual[:-1] / residual[-1])
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("limits", [{"rate": [9.0, 4.0]}, {"acceleration": [30.0, 10.0]}, LIMITS["cubic"]])
+@pytest.mark.parametrize("order", ["cubic", "bspline"])
+def test_limited_is_the_nearest_that_keeps_all_limits(order: str, limits: dict[str, Any]) -> None:
+    plan = trajectory(order, **{"rate": inf, "acceleration": inf, **limits})
+    knots = np.random.default_rng(3).uniform(-3.0, 3.0, size=(9, 2))
+    moved, least = plan.limited(knots) - knots, nearest(plan, knots) - knots
+    # Between the times, a limit may be exceeded; the limits of Bezier coefficients are a little stricter.
+    assert np.linalg.norm(moved, axis=0) == pytest.approx(np.linalg.norm(least, axis=0), rel=0.12)
 
 
 @pytest.mark.parametrize("order", ORDERS)
