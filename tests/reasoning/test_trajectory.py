@@ -97,7 +97,10 @@ def nearest(plan: Trajectory, knots: np.ndarray) -> np.ndarray:
             (S, np.asarray(plan.upper)[j]),
             (-S, -np.asarray(plan.lower)[j]),
             *((sign * np.diff(S, axis=0) / step, np.broadcast_to(plan.rate, 2)[j]) for sign in (1.0, -1.0)),
-            *((sign * np.diff(S, n=2, axis=0) / step**2, np.broadcast_to(plan.acceleration, 2)[j]) for sign in (1.0, -1.0)),
+            *(
+                (sign * np.diff(S, n=2, axis=0) / step**2, np.broadcast_to(plan.acceleration, 2)[j])
+                for sign in (1.0, -1.0)
+            ),
         ]
         sides = [(rows, limit) for rows, limit in sides if limit < inf]
         rows = np.concatenate([rows for rows, _ in sides])

@@ -166,6 +166,17 @@ def test_landscape_is_the_worst_h_with_the_best_point(conditions: int) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("sim.sys.payload.mass [kg]", "sim.env.ground.friction")
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered in minimum")
+@pytest.mark.parametrize("failed", [(), (1, 4)])
+def test_failed_points_of_a_landscape_are_crosses(failed: tuple[int, ...]) -> None:
+    points = [(m, f) for m in (0.0, 30.0, 60.0) for f in (0.2, 0.8)]
+    rollouts = [rollout(m / 60 * np.sin(TIMES) + f, failed=i in failed) for i, (m, f) in enumerate(points)]
+    axes = plot_sweep(sweep(points, rollouts, parameters=(MASS, FRICTION), units=("kg", "1"))).axes[0]
+    crosses = [tuple(point) for line in marked(axes, "failed") for point in line.get_xydata()]
+    assert crosses == [points[i] for i in failed]
+    assert len(marked(axes, "failed")) == (1 if failed else 0)
+
+
 def test_points_off_a_grid_are_drawn_where_they_are() -> None:
     points = np.array([[1.0, 0.1], [2.0, 0.7], [5.0, 0.4]])
     results = [rollout(np.full(2, value)) for value in (1.0, 3.0, 2.0)]

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from tests.components.localization.drives import DRIFT, PERIOD, Drive, drive, error, nees
+from vtbdrake.components.localization import health
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, transform
 from vtbdrake.components.localization.track_state import TrackState
@@ -148,6 +149,18 @@ def test_landmarks_are_looked_for_as_far_as_they_may_be():
     assert matches.is_fused and [i == j for i, j in matches.pairs] == [True] * 8
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_landmarks_are_looked_for_along_the_axis_of_an_uncertain_pose(axis):
+    places = np.array([[x, y] for x in (-30.0, -10.0, 10.0, 30.0) for y in (-15.0, 15.0)])
+    tracker = Tracker(spread_out(places, 0.01), bias_deviation=1e-6)
+    deviations, shift = np.array([0.01, 0.01, 0.001]), np.zeros(2)
+    deviations[axis], shift[axis] = 2.0, 3.0
+    state, _ = tracker.start(np.zeros(3), np.diag(deviations) ** 2)
+    state, matches = tracker.update(state, spread_out(places - shift, 0.02))
+    assert matches.is_fused and [i == j for i, j in matches.pairs] == [True] * 8
+    assert state.pose[axis] == pytest.approx(3.0, abs=0.05)
+
+
 @pytest.mark.parametrize(("deviations", "is_lost"), [(0.5, False), (2.2, True)])
 def test_first_matches_that_fit_badly_lose_the_track(deviations, is_lost):
     places = np.array([[x, y] for x in (-9.0, 0.0, 9.0) for y in (-9.0, -3.0, 3.0, 9.0)])
@@ -169,6 +182,26 @@ def test_an_uncertain_position_loses_the_track():
         # Along the way, its deviation is 0.03 m times the root of the metres.
         after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), duration=0.0)
         assert tracker.is_lost(after) == is_lost
+
+
+@pytest.mark.parametrize(
+    ("change", "before", "expected"),
+    [
+        ([0.5, 0.0, 0.0], 1.0, 1.525),  # s = 6.25
+        ([0.2, 0.0, 0.0], 1.7, 1.7),  # s = 1
+        ([0.1, 0.0, 0.0], 2.0, 1.85),  # s = 0.25
+        ([0.1, 0.0, 0.0], 1.0, 1.0),
+        ([9.0, 0.0, 0.0], 1.0, 3.4),  # s counts as 25
+        ([9.0, 0.0, 0.0], 900.0, 1000.0),
+        ([0.5, 7.0, 7.0], 1.0, 1.525),  # the scan says nothing of y and of the heading
+    ],
+)
+@pytest.mark.parametrize("rounding", [0.0, 1e-16])
+def test_drift_follows_what_a_scan_says(change, before, expected, rounding):
+    tracker = Tracker(spread_out(np.zeros((1, 2)), 0.1))
+    first = replace(tracker.start(np.zeros(3), np.diag([0.05, 0.01, 0.001]))[0], drift=before)
+    after, _ = tracker.start(change, np.diag([0.01, 0.01 + rounding, 0.001 + rounding]))
+    assert health.drift_after(first, after) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.3])

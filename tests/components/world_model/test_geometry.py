@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import Part, Quantity, WorldModel, WorldObject, add_to_plant, position_estimate
+from vtbdrake.components.world_model.geometry import tree_parts
 
 
 def metres(**values: float) -> dict[str, Quantity]:
@@ -73,6 +74,26 @@ def test_crown_is_seen_and_not_felt() -> None:
     }
     assert roles == {"a/trunk", "a/crown"}
     assert inspector.NumGeometriesWithRole(Role.kProximity) == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "base", "width"), [({"crown_base": 5.0, "crown_diameter": 6.0}, 5.0, 6.0), ({}, None, None)]
+)
+def test_crown_reaches_from_its_base_to_the_height_of_the_tree(
+    fields: dict[str, float], base: float | None, width: float | None
+) -> None:
+    values = metres(trunk_diameter=0.4, height=20.0, **fields)
+    trunk, crown = tree_parts(WorldObject("a", "tree", position_estimate([0.0, 0.0, 0.0]), attributes=values))
+    middle = crown.X_OS.translation()
+    assert middle[:2].tolist() == [0.0, 0.0] and crown.shape.a() == crown.shape.b()
+    assert middle[2] + crown.shape.c() == pytest.approx(20.0)
+    if base is not None and width is not None:
+        assert middle[2] - crown.shape.c() == pytest.approx(base)
+        assert 2.0 * crown.shape.a() == pytest.approx(width)
+    # The trunk stands on the ground, and ends in the middle of the crown.
+    assert trunk.shape.radius() == pytest.approx(0.2)
+    assert trunk.X_OS.translation().tolist() == pytest.approx([0.0, 0.0, 0.5 * trunk.shape.length()])
+    assert trunk.shape.length() == pytest.approx(middle[2])
 
 
 def test_only_what_is_believed_is_built() -> None:
