@@ -114,9 +114,9 @@ def test_signals_without_max_age_are_refused_outside_of_lock_step() -> None:
     ageless = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
     deployment = Deployment(continuity=CONTINUITY)
     with pytest.raises(ValueError, match=r"no sensor signal has a max_age, .* \(position, speed\)"):
-        deployment.check(ageless)
-    deployment.check(interface)
-    deployment.in_lock_step("speed").check(ageless)
+        deployment.check_interface(ageless)
+    deployment.check_interface(interface)
+    deployment.in_lock_step("speed").check_interface(ageless)
 
 
 def test_signal_that_is_not_sent_in_every_cycle_is_refused_in_lock_step() -> None:

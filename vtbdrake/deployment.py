@@ -95,14 +95,14 @@ class Deployment:
             raise DeploymentError(f"{name}.deployment() must return a vtbdrake.Deployment, not {deployment!r}")
         deployment = replace(deployment, **changes)
         try:
-            deployment.check(scenario.interface())
+            deployment.check_interface(scenario.interface())
         except ValueError as error:
             raise DeploymentError(
                 f"{name} cannot run on its machine: {error}; its method deployment() describes how it runs"
             ) from error
         return deployment
 
-    def check(self, interface: Interface) -> None:
+    def check_interface(self, interface: Interface) -> None:
         """Check that the DPS with this interface can run safely.
 
         Raises:
@@ -198,7 +198,7 @@ def deploy(
     """Connect the DPS of a scenario to its machine; see `Scenario.deploy`."""
     deployment = deployment or Deployment.of(scenario)
     interface = scenario.interface()
-    deployment.check(interface)
+    deployment.check_interface(interface)
     protocol = deployment.protocol or protocol_of(scenario)  # An error if the scenario has none, either.
     bridge = protocol.bridge(interface, url)
     target = target or DpsAlone(scenario)

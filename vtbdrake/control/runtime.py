@@ -210,7 +210,7 @@ class Runtime(Stepped):
                     begins = False
                     # A loop that is paced by messages has just received them.
                     self.cycle(due=due, lateness=lateness, poll=self.pace is None)
-                    interruptible.check()
+                    interruptible.raise_interrupt()
                     done += 1
                     if until():
                         return

@@ -217,7 +217,7 @@ class StudyRun:
                     self._bar.update()
                     self._end_at_target([point])
                     self._end_at_deadline()
-                    interruptible.check()
+                    interruptible.raise_interrupt()
         finally:
             if points:
                 results.close()  # type: ignore[attr-defined]

@@ -208,7 +208,7 @@ class DecisionRun:
                 for index, result in results:
                     self._results[keys[index]] = result
                     self._count += 1
-                    interruptible.check()
+                    interruptible.raise_interrupt()
         finally:
             results.close()  # type: ignore[attr-defined]
 

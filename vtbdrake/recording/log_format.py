@@ -261,10 +261,10 @@ class LogHeader:
                 scenario = load_scenario(f"{name}@{path}")
             except ScenarioError as error:
                 raise LogError(f"the scenario of the log, {name}, cannot be loaded in this version: {error}") from error
-        self.check(scenario)
+        self.check_scenario(scenario)
         return scenario
 
-    def check(self, scenario: Scenario | None) -> None:
+    def check_scenario(self, scenario: Scenario | None) -> None:
         """Check that this scenario was recorded.
 
         Raises:

@@ -227,7 +227,7 @@ class _Replay:
         digests = {i for i, _ in log.digests}
         with Interruptible() as interruptible:
             for i in range(self.count):
-                interruptible.check()
+                interruptible.raise_interrupt()
                 for changed, name, values in vectors:
                     if changed[i]:
                         feed(name, values[i])
@@ -367,7 +367,7 @@ def _largest_differences(log: ControlLog, actuation: Mapping[str, np.ndarray]) -
 
 def _restore(log: ControlLog, target: Target, context: Context) -> None:
     """Bring a context of ``target`` into the state before the first recorded cycle."""
-    log.header.check(target.scenario)
+    log.header.check_scenario(target.scenario)
     if isinstance(target, DpsAlone) and log.header.target == TESTBED:
         _check_fed_by_machine(log)
     try:

@@ -254,7 +254,7 @@ def run_rollouts(
                         warned = True
                         _log.warning("%s", warning)
                     bar.update()
-                    interruptible.check()
+                    interruptible.raise_interrupt()
         except KeyboardInterrupt:
             done = sum(result is not None for result in results)
             _log.warning("interrupted: %d of %d rollouts are finished and kept", done, len(points))

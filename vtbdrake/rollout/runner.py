@@ -109,7 +109,7 @@ class RolloutRunner:
         def raise_if_cancelled() -> None:
             if cutoff.is_over or (cancel is not None and cancel.is_set()):
                 raise CancelledError
-            interruptible.check()
+            interruptible.raise_interrupt()
 
         samples = _Samples(self, cutoff.to_beat)
         end, message = HORIZON, ""
@@ -188,7 +188,7 @@ class RolloutRunner:
             with Interruptible() as interruptible:
                 self._reset(parameters)
                 for time_, instant in zip(self._times[: last + 1], self._instants[: last + 1], strict=True):
-                    interruptible.check()
+                    interruptible.raise_interrupt()
                     status = self._advance(time_, instant)
                     if _terminated(status) and self._context.get_time() < self._instants[last]:
                         raise SimulationError(status.FormatMessage())

@@ -46,7 +46,7 @@ class Interruptible:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
 
-    def check(self) -> None:
+    def raise_interrupt(self) -> None:
         """Raise the exception of the signal handler, if any; long operations call this from time to time."""
         if self._raised is not None:
             raise self._raised
@@ -56,4 +56,4 @@ class Interruptible:
     ) -> None:
         self._restore()
         if error is not self._raised:
-            self.check()
+            self.raise_interrupt()

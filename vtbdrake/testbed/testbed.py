@@ -67,7 +67,7 @@ class BeliefRule:
                 "value of the target as by=f(estimates..., late=seconds)"
             )
 
-    def check(self, variables: Variables) -> None:
+    def check_addresses(self, variables: Variables) -> None:
         """Check the addresses of the belief.
 
         Raises:
@@ -205,7 +205,7 @@ class VirtualTestbed(AddressedDiagram):
         self.simulated_actuators = {name: port.get_system() for name, port in parts.actuators.items()}
         self.belief_rules = tuple(parts.belief_rules)
         for rule in self.belief_rules:
-            rule.check(self._variables)
+            rule.check_addresses(self._variables)
 
     def _repr_html_(self) -> str:
         """Show Figure 4 in a notebook, with the switches as they were built."""

@@ -239,7 +239,7 @@ def test_correlated_residuals_raise_no_alarm(rho: float, windows: int) -> None:
     table = correlated(rho, windows + 20_000)
     config = ResidualConfig(false_alarm_interval=3.6e6)
     detector = AlarmDetector(PLACES, config, of(table[:windows]))
-    assert not [alarm for row in table[windows:] for alarm in detector.take(Window(0.0, row))]
+    assert not [alarm for row in table[windows:] for alarm in detector.update(Window(0.0, row))]
 
 
 def test_deviation_counts_correlated_residuals_as_fewer() -> None:
@@ -306,20 +306,20 @@ def test_cusum_matches_its_definition() -> None:
     upper = lower = highest = 0.0
     for z in values:
         upper, lower = max(0.0, upper + z - 0.5), max(0.0, lower - z - 0.5)
-        assert cusum.take(np.array([z])) == pytest.approx(max(upper, lower))
+        assert cusum.update(np.array([z])) == pytest.approx(max(upper, lower))
         highest = max(highest, upper, lower)
     assert highest > 2.0
 
 
 def test_cusum_ignores_missing_values() -> None:
     cusum = Cusum(3, threshold=10.0, allowance=0.5)
-    cusum.take(np.array([2.0, -2.0, np.nan]))
-    np.testing.assert_array_equal(cusum.take(np.array([np.nan, -2.0, np.nan])), [1.5, 3.0, 0.0])
+    cusum.update(np.array([2.0, -2.0, np.nan]))
+    np.testing.assert_array_equal(cusum.update(np.array([np.nan, -2.0, np.nan])), [1.5, 3.0, 0.0])
 
 
 def test_cusum_is_limited_to_twice_the_threshold() -> None:
     cusum = Cusum(2, threshold=10.0, allowance=0.5)
-    np.testing.assert_array_equal(cusum.take(np.array([1e6, -1e6])), [20.0, 20.0])
+    np.testing.assert_array_equal(cusum.update(np.array([1e6, -1e6])), [20.0, 20.0])
 
 
 @pytest.mark.parametrize(("threshold", "allowance"), [(3.0, 0.5), (4.0, 0.25)])

@@ -154,7 +154,7 @@ def rows_of(cycles: int) -> tuple[Comparison, RowLayout, np.ndarray]:
 
 def test_rows_arrive_in_any_portions() -> None:
     comparison, layout, rows = rows_of(102)
-    expected = np.array([window.residual for window in comparison.take(rows)])
+    expected = np.array([window.residual for window in comparison.add(rows)])
     assert np.abs(expected).max() > 1e-2
     again, *_ = rows_of(1)
     found = []
@@ -164,18 +164,18 @@ def test_rows_arrive_in_any_portions() -> None:
         velocity = layout.sense["velocity"]
         late[:2], late[velocity] = row[:2], row[velocity]
         early[velocity] = np.nan
-        found += again.take(early[None]) + again.take(np.array([late, row]))
+        found += again.add(early[None]) + again.add(np.array([late, row]))
     assert again.skipped == 0
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
 
 def test_last_actuation_of_a_period_acts() -> None:
     comparison, layout, rows = rows_of(102)
-    expected = np.array([window.residual for window in comparison.take(rows)])
+    expected = np.array([window.residual for window in comparison.add(rows)])
     again, *_ = rows_of(1)
     first = rows.copy()
     first[:, layout.actuation["torque"]] += 5.0
-    found = again.take(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
+    found = again.add(np.stack((first, rows), axis=1).reshape(-1, rows.shape[1]))
     np.testing.assert_array_equal([window.residual for window in found], expected)
 
 

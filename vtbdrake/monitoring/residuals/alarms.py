@@ -187,7 +187,7 @@ class Cusum:
         self.lower = np.zeros(size)
         self._allowance = allowance
 
-    def take(self, z: Array) -> Array:
+    def update(self, z: Array) -> Array:
         """Return the larger of both sums after further values, of shape (size,); a NaN changes nothing."""
         known = np.where(np.isnan(z), 0.0, z)
         k = np.where(np.isnan(z), 0.0, self._allowance)
@@ -275,11 +275,11 @@ class AlarmDetector:
             raise error(f"the residual of {name} has {size} entries, but a value of shape {np.shape(value)} was given")
         target[place] = value
 
-    def take(self, window: Window) -> list[Alarm]:
+    def update(self, window: Window) -> list[Alarm]:
         """Return the alarms that end and begin with this window, those with the largest residuals first."""
         threshold = self._cusum.threshold
         z = (window.residual - self.mean) / self.scale
-        self.statistic = statistic = self._cusum.take(z)
+        self.statistic = statistic = self._cusum.update(z)
         changed = []
         for k, alarm in list(self._active.items()):
             if statistic[k] <= 0.5 * threshold:

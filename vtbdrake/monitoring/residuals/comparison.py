@@ -183,8 +183,8 @@ class Comparison:
         self._next = 0
         self._settled = 0
 
-    def take(self, rows: Array) -> list[Window]:
-        """Return the windows that further rows, of shape (n, width), complete."""
+    def add(self, rows: Array) -> list[Window]:
+        """Add rows, of shape (n, width), and return the windows that they complete."""
         horizon, found = self._config.horizon, []
         for row in rows:
             index = int(row[INDEX])

@@ -438,10 +438,10 @@ class ResidualReport:
 
 def _checked(comparison: Comparison, detector: AlarmDetector | None, rows: Array) -> ResidualReport:
     """Return the results of further rows, of shape (n, width of a `RowLayout`), in order."""
-    windows, alarms = comparison.take(rows), []
+    windows, alarms = comparison.add(rows), []
     if detector:
         for k, window in enumerate(windows):
-            alarms += detector.take(window)
+            alarms += detector.update(window)
             windows[k] = window._replace(statistic=detector.statistic)
     return ResidualReport(windows, alarms, comparison.skipped, comparison.failed, comparison.error)
 
