@@ -77,12 +77,12 @@ class Arrival(AddressedSystem):
         self._number.mutable(numbers).number += 1.0
         return EventStatus.Succeeded()
 
-    def _is_same(self, one: Any, other: Any) -> bool:
-        if one is other:
+    def _is_same(self, value: Any, previous: Any) -> bool:
+        if value is previous:
             return True
-        arrays, others = self._codec.encode(one), self._codec.encode(other)
-        return all(_equal(array, others[part]) for part, array in arrays.items())
+        arrays, previous_arrays = self._codec.encode(value), self._codec.encode(previous)
+        return all(_equal(array, previous_arrays[part]) for part, array in arrays.items())
 
 
-def _equal(one: np.ndarray, other: np.ndarray) -> bool:
-    return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+def _equal(array: np.ndarray, reference: np.ndarray) -> bool:
+    return np.array_equal(array, reference, equal_nan=array.dtype.kind == "f")

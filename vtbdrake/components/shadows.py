@@ -95,11 +95,11 @@ def _share(query: QueryObject, renderer: str, p_S: Array, spacing: float, R_WS: 
     corners = [np.minimum(image.ravel()[first + k], nothing) for k in (0, 1, size, size + 1)]
     above = (1.0 - a) * corners[0] + a * corners[1]
     below = (1.0 - a) * corners[2] + a * corners[3]
-    seen = (1.0 - b) * above + b * below
+    visible_depth = (1.0 - b) * above + b * below
     pixel = 2.0 * float(radii[:2].max()) / (0.98 * size)
     hidden = z - _BIAS * pixel
     # Of pixels that are partly in front of the point, the share follows from how far the interpolation lies between
     # them and the point. If all of them are in front of it, the point is in shadow.
     nearest, farthest = (f(f(*corners[:2]), f(*corners[2:])) for f in (np.minimum, np.maximum))
-    dark = np.clip((hidden - seen) / np.maximum(hidden - nearest, pixel), 0.0, 1.0)
+    dark = np.clip((hidden - visible_depth) / np.maximum(hidden - nearest, pixel), 0.0, 1.0)
     return np.where(farthest < hidden, 0.0, 1.0 - dark)

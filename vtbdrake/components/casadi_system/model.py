@@ -90,8 +90,8 @@ class Model:
         self.state = {name: _flat(STATE, name, value, self.shapes[name]) for name, value in state.items()}
         self.parameters = {name: _flat(PARAMETER, name, value, self.shapes[name]) for name, value in parameters.items()}
         self.variables = tuple(self._elements(units, bounds))
-        given = {*state, *parameters, time}
-        self.inputs = tuple(name for name in arguments if name not in given)
+        arguments_of_model = {*state, *parameters, time}
+        self.inputs = tuple(name for name in arguments if name not in arguments_of_model)
         self._blocks = (
             *(Block(STATE, (name,)) for name in state),
             *([Block(TIME, clock)] if clock else []),
@@ -214,11 +214,11 @@ def _argument_shapes(functions: Iterable[casadi.Function]) -> dict[str, Shape]:
 
 def _next_shapes(update: casadi.Function, shapes: Mapping[str, Shape], state: tuple[str, ...]) -> dict[str, Shape]:
     """Return the shapes of the states after `update`."""
-    expected, given = [f"{name}{NEXT}" for name in state], update.name_out()
-    if set(expected) != set(given):
+    expected, updated = [f"{name}{NEXT}" for name in state], update.name_out()
+    if set(expected) != set(updated):
         raise ValueError(
-            f"{update.name()} gives {_listed(given)}, but the next values of the state {_listed(state)} are expected: "
-            f"{_listed(expected)}."
+            f"{update.name()} gives {_listed(updated)}, but the next values of the state {_listed(state)} are "
+            f"expected: {_listed(expected)}."
         )
     following = {name: update.size_out(f"{name}{NEXT}") for name in state}
     for name, shape in following.items():
@@ -234,12 +234,12 @@ def _check_names(role: str, names: Iterable[str], arguments: Iterable[str]) -> N
 
 
 def _check_disjoint(roles: Mapping[str, Iterable[str]]) -> None:
-    seen: dict[str, str] = {}
+    roles_by_name: dict[str, str] = {}
     for role, names in roles.items():
         for name in names:
-            if name in seen:
-                raise ValueError(f"{name!r} is {seen[name]} and {role}, but can be one thing only.")
-            seen[name] = role
+            if name in roles_by_name:
+                raise ValueError(f"{name!r} is {roles_by_name[name]} and {role}, but can be one thing only.")
+            roles_by_name[name] = role
 
 
 def _flat(role: str, name: str, value: ArrayLike, shape: Shape) -> NDArray[np.float64]:

@@ -244,20 +244,20 @@ class PlantDynamics:
     def actuation(self, u: Expression) -> Expression:
         """Return tau of the actuation u, which is held within the actuators' effort limits, as Drake does."""
         limits = [self._effort[i] for i in range(self.nu)]
-        held = [clamp(u[i], -limit, limit) if np.isfinite(limit) else u[i] for i, limit in enumerate(limits)]
-        return self._actuation @ casadi.vertcat(casadi.SX(0, 1), *held)
+        limited = [clamp(u[i], -limit, limit) if np.isfinite(limit) else u[i] for i, limit in enumerate(limits)]
+        return self._actuation @ casadi.vertcat(casadi.SX(0, 1), *limited)
 
     # -- kinematics
 
     def qdot(self, q: Expression, v: Expression) -> Expression:
         """Return qdot = N(q) v."""
-        found = casadi.SX(self.nq, 1)
+        rates = casadi.SX(self.nq, 1)
         for link in self._links:
             if link.kind == FLOATING:
-                found[link.q] = _floating_rate(q[link.q], v[link.v])
+                rates[link.q] = _floating_rate(q[link.q], v[link.v])
             else:
-                found[link.q] = v[link.v]
-        return found
+                rates[link.q] = v[link.v]
+        return rates
 
     def frame(self, frame: Frame, q: Expression) -> FrameMotion:
         """Return pose and Jacobian of a frame of the plant."""
@@ -296,14 +296,14 @@ class PlantDynamics:
         for link in self._links:
             R, p = _joint_pose(link, q)
             S = _subspace(link, q)
-            own = S @ v[link.v]
+            V_joint = S @ v[link.v]
             X_joint, X_fixed = _motion(R, p), _motion(*link.X_PF)
             carried = casadi.SX(6, 1) if link.parent < 0 else X_joint @ (X_fixed @ moves[link.parent].V)
-            V = carried + own
-            bias = _crm(V) @ own
+            V = carried + V_joint
+            bias = _crm(V) @ V_joint
             if link.kind == FLOATING:
                 # The axes of S stay with F, which turns against M.
-                bias -= casadi.vertcat(casadi.SX(3, 1), skew(own[:3]) @ own[3:])
+                bias -= casadi.vertcat(casadi.SX(3, 1), skew(V_joint[:3]) @ V_joint[3:])
             moves.append(_Move(X_joint, X_fixed, S, V, bias))
         return moves
 
@@ -360,12 +360,12 @@ class _Factor:
 
 def _joint_pose(link: Link, q: Expression) -> Pose:
     """Return X_FM."""
-    own = q[link.q]
+    q_joint = q[link.q]
     if link.kind == REVOLUTE:
-        return rotation(link.axis, own), casadi.SX(3, 1)
+        return rotation(link.axis, q_joint), casadi.SX(3, 1)
     if link.kind == PRISMATIC:
-        return casadi.SX.eye(3), link.axis * own
-    return _quaternion_rotation(own[:4]), own[4:]
+        return casadi.SX.eye(3), link.axis * q_joint
+    return _quaternion_rotation(q_joint[:4]), q_joint[4:]
 
 
 def _subspace(link: Link, q: Expression) -> Expression:

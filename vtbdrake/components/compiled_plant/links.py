@@ -202,8 +202,8 @@ class _Reader:
         if address not in self._symbols:
             self._check_alone(frame, address)
         value = np.concatenate([X_PF.translation(), X_PF.rotation().ToRollPitchYaw().vector()])
-        given = self._input(address, value)
-        return times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(given[3:]), given[:3]))
+        pose = self._input(address, value)
+        return times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(pose[3:]), pose[:3]))
 
     def _check_alone(self, frame: FixedOffsetFrame, address: str) -> None:
         """Refuse a pose on which the poses of further frames depend."""
@@ -218,12 +218,12 @@ class _Reader:
 
     def _reflected_inertias(self) -> dict[int, Expression]:
         """Return the reflected inertia of each joint's actuator, by the joint's index."""
-        found: dict[int, Expression] = {}
+        inertias: dict[int, Expression] = {}
         for index in self._plant.GetJointActuatorIndices():
             actuator = self._plant.get_joint_actuator(index)
             rotor = self._input(f"{self._address(actuator)}.rotor_inertia", actuator.rotor_inertia(self._context))
-            found[int(actuator.joint().index())] = actuator.gear_ratio(self._context) ** 2 * rotor
-        return found
+            inertias[int(actuator.joint().index())] = actuator.gear_ratio(self._context) ** 2 * rotor
+        return inertias
 
     def _input(self, address: str, value: ArrayLike) -> Expression:
         """Return the symbol of an input, or the value itself, shape (n, 1)."""

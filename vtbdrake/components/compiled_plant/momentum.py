@@ -268,8 +268,8 @@ class BaseReaction:
         arguments, evaluate, result = self._buffers.parts
         arguments[:] = w.ravel()
         evaluate()
-        found = result.reshape(len(self._times), -1).copy()
-        return BaseMotion(self._times, found[:, :4], found[:, 4:7], found[:, 7:])
+        motion = result.reshape(len(self._times), -1).copy()
+        return BaseMotion(self._times, motion[:, :4], motion[:, 4:7], motion[:, 7:])
 
 
 def base_poses(steps: int, duration: float) -> casadi.Function:

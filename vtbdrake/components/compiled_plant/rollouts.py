@@ -146,8 +146,8 @@ class PlantRollouts:
 
     def _evaluate(self, buffers: Buffers, n: int, x0: ArrayLike, z: Array, inputs: Mapping[str, ArrayLike]) -> Array:
         if inputs.keys() != self._inputs.keys():
-            given, expected = (", ".join(names) or "none" for names in (inputs, self._inputs))
-            raise ValueError(f"the inputs of the step are {expected}, but the values given are of {given}.")
+            passed, expected = (", ".join(names) or "none" for names in (inputs, self._inputs))
+            raise ValueError(f"the inputs of the step are {expected}, but the values given are of {passed}.")
         arguments, evaluate, result = buffers.parts
         start = 0
         sizes = {"x0": self.function.numel_in("x0"), "knots": z[0].size, **self._inputs}
@@ -170,21 +170,21 @@ def _rollout(
     final_cost: Callable[[Expression], Expression] | None,
 ) -> casadi.Function:
     """Return the function (x0, knots, inputs) -> cost, overrun, extent, final."""
-    x, u, *given = step.sx_in()
+    x, u, *further_inputs = step.sx_in()
     spent, worst, extent = (casadi.SX.sym(name) for name in ("spent", "worst", "extent"))
-    x_next, overrun = step.call([x, u, *given])
+    x_next, overrun = step.call([x, u, *further_inputs])
     before = casadi.vertcat(x, spent, worst, extent)
     after = casadi.vertcat(
         x_next, spent + cost(x, u), casadi.fmax(worst, overrun), extent + casadi.norm_1(casadi.vertcat(x, u))
     )
-    one = casadi.Function("one", [before, u, *given], [after], {"cse": True})
+    single_step = casadi.Function("one", [before, u, *further_inputs], [after], {"cse": True})
     names = step.name_in()[2:]
     x0, knots = casadi.MX.sym("x0", x.numel()), casadi.MX.sym("knots", u.numel(), B.shape[1])
-    inputs = [casadi.MX.sym(name, symbol.numel()) for name, symbol in zip(names, given, strict=True)]
+    inputs = [casadi.MX.sym(name, symbol.numel()) for name, symbol in zip(names, further_inputs, strict=True)]
     steps = len(B)
     controls = knots @ casadi.DM(B.T)
     # B may be sparse (a spline has local support), but its zeros cost less than an index.
-    last = one.fold(steps)(
+    last = single_step.fold(steps)(
         casadi.vertcat(x0, 0.0, -np.inf, 0.0), controls, *(casadi.repmat(value, 1, steps) for value in inputs)
     )
     final, total, largest, magnitude = casadi.vertsplit(last, [0, *range(x.numel(), x.numel() + 4)])

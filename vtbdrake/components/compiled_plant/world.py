@@ -55,9 +55,9 @@ def compiled_world(
     defaults = PlantDynamics(plant, context, inputs=inputs).values
     _check(plant, context, step, list(defaults.values()))
     x0 = plant.GetPositionsAndVelocities(context)
-    x, u, *given = step.sx_in()
+    x, u, *further_inputs = step.sx_in()
     overrun = casadi.SX.sym("overrun")
-    x_next, beyond = step.call([x, u, *given])
+    x_next, beyond = step.call([x, u, *further_inputs])
     names, arguments, following = ["state"], [x], {"state_next": x_next}
     state = {"state": x0}
     if np.isfinite([plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()]).any():
@@ -66,7 +66,7 @@ def compiled_world(
         state["overrun"] = float(step(x0, np.zeros(u.numel()), *defaults.values())[1])
     update = casadi.Function(
         "world",
-        [*arguments, u, *given],
+        [*arguments, u, *further_inputs],
         list(following.values()),
         [*names, "actuation", *step.name_in()[2:]],
         list(following),

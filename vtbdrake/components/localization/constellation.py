@@ -228,12 +228,15 @@ class ConstellationMap:
         relative = self._relative(here.places)
         variance = relative + float(np.mean(here.variances)) + _FLOOR**2
         judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
-        found = sorted((one for one in judged if one is not None), key=lambda one: -one.log_likelihood)
-        if not found:
+        ranking = sorted(
+            (candidate for candidate in judged if candidate is not None),
+            key=lambda candidate: -candidate.log_likelihood,
+        )
+        if not ranking:
             return self._unknown()
-        best = found[0]
-        others = [one.log_likelihood for one in found[1:] if _is_other(one.pairs, best.pairs)]
-        margin = best.log_likelihood - max([0.0, *others])
+        best = ranking[0]
+        rivals = [candidate.log_likelihood for candidate in ranking[1:] if _is_other(candidate.pairs, best.pairs)]
+        margin = best.log_likelihood - max([0.0, *rivals])
         fit = best.log_likelihood / max(1.0, self._expected(here, relative / max(self._variance, 1e-12)))
         is_sure = (
             len(local) >= self.fewest
@@ -249,8 +252,10 @@ class ConstellationMap:
 
     def required(self, local: Landmarks) -> float:
         """Return the log-likelihood ratio Λ that a sure pose needs at least with these landmarks."""
-        own = 0.5 * float(np.mean(np.trace(local.covariances, axis1=1, axis2=2)))
-        return self._required(self._relative(local.positions - local.positions.mean(axis=0)) + own + _FLOOR**2)
+        local_variance = 0.5 * float(np.mean(np.trace(local.covariances, axis1=1, axis2=2)))
+        return self._required(
+            self._relative(local.positions - local.positions.mean(axis=0)) + local_variance + _FLOOR**2
+        )
 
     def _required(self, variance: float) -> float:
         """Return the least Λ of a sure pose, if local and mapped positions differ by a variance in m² per axis."""
@@ -290,25 +295,29 @@ class ConstellationMap:
             relative: The share of the map's variance that displaces landmarks relative to each other.
         """
         rng = np.random.default_rng(0)
-        one = rng.integers(len(here.places), size=_SAMPLES)
-        own = rng.integers(len(self._places), size=_SAMPLES)
-        S = relative * self.landmarks.covariances[own] + here.covariances[one] + _FLOOR**2 * np.eye(2)
-        errors = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(_SAMPLES, 2)))
-        true = self.landmarks.diameters[own]
-        variances = here.diameter_variances[one]
-        known = np.where(np.isfinite(variances), variances, 0.0) + np.where(
-            np.isfinite(self._diameter_variances[own]), self._diameter_variances[own], 0.0
+        local_rows = rng.integers(len(here.places), size=_SAMPLES)
+        landmark_indices = rng.integers(len(self._places), size=_SAMPLES)
+        S = (
+            relative * self.landmarks.covariances[landmark_indices]
+            + here.covariances[local_rows]
+            + _FLOOR**2 * np.eye(2)
         )
-        diameters = true + np.sqrt(known) * rng.normal(size=_SAMPLES)
+        errors = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(_SAMPLES, 2)))
+        true = self.landmarks.diameters[landmark_indices]
+        variances = here.diameter_variances[local_rows]
+        diameter_variances = np.where(np.isfinite(variances), variances, 0.0) + np.where(
+            np.isfinite(self._diameter_variances[landmark_indices]), self._diameter_variances[landmark_indices], 0.0
+        )
+        diameters = true + np.sqrt(diameter_variances) * rng.normal(size=_SAMPLES)
         common = self._common(diameters, variances)
         expected = 0.0
         for share, places in (
-            (self.share, self._places[own] + errors),
+            (self.share, self._places[landmark_indices] + errors),
             (1.0 - self.share, rng.uniform(self._low, self._high, (_SAMPLES, 2))),
         ):
             nothing = np.zeros((_SAMPLES, 0))
             sampled = _Local(
-                places, here.covariances[one], diameters, variances, common, nothing, np.full(_SAMPLES, relative)
+                places, here.covariances[local_rows], diameters, variances, common, nothing, np.full(_SAMPLES, relative)
             )
             matches = self._matches(sampled, np.zeros(3), np.zeros((_SAMPLES, 2)), np.zeros((_SAMPLES, 2, 2)))
             expected += share * float(matches.likelihoods(self.share).mean())
@@ -332,13 +341,13 @@ class ConstellationMap:
         poses = poses[np.argsort(-support)[:_FITTED]]
         for width in (0.8 * wide, 0.6 * wide, 0.6 * wide):
             poses, support = self._approach(here.places, weights, poses, width)
-        chosen: list[Array] = []
+        distinct: list[Array] = []
         for row in np.argsort(-support):
-            if support[row] > 0.0 and not any(_is_near(poses[row], other) for other in chosen):
-                chosen.append(poses[row])
-            if len(chosen) == _JUDGED:
+            if support[row] > 0.0 and not any(_is_near(poses[row], other) for other in distinct):
+                distinct.append(poses[row])
+            if len(distinct) == _JUDGED:
                 break
-        return np.array(chosen).reshape(-1, 3)
+        return np.array(distinct).reshape(-1, 3)
 
     def _approach(self, places: Array, weights: Array, poses: Array, width: float) -> tuple[Array, Array]:
         """Fit poses to the landmarks of the map nearest to each local one, in one step of least squares.
@@ -352,8 +361,8 @@ class ConstellationMap:
         Returns:
             The improved poses (k, 3), and their sums of weights (k,).
         """
-        seen = places @ rotations(poses[:, 2]).swapaxes(1, 2) + poses[:, np.newaxis, :2]
-        distances, nearest = self._tree.query(seen, distance_upper_bound=2.5 * width)
+        places_M = places @ rotations(poses[:, 2]).swapaxes(1, 2) + poses[:, np.newaxis, :2]
+        distances, nearest = self._tree.query(places_M, distance_upper_bound=2.5 * width)
         is_near = nearest < len(self._places)
         weight = weights * np.where(is_near, np.exp(-0.5 * np.minimum(distances / width, 9.0) ** 2), 0.0)
         target = self._places[np.where(is_near, nearest, 0)]
@@ -377,13 +386,13 @@ class ConstellationMap:
             spread: The covariance of this displacement, in the same units, (n, 2, 2).
         """
         R_MC = rotation(pose[2])
-        seen = transform(pose, here.places)
+        places_M = transform(pose, here.places)
         C = R_MC @ here.covariances @ R_MC.T + _FLOOR**2 * np.eye(2)
-        _, near = self._tree.query(seen + self._variance**0.5 * mean, k=min(_NEIGHBOURS, len(self._places)))
+        _, near = self._tree.query(places_M + self._variance**0.5 * mean, k=min(_NEIGHBOURS, len(self._places)))
         L = self._roots[near]
         S = L @ (spread + here.independent[:, np.newaxis, np.newaxis] * np.eye(2))[:, np.newaxis] @ L.swapaxes(-1, -2)
         S += C[:, np.newaxis]
-        deltas = self._places[near] - seen[:, np.newaxis] - np.einsum("nkij,nj->nki", L, mean)
+        deltas = self._places[near] - places_M[:, np.newaxis] - np.einsum("nkij,nj->nki", L, mean)
         a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
         determinant = a * c - b**2
         weights = np.moveaxis(np.array([[c, -b], [-b, a]]) / determinant, (0, 1), (2, 3))
@@ -463,8 +472,8 @@ def _one_to_one(near: Indices, probable: Array) -> Indices:
     best = probable.argmax(axis=1)
     rows = np.flatnonzero(probable.max(axis=1) > 0.5)
     rows = rows[np.argsort(-probable[rows, best[rows]], kind="stable")]
-    chosen, first = np.unique(near[rows, best[rows]], return_index=True)
-    pairs = np.column_stack([rows[first], chosen])
+    landmark_indices, first = np.unique(near[rows, best[rows]], return_index=True)
+    pairs = np.column_stack([rows[first], landmark_indices])
     return pairs[np.argsort(pairs[:, 0])]
 
 

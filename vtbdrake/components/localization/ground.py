@@ -106,9 +106,9 @@ def _lowest(points: Array, corner: Array, *, cells: int) -> Array:
 @lru_cache(8)
 def _stiffness(m: int) -> Array:
     """Return the upper band (2 m + 1, m^2) of the matrix of the squared second differences of m times m nodes."""
-    one, first = np.eye(m), np.diff(np.eye(m), axis=0)
+    identity, first = np.eye(m), np.diff(np.eye(m), axis=0)
     second = np.diff(first, axis=0)
-    factors = ((second, one, 1.0), (one, second, 1.0), (first, first, 2.0))
+    factors = ((second, identity, 1.0), (identity, second, 1.0), (first, first, 2.0))
     matrix = sum(weight * kron(a.T @ a, b.T @ b, format="csr") for a, b, weight in factors)
     band = np.zeros((2 * m + 1, m * m))
     for k in range(2 * m + 1):

@@ -75,8 +75,8 @@ class Landmarks:
 
     def select(self, rows: ArrayLike) -> Landmarks:
         """Return the landmarks with these indices, or those for which a mask (n,) is true."""
-        chosen = np.asarray(rows)
-        return Landmarks(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        indices = np.asarray(rows)
+        return Landmarks(*(getattr(self, field.name)[indices] for field in fields(self)))
 
     def widened(self, deviation: float) -> Landmarks:
         """Return the landmarks with a deviation (m) added to those of positions, per axis, and of diameters."""
@@ -112,24 +112,24 @@ def map_landmarks(model: WorldModel, kind: str = "tree", *, deviation: float = 0
         raise ValueError(f"deviation is a standard deviation in m, finite and at least 0, not {deviation!r}")
     if kind not in DIAMETERS:
         raise ValueError(f"landmarks are of the class {' or '.join(DIAMETERS)}, not {kind!r}")
-    objects = [one for one in model.find(kind) if one.is_known]
+    objects = [mapped for mapped in model.find(kind) if mapped.is_known]
     if not objects:
         raise ValueError(f"the map, {model}, has no {kind} that is believed to be there: localization needs landmarks")
-    diameters = [one.number(DIAMETERS[kind], unit="m") for one in objects]
-    for one, diameter in zip(objects, diameters, strict=True):
+    diameters = [mapped.number(DIAMETERS[kind], unit="m") for mapped in objects]
+    for mapped, diameter in zip(objects, diameters, strict=True):
         if not 0.0 < diameter <= _LARGEST_DIAMETER:
             raise ValueError(
-                f"{DIAMETERS[kind]} of the {kind} {one.identity} is {diameter:g} m, but must be positive and at most "
-                f"{_LARGEST_DIAMETER:g} m: are its units those that the map declares?"
+                f"{DIAMETERS[kind]} of the {kind} {mapped.identity} is {diameter:g} m, but must be positive and at "
+                f"most {_LARGEST_DIAMETER:g} m: are its units those that the map declares?"
             )
-        if not np.isfinite(one.pose.covariance[3:5, 3:5]).all():
+        if not np.isfinite(mapped.pose.covariance[3:5, 3:5]).all():
             raise ValueError(
-                f"the {kind} {one.identity} has an infinite variance in the plane: leave out what has no known place"
+                f"the {kind} {mapped.identity} has an infinite variance in the plane: leave out what has no known place"
             )
-    deviations = [one.attributes[DIAMETERS[kind]].deviation for one in objects]
+    deviations = [mapped.attributes[DIAMETERS[kind]].deviation for mapped in objects]
     return Landmarks(
-        np.array([one.p_WoOo_W[:2] for one in objects]),
-        np.array([one.pose.covariance[3:5, 3:5] for one in objects]) + deviation**2 * np.eye(2),
+        np.array([mapped.p_WoOo_W[:2] for mapped in objects]),
+        np.array([mapped.pose.covariance[3:5, 3:5] for mapped in objects]) + deviation**2 * np.eye(2),
         np.array(diameters),
         np.array(deviations),
     )

@@ -163,32 +163,32 @@ class PairTable:
         votes = votes[((votes[:, :2] > low) & (votes[:, :2] < high)).all(axis=1)]
         scaled = (votes[:, :2] - low.astype(np.float32)) / np.float32(cell)
         turned = votes[:, 2] * np.float32(sectors / (2.0 * pi))
-        found = []
+        poses = []
         # Two grids, so that few places lie near the border of a cell in both.
         for offset in (np.float32(0.0), np.float32(0.5)):
             column, line = (scaled + offset).astype(np.int64).T
             sector = (turned + offset).astype(np.int64) % sectors
-            found.append(_crowded((sector * lines + line) * columns + column, votes, count // 2))
-        return np.vstack(found)
+            poses.append(_crowded((sector * lines + line) * columns + column, votes, count // 2))
+        return np.vstack(poses)
 
     def _votes(self, local: LocalPairs, row: int, part: slice) -> Singles:
         """Return the votes (n, 3) of one local pair, with headings in [0, 2π), for a part of the table."""
-        found = []
+        votes = []
         x, y = local.middles[row].astype(np.float32)
         for flip in (False, True):
             alike = np.ones(part.stop - part.start, dtype=bool)
             for end in (0, 1):
-                one = 1 - end if flip else end
-                delta = self.diameters[one, part] - np.float32(local.diameters[row, end])
+                mapped_end = 1 - end if flip else end
+                delta = self.diameters[mapped_end, part] - np.float32(local.diameters[row, end])
                 reach = np.float32(_GATE**2 * local.diameter_variances[row, end])
-                alike &= delta * delta <= self.reaches[one, part] + reach
+                alike &= delta * delta <= self.reaches[mapped_end, part] + reach
             turn = np.float32(2.0 * pi)
             heading = self.angles[part][alike] - np.float32(local.angles[row] - pi * flip)
             heading -= turn * np.floor(heading / turn)
             c, s = np.cos(heading), np.sin(heading)
             middle = self.middles[:, part][:, alike]
-            found.append(np.column_stack([middle[0] - (c * x - s * y), middle[1] - (s * x + c * y), heading]))
-        return np.concatenate(found)
+            votes.append(np.column_stack([middle[0] - (c * x - s * y), middle[1] - (s * x + c * y), heading]))
+        return np.concatenate(votes)
 
 
 def _pairs(places: Array, tree: cKDTree) -> NDArray[np.intp]:

@@ -89,19 +89,19 @@ class Scene:
         Raises:
             ValueError: The points or the place of the scanner have another shape, or are not finite.
         """
-        seen, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
-        if seen.ndim != 2 or seen.shape[1] != 3 or eye.shape != (3,):
-            raise ValueError(f"points have the shape (n, 3), the scanner's place (3,), not {seen.shape}, {eye.shape}")
-        if not (np.isfinite(seen).all() and np.isfinite(eye).all()):
+        points, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 3 or eye.shape != (3,):
+            raise ValueError(f"points have the shape (n, 3), the scanner's place (3,), not {points.shape}, {eye.shape}")
+        if not (np.isfinite(points).all() and np.isfinite(eye).all()):
             raise ValueError("points and the scanner's place are finite numbers: leave rays without a return out")
-        seen = seen - eye
-        distances = np.hypot(seen[:, 0], seen[:, 1])
+        points = points - eye
+        distances = np.hypot(points[:, 0], points[:, 1])
         near = np.flatnonzero((distances <= detector.reach) & (distances > 0.0))
-        seen, distances = seen[near], distances[near]
+        points, distances = points[near], distances[near]
         feet = np.array([0.0, 0.0, detector.ground_height - eye[2]])
-        heights = _heights(seen, feet, detector.reach)
-        scene = cls(seen, distances, np.arctan2(seen[:, 1], seen[:, 0]), seen[:, 2] / distances, heights)
-        if _shows_ground(heights) or not _shows_ground(_heights(seen * [1.0, 1.0, -1.0], feet, detector.reach)):
+        heights = _heights(points, feet, detector.reach)
+        scene = cls(points, distances, np.arctan2(points[:, 1], points[:, 0]), points[:, 2] / distances, heights)
+        if _shows_ground(heights) or not _shows_ground(_heights(points * [1.0, 1.0, -1.0], feet, detector.reach)):
             return scene
         return scene.select(np.zeros(0, dtype=np.intp))
 
@@ -148,17 +148,17 @@ class Cells:
         side = int(2.0 * reach / size) + 3
         return cls(index[:, 0] * side + index[:, 1], side)
 
-    def connected(self, chosen: Indices) -> tuple[Indices, Indices]:
+    def connected(self, rows: Indices) -> tuple[Indices, Indices]:
         """Return chosen points in the order of their clusters, and the cluster of each: a number, ascending from 0.
 
         The cells of a cluster touch each other at an edge or a corner.
         """
         occupied = np.zeros(self.side**2, dtype=bool)
-        occupied[self.flat[chosen]] = True
+        occupied[self.flat[rows]] = True
         labels, _ = label(occupied.reshape(self.side, self.side), structure=np.ones((3, 3)))
-        owners = labels.ravel()[self.flat[chosen]] - 1
+        owners = labels.ravel()[self.flat[rows]] - 1
         order = np.argsort(owners, kind="stable")
-        return chosen[order], owners[order].astype(np.intp)
+        return rows[order], owners[order].astype(np.intp)
 
 
 @dataclass(frozen=True, eq=False)

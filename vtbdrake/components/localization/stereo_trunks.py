@@ -109,10 +109,10 @@ def detect_stereo_trunks(
     if not len(ahead):
         return Landmarks.empty()
     grid = _Grid(camera, ahead, right)
-    found = [row for trunk in grid.trunks(detector.extent) if (row := _measured(trunk, camera, detector)) is not None]
-    if not found:
+    rows = [row for trunk in grid.trunks(detector.extent) if (row := _measured(trunk, camera, detector)) is not None]
+    if not rows:
         return Landmarks.empty()
-    distance, bearing, diameter, is_whole = np.array(found).T
+    distance, bearing, diameter, is_whole = np.array(rows).T
     return _landmarks(distance, heading - bearing, diameter, is_whole > 0.0, camera, detector, X_HC)
 
 
@@ -127,8 +127,8 @@ def _level(
     near = disparity > camera.focal_length * camera.baseline / detector.reach
     ahead, right, above = R_LC @ camera.points(disparity)[near].T
     low, high = detector.heights
-    kept = (above > low) & (above < high) & (ahead > 2.0 * camera.baseline)
-    return ahead[kept], right[kept], heading
+    in_slice = (above > low) & (above < high) & (ahead > 2.0 * camera.baseline)
+    return ahead[in_slice], right[in_slice], heading
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +169,14 @@ class _Grid:
             self._trunk(labels[part] == number, part, upright) for number, part in enumerate(find_objects(labels), 1)
         ]
 
-    def _trunk(self, own: NDArray[np.bool_], part: tuple[slice, slice], upright: NDArray[np.bool_]) -> _Trunk:
+    def _trunk(self, mask: NDArray[np.bool_], part: tuple[slice, slice], upright: NDArray[np.bool_]) -> _Trunk:
         columns, cells = part[0], slice(part[1].start - 1, part[1].stop + 1)
         first, last = max(columns.start - _BESIDE, 0), columns.stop + _BESIDE
         profile = self._height[first:last, cells].sum(axis=1)
         share = np.minimum(profile / np.median(profile[columns.start - first : columns.stop - first]), 1.0)
         width = float(share.sum())
         middle = float(share @ np.arange(first, first + len(share))) / width + 0.5 + self._first
-        spread = convolve1d(np.pad(own, ((0, 0), (1, 1))).astype(int), np.ones(3, int), axis=1, mode="constant") > 0
+        spread = convolve1d(np.pad(mask, ((0, 0), (1, 1))).astype(int), np.ones(3, int), axis=1, mode="constant") > 0
         disparity = float(self._moment[columns, cells][spread].sum() / self._height[columns, cells][spread].sum())
         beside = np.r_[first : columns.start, columns.stop : min(last, self._shape[0])]
         return _Trunk(middle, width, disparity, bool(upright[beside, cells.stop :].any()))

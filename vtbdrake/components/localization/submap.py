@@ -117,8 +117,8 @@ class Submap:
         diameters[old], deviations[old] = _mean(
             diameters[old], deviations[old], scan.diameters[new], scan.diameter_deviations[new]
         )
-        seen, last = self.seen.copy(), self.last.copy()
-        seen[old] += 1.0
+        hits, last = self.seen.copy(), self.last.copy()
+        hits[old] += 1.0
         last[old] = self.distance
         in_view = np.hypot(*(positions - self.X_OH[:2]).T) < _IN_VIEW * np.hypot(*landmarks.positions.T).max()
         in_view[old] = True
@@ -131,17 +131,17 @@ class Submap:
             np.concatenate([covariances, R[rest]]),
             np.concatenate([diameters, scan.diameters[rest]]),
             np.concatenate([deviations, scan.diameter_deviations[rest]]),
-            np.concatenate([seen, once]),
+            np.concatenate([hits, once]),
             np.concatenate([self.chances + in_view, once]),
             np.concatenate([last, self.distance * once]),
         )
 
     def landmarks(self) -> Landmarks:
         """Return the landmarks in the present H; what was in view several times, but seen once only, is left out."""
-        kept = self._select((self.seen >= 2.0) | (self.chances < _CHANCES))
-        return Landmarks(kept.positions, kept.covariances, kept.diameters, kept.diameter_deviations).seen_from(
-            inverse(self.X_OH)
-        )
+        reliable = self._select((self.seen >= 2.0) | (self.chances < _CHANCES))
+        return Landmarks(
+            reliable.positions, reliable.covariances, reliable.diameters, reliable.diameter_deviations
+        ).seen_from(inverse(self.X_OH))
 
     def _select(self, mask: NDArray[np.bool_]) -> Submap:
         names = ("positions", "covariances", "diameters", "diameter_deviations", "seen", "chances", "last")

@@ -135,9 +135,9 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_
 def _upright(scene: Scene, detector: TrunkDetectorConfig) -> Clusters:
     """Return the points that stand above each other in the slice."""
     low, high = detector.heights
-    chosen = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
-    heights, distances = scene.heights[chosen], scene.distances[chosen]
-    cells = Cells.of(scene.points[chosen], size=detector.cell, reach=detector.reach)
+    in_slice = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
+    heights, distances = scene.heights[in_slice], scene.distances[in_slice]
+    cells = Cells.of(scene.points[in_slice], size=detector.cell, reach=detector.reach)
     layer = (high - low) / _LAYERS
     filled = np.zeros((cells.side**2, _LAYERS), dtype=bool)
     filled[cells.flat, np.minimum((heights - low) / layer, _LAYERS - 1).astype(np.intp)] = True
@@ -145,15 +145,15 @@ def _upright(scene: Scene, detector: TrunkDetectorConfig) -> Clusters:
     # With the neighbours of each cell, along x and along y.
     bits[1:-1] = bits[1:-1] | bits[2:] | bits[:-2]
     bits[:, 1:-1] = bits[:, 1:-1] | bits[:, 2:] | bits[:, :-2]
-    seen = np.bitwise_count(bits.ravel()[cells.flat])
+    filled_layers = np.bitwise_count(bits.ravel()[cells.flat])
     # The layers in which rays passed: no more than the field of view has rows there.
-    eye_heights = heights - scene.points[chosen, 2]
+    eye_heights = heights - scene.points[in_slice, 2]
     top = np.minimum(eye_heights + distances * scene.slopes.max(initial=-inf), high)
     bottom = np.maximum(eye_heights + distances * scene.slopes.min(initial=inf), low)
     passed = (top - bottom) / np.maximum(detector.elevation_step * distances, layer)
-    upright = np.flatnonzero(seen >= np.maximum(detector.upright_share * passed, 2.0))
+    upright = np.flatnonzero(filled_layers >= np.maximum(detector.upright_share * passed, 2.0))
     rows, owners = cells.connected(upright)
-    return Clusters(scene, chosen[rows], owners)
+    return Clusters(scene, in_slice[rows], owners)
 
 
 class _Fit:
@@ -285,11 +285,11 @@ class _Fit:
         """Return the covariances of the parameters, (k, 5, 5)."""
         _, weights, derivatives = self._errors(cylinders)
         weighted = derivatives * (weights * on)[:, None]
-        known = _information(*self._constraints(cylinders, on)[1:])
-        inverse = np.linalg.inv(self._clusters.sums(weighted[:, :, None] * derivatives[:, None, :]) + known)
+        prior = _information(*self._constraints(cylinders, on)[1:])
+        inverse = np.linalg.inv(self._clusters.sums(weighted[:, :, None] * derivatives[:, None, :]) + prior)
         # The covariance of the gradient: grazing rays have less weight than their variance would give them.
         spread = self._clusters.sums(weighted[:, :, None] * weighted[:, None, :] * self._variance)
-        covariances: Array = inverse @ (spread + known) @ inverse
+        covariances: Array = inverse @ (spread + prior) @ inverse
         return covariances
 
     def _constraints(self, cylinders: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array]:

@@ -196,8 +196,8 @@ class LocalizationUnit:
         fix = self.locator.locate(gathered)
         if not fix.is_sure:
             return none, state
-        seen = gathered if self.begins_with_submap else landmarks
-        track, matches = self.tracker.start(fix.pose, fix.covariance, seen)
+        detections = gathered if self.begins_with_submap else landmarks
+        track, matches = self.tracker.start(fix.pose, fix.covariance, detections)
         if len(matches.pairs) < _FEWEST or self.tracker.is_lost(track) or self.tracker.is_doubtful(track):
             return none, state
         answer = self._answer(track, matches, len(landmarks), X_OH, time)

@@ -222,8 +222,8 @@ class Detections:
     def on(self, board: MarkerBoard) -> Detections:
         """Return those that the board has, each once."""
         first = np.unique(self.ids, return_index=True)[1]
-        known = first[board.find(self.ids[first]) >= 0]
-        return Detections(self.ids[known], self.corners[known])
+        rows = first[board.find(self.ids[first]) >= 0]
+        return Detections(self.ids[rows], self.corners[rows])
 
 
 def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetectorConfig | None = None) -> Detections:
@@ -248,10 +248,10 @@ def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetec
     if detector.refinement == "subpixel":
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
     dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
-    found, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
+    quadrangles, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
     if ids is None or not len(ids):
         return Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
-    corners = np.array(found, dtype=float).reshape(-1, 4, 2)
+    corners = np.array(quadrangles, dtype=float).reshape(-1, 4, 2)
     if detector.refinement == "lines":
         corners = fit_edges(grey, fit_edges(grey, corners))
     return Detections(np.array(ids, dtype=np.int64).ravel(), corners + 0.5)
@@ -391,11 +391,11 @@ def pose_from_markers(
     Raises:
         ValueError: A corner is not finite.
     """
-    known = detections.on(board)
-    if not np.isfinite(known.corners).all():
+    on_board = detections.on(board)
+    if not np.isfinite(on_board.corners).all():
         raise ValueError("corners of markers are finite numbers of pixels: leave out what was not found")
-    wide = _widths(known.corners).min(axis=1) >= (_NARROWEST if corner_noise is None else 0.0)
-    ids, pixels = known.ids[wide], known.corners[wide]
+    wide = _widths(on_board.corners).min(axis=1) >= (_NARROWEST if corner_noise is None else 0.0)
+    ids, pixels = on_board.ids[wide], on_board.corners[wide]
     if not len(ids) or (prediction is None and len(ids) < fewest):
         return PoseEstimate.missing(time=time)
     corners = _Corners(

@@ -97,7 +97,7 @@ class Faces:
             For each direction along a face in which both edges were seen: the centre of the face (k, 3), the direction
             (k, 3), the offset of the points (k,) in m and its standard deviation (k,) in m.
         """
-        found: list[tuple[Array, Array, float, float]] = []
+        edges: list[tuple[Array, Array, float, float]] = []
         for pose, half in zip(self.poses, self.half_sizes, strict=True):
             if pose[:, 2] @ (eye - pose[:, 3]) <= 0.0:
                 continue
@@ -116,8 +116,8 @@ class Faces:
                 whole = (high > half[k] - 2.0 * s) & (low < 2.0 * s - half[k])
                 if whole.sum() >= 3:
                     offset = float(np.mean(0.5 * (low[whole] + high[whole])))
-                    found.append((pose[:, 3], pose[:, k], offset, s / 12.0**0.5))
-        centres, directions, offsets, deviations = zip(*found, strict=True) if found else ((), (), (), ())
+                    edges.append((pose[:, 3], pose[:, k], offset, s / 12.0**0.5))
+        centres, directions, offsets, deviations = zip(*edges, strict=True) if edges else ((), (), (), ())
         return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(offsets), np.array(deviations)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Faces:

@@ -179,9 +179,11 @@ class StereoMatcher:
         )
         # OpenCV leaves out a margin, in which the largest disparities would lead out of the right image.
         margin = (0, 0, self.largest_disparity, 0, cv2.BORDER_REPLICATE)
-        found = matcher.compute(*(cv2.copyMakeBorder(grey, *margin) for grey in greys))[:, self.largest_disparity :]
-        columns = np.arange(found.shape[1], dtype=np.float32)
-        disparity = found.astype(np.float32) / 16.0
+        sixteenths = matcher.compute(*(cv2.copyMakeBorder(grey, *margin) for grey in greys))[
+            :, self.largest_disparity :
+        ]
+        columns = np.arange(sixteenths.shape[1], dtype=np.float32)
+        disparity = sixteenths.astype(np.float32) / 16.0
         # Semi-global matching spreads what is near over what has no texture beside it: a narrow window undoes this.
         change = cv2.absdiff(greys[0][:, 1:], greys[0][:, :-1]).astype(np.float32)
         contrast = cv2.blur(
@@ -189,7 +191,7 @@ class StereoMatcher:
             (2, 4 * self.block + 1),
             anchor=(0, 2 * self.block),
         )
-        unknown = (found < 0) | (contrast < self.texture) | (disparity > columns)
+        unknown = (sixteenths < 0) | (contrast < self.texture) | (disparity > columns)
         disparity[unknown] = np.nan
         return disparity
 

@@ -294,12 +294,12 @@ class Camera(AddressedSystem):
         return expected, depth if self._depth is not None else None
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
-        for found in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
-            if found.distance < -self._clipping_near:
-                name = view.inspector().GetName(found.id_G).partition(" ")[2]
+        for signed_distance in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
+            if signed_distance.distance < -self._clipping_near:
+                name = view.inspector().GetName(signed_distance.id_G).partition(" ")[2]
                 raise RenderingError(
-                    f"camera {self.get_name()} is {-found.distance:.3g} m inside {name}, where it sees nothing: change "
-                    "its pose, or the geometry"
+                    f"camera {self.get_name()} is {-signed_distance.distance:.3g} m inside {name}, where it sees "
+                    "nothing: change its pose, or the geometry"
                 )
 
     def _take(self, context: Context, tick: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

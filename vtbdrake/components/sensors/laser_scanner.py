@@ -301,8 +301,8 @@ class LaserScanner(AddressedSystem):
                 rays_L = raster(rows, columns, config.azimuth, config.elevation, by_columns=by_columns)
                 directions = rays_L[fired:due]
                 times = (np.arange(fired, due) + 0.5) * (period / rays)
-                kept, ranges = self._fire(context, settings, generator, directions, times + (start - now))
-                slices = (*slices, np.column_stack((directions[kept], ranges, times[kept])))
+                returned, ranges = self._fire(context, settings, generator, directions, times + (start - now))
+                slices = (*slices, np.column_stack((directions[returned], ranges, times[returned])))
                 fired = due
             if fired < rays or start + period > now + _ROUNDING:
                 break
@@ -363,10 +363,10 @@ class LaserScanner(AddressedSystem):
             ranges = np.where(false < np.minimum(distances, reach), false, ranges)
         else:
             ranges = np.where(power >= distances**2, distances, inf)
-        kept = np.flatnonzero(ranges < inf)
-        ranges = _with_errors(ranges[kept], errors, generator)
+        returned = np.flatnonzero(ranges < inf)
+        ranges = _with_errors(ranges[returned], errors, generator)
         reported = (config.min_range <= ranges) & (ranges <= config.max_range)
-        return kept[reported], ranges[reported]
+        return returned[reported], ranges[reported]
 
 
 def connect_laser_scanner(

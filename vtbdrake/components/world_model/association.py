@@ -129,7 +129,7 @@ def _within_reach(
     """
     widest = max((len(sighting.attributes) for sighting in sightings), default=0)
     gate = chi_square_quantile(probability, 6 + widest)
-    reach = np.array([[one.kind == s.kind for one in objects] for s in sightings], dtype=bool)
+    reach = np.array([[world_object.kind == s.kind for world_object in objects] for s in sightings], dtype=bool)
     reach = reach.reshape(len(sightings), len(objects))
     delta2, trace = np.zeros(reach.shape), np.zeros(reach.shape)
     for axis in range(3):

@@ -62,15 +62,17 @@ def save_geojson(model: WorldModel, path: str | os.PathLike[str], *, frame: Loca
         ValueError: An attribute has the name of another property, or one attribute is in several units.
     """
     units: dict[str, str] = {}
-    for one in model:
-        for name, quantity in one.attributes.items():
+    for world_object in model:
+        for name, quantity in world_object.attributes.items():
             if name in _OWN or name.endswith(_DEVIATION):
-                raise ValueError(f"the attribute {name} of {one.identity} has the name of another property in GeoJSON")
+                raise ValueError(
+                    f"the attribute {name} of {world_object.identity} has the name of another property in GeoJSON"
+                )
             if not isinstance(quantity.value, str) and units.setdefault(name, quantity.unit) != quantity.unit:
-                raise ValueError(f"{name} of {one.identity} is in {quantity.unit}, of others in {units[name]}")
+                raise ValueError(f"{name} of {world_object.identity} is in {quantity.unit}, of others in {units[name]}")
     places = frame.to_geographic(model.positions())
     members = {"type": "FeatureCollection", "local_frame": asdict(frame), "units": units}
-    features = (_feature(one, place) for one, place in zip(model, places, strict=True))
+    features = (_feature(world_object, place) for world_object, place in zip(model, places, strict=True))
     with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         # One after another, because all of them as one text took 0.7 GB for 100,000 objects.
         file.write(json.dumps(members, allow_nan=False).removesuffix("}") + ', "features": [\n')
@@ -79,28 +81,30 @@ def save_geojson(model: WorldModel, path: str | os.PathLike[str], *, frame: Loca
         file.write("\n]}\n")
 
 
-def _feature(one: WorldObject, place: Array) -> dict[str, Any]:
+def _feature(world_object: WorldObject, place: Array) -> dict[str, Any]:
     properties: dict[str, Any] = {
-        "class": one.kind,
-        "status": one.status,
-        "source": one.source,
-        "time": one.pose.time,
-        "hits": one.hits,
-        "misses": one.misses,
-        "conflicts": one.conflicts,
+        "class": world_object.kind,
+        "status": world_object.status,
+        "source": world_object.source,
+        "time": world_object.pose.time,
+        "hits": world_object.hits,
+        "misses": world_object.misses,
+        "conflicts": world_object.conflicts,
     }
-    for name, quantity in one.attributes.items():
+    for name, quantity in world_object.attributes.items():
         properties[name] = quantity.value
         if quantity.is_measured:
             properties[name + _DEVIATION] = quantity.deviation
-    covariance = [[value if isfinite(value) else None for value in row] for row in one.pose.covariance.tolist()]
+    covariance = [
+        [value if isfinite(value) else None for value in row] for row in world_object.pose.covariance.tolist()
+    ]
     properties |= {
-        "orientation": json.dumps(one.X_WO.rotation().ToQuaternion().wxyz().tolist()),
+        "orientation": json.dumps(world_object.X_WO.rotation().ToQuaternion().wxyz().tolist()),
         "covariance": json.dumps(covariance),
-        "relations": json.dumps([asdict(relation) for relation in one.relations]),
+        "relations": json.dumps([asdict(relation) for relation in world_object.relations]),
     }
     geometry = {"type": "Point", "coordinates": place.tolist()}
-    return {"type": "Feature", "id": one.identity, "geometry": geometry, "properties": properties}
+    return {"type": "Feature", "id": world_object.identity, "geometry": geometry, "properties": properties}
 
 
 def load_geojson(
@@ -141,10 +145,10 @@ def _reject(constant: str) -> NoReturn:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         raise ValueError(f"one of the members {', '.join(name for name, _ in pairs)} is there twice")
-    return found
+    return members
 
 
 class _Reader:
@@ -172,8 +176,8 @@ class _Reader:
         places = [self._named(number, self._place) for number in range(len(self._features))]
         # All at once: one at a time, this took a third of the time of reading.
         self._positions = self._frame.from_geographic(np.array(places, dtype=float).reshape(-1, 3))
-        seen: set[str] = set()
-        return WorldModel(self._named(number, self._object, seen) for number in range(len(self._features)))
+        identities: set[str] = set()
+        return WorldModel(self._named(number, self._object, identities) for number in range(len(self._features)))
 
     def _named(self, number: int, read: Callable[..., _Read], *further: Any) -> _Read:
         """Return what ``read(number, *further)`` returns; an error names the feature of this number."""
@@ -202,7 +206,7 @@ class _Reader:
             raise ValueError(f"its coordinates are degrees of longitude and latitude, not {longitude}, {latitude}")
         return [longitude, latitude, height]
 
-    def _object(self, number: int, seen: set[str]) -> WorldObject:
+    def _object(self, number: int, identities: set[str]) -> WorldObject:
         """Return the object of a feature; its identity joins those that were ``seen``."""
         feature = self._features[number]
         properties = feature.get("properties")
@@ -213,9 +217,9 @@ class _Reader:
         identity = feature.get("id", properties.get("id"))
         if isinstance(identity, bool) or not isinstance(identity, str | int) or identity == "":
             raise ValueError(f"its id is a text or a whole number, not {identity!r}")
-        if str(identity) in seen:
+        if str(identity) in identities:
             raise ValueError("another feature has this id, too")
-        seen.add(str(identity))
+        identities.add(str(identity))
         kind = properties.get("class")
         if not isinstance(kind, str):
             raise ValueError(f"its property class is a text, such as tree, not {kind!r}")
@@ -254,7 +258,7 @@ class _Reader:
         return PoseEstimate.of(RigidTransform(rotation, position), covariance, time=time)
 
     def _attributes(self, properties: Mapping[str, Any]) -> dict[str, Quantity]:
-        found: dict[str, Quantity] = {}
+        attributes: dict[str, Quantity] = {}
         names = [name for name in properties if name not in _OWN]
         for name in names:
             value = properties[name]
@@ -263,7 +267,7 @@ class _Reader:
                 if owner not in properties:
                     raise ValueError(f"its property {name} is the deviation of an attribute that it does not have")
             elif isinstance(value, str):
-                found[name] = Quantity(value)
+                attributes[name] = Quantity(value)
             elif not _are_numbers([value]):
                 raise ValueError(f"its attribute {name} is a number or a text, not {value!r}")
             elif name not in self._units:
@@ -273,26 +277,26 @@ class _Reader:
                 if not _are_numbers([deviation]):
                     raise ValueError(f"its property {name}{_DEVIATION} is a number, not {deviation!r}")
                 try:
-                    found[name] = Quantity(value, self._units[name], deviation)
+                    attributes[name] = Quantity(value, self._units[name], deviation)
                 except ValueError as error:
                     raise ValueError(f"its attribute {name}: {error}") from error
-        return found
+        return attributes
 
 
-def _local_frame(data: Any, given: LocalFrame | None) -> LocalFrame:
-    if data is None and given is None:
+def _local_frame(data: Any, frame: LocalFrame | None) -> LocalFrame:
+    if data is None and frame is None:
         raise ValueError(
             "the member local_frame, which other programs drop, is missing: add its place on Earth to the file, as "
             '"local_frame": {"longitude_deg": ..., "latitude_deg": ...}, or give frame=LocalFrame(...)'
         )
     try:
-        declared = given if data is None else LocalFrame(**data)
+        declared = frame if data is None else LocalFrame(**data)
     except TypeError:
         raise ValueError(
             f"local_frame has numbers longitude_deg, latitude_deg, height, x_axis_deg, and is not {data!r}"
         ) from None
-    if declared is None or given not in (None, declared):
-        raise ValueError(f"the file declares {declared}, and not frame={given}: leave frame out")
+    if declared is None or frame not in (None, declared):
+        raise ValueError(f"the file declares {declared}, and not frame={frame}: leave frame out")
     return declared
 
 
@@ -316,12 +320,14 @@ def _covariance(rows: Any) -> Array:
 
 def _relations(data: Any) -> tuple[Relation, ...]:
     try:
-        found = tuple(Relation(**one) for one in data)
+        relations = tuple(Relation(**relation) for relation in data)
     except TypeError:
-        found = None
-    if found is None or not all(isinstance(text, str) for one in found for text in (one.kind, one.other)):
+        relations = None
+    if relations is None or not all(
+        isinstance(text, str) for relation in relations for text in (relation.kind, relation.other)
+    ):
         raise ValueError('its relations are a list of {"kind": ..., "other": ...}')
-    return found
+    return relations
 
 
 def _text(properties: Mapping[str, Any], name: str, default: str) -> str:

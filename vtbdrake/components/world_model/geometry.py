@@ -110,16 +110,18 @@ def add_to_plant(plant: MultibodyPlant, model: WorldModel, *, parts: Mapping[str
     from pydrake.geometry import ProximityProperties
 
     placed: list[tuple[WorldObject, Part]] = []
-    for one in model:
-        if one.is_known:
-            if one.kind not in parts:
+    for standing in model:
+        if standing.is_known:
+            if standing.kind not in parts:
                 has = ", ".join(parts)
-                raise ValueError(f"no parts are known of the class {one.kind} of {one.identity} (known: {has}): add it")
-            placed += [(one, part) for part in parts[one.kind](one)]
+                raise ValueError(
+                    f"no parts are known of the class {standing.kind} of {standing.identity} (known: {has}): add it"
+                )
+            placed += [(standing, part) for part in parts[standing.kind](standing)]
     # Drake's defaults of friction: no variables of its own for each of thousands of geometries.
     world, default = plant.world_body(), ProximityProperties()
-    for one, part in placed:
-        X_WS, name = one.X_WO @ part.X_OS, f"{one.identity}/{part.name}"
+    for standing, part in placed:
+        X_WS, name = standing.X_WO @ part.X_OS, f"{standing.identity}/{part.name}"
         plant.RegisterVisualGeometry(world, X_WS, part.shape, name, part.color)
         if part.solid:
             plant.RegisterCollisionGeometry(world, X_WS, part.shape, name, default)

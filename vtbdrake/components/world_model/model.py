@@ -49,16 +49,15 @@ class WorldModel:
 
     def __init__(self, objects: Iterable[WorldObject] = (), *, created: int = 0) -> None:
         self._objects: dict[str, WorldObject] = {}
-        for one in objects:
-            if one.identity in self._objects:
-                raise ValueError(f"two objects have the identity {one.identity!r}")
-            self._objects[one.identity] = one
-        for one in self._objects.values():
-            for relation in one.relations:
+        for world_object in objects:
+            if world_object.identity in self._objects:
+                raise ValueError(f"two objects have the identity {world_object.identity!r}")
+            self._objects[world_object.identity] = world_object
+        for world_object in self._objects.values():
+            for relation in world_object.relations:
                 if relation.other not in self._objects:
-                    raise ValueError(
-                        f"{one.identity} {relation.kind} {relation.other!r}, which is not an object of the model"
-                    )
+                    statement = f"{world_object.identity} {relation.kind} {relation.other!r}"
+                    raise ValueError(f"{statement}, which is not an object of the model")
         self._created = created
         self._index: _Index | None = None
 
@@ -89,12 +88,12 @@ class WorldModel:
         return partial(WorldModel, created=self._created), (tuple(self),)
 
     def __repr__(self) -> str:
-        kinds = [one.kind for one in self]
+        kinds = [world_object.kind for world_object in self]
         return f"<WorldModel: {', '.join(f'{kinds.count(k)} {k}' for k in dict.fromkeys(kinds)) or 'empty'}>"
 
     def positions(self) -> Array:
         """Return the positions p_WoOo_W of all objects in m, shape (n, 3)."""
-        return np.array([one.pose.matrix[:, 3] for one in self]).reshape(-1, 3)
+        return np.array([world_object.pose.matrix[:, 3] for world_object in self]).reshape(-1, 3)
 
     def find(
         self,
@@ -122,7 +121,7 @@ class WorldModel:
         Raises:
             ValueError: A point, a box, a polygon, a status or the condition of an attribute is not one.
         """
-        chosen: Iterable[WorldObject] = self
+        candidates: Iterable[WorldObject] = self
         if near is not None or box is not None or polygon is not None:
             index = self._indexed()
             places = index.trees[3].data
@@ -131,18 +130,18 @@ class WorldModel:
                 rows = rows[_in_box(places[rows], *box)]
             if polygon is not None:
                 rows = rows[_in_polygon(places[rows, :2], polygon)]
-            chosen = [index.objects[row] for row in rows]
+            candidates = [index.objects[row] for row in rows]
         statuses = (status,) if isinstance(status, str) else None if status is None else tuple(status)
         for one_status in statuses or ():
             if one_status not in STATUSES:
                 raise ValueError(f"a status is one of {', '.join(STATUSES)}, not {one_status!r}")
-        conditions = [(name, _condition(name, wanted)) for name, wanted in (attributes or {}).items()]
+        conditions = [(name, _condition(name, condition)) for name, condition in (attributes or {}).items()]
         return tuple(
-            one
-            for one in chosen
-            if (kind is None or one.kind == kind)
-            and (statuses is None or one.status in statuses)
-            and all(_meets(one.attributes.get(name), condition) for name, condition in conditions)
+            candidate
+            for candidate in candidates
+            if (kind is None or candidate.kind == kind)
+            and (statuses is None or candidate.status in statuses)
+            and all(_meets(candidate.attributes.get(name), condition) for name, condition in conditions)
         )
 
     def nearest(self, p_WoQ_W: ArrayLike, count: int = 1) -> tuple[WorldObject, ...]:
@@ -158,12 +157,12 @@ class WorldModel:
         """Return the objects to which an object has a relation (of ``kind``, if given)."""
         return tuple(self[r.other] for r in self[identity].relations if kind is None or r.kind == kind)
 
-    def known(self) -> WorldModel:
+    def without_unknown(self) -> WorldModel:
         """Return the part of the model that is believed to be there, without tentative and retired objects.
 
         Relations to what is left out are left out, too.
         """
-        return self.without(one.identity for one in self if not one.is_known)
+        return self.without(world_object.identity for world_object in self if not world_object.is_known)
 
     def with_objects(self, *objects: WorldObject, created: int | None = None) -> WorldModel:
         """Return a model in which these objects replace those of the same identity, or are added.
@@ -172,7 +171,7 @@ class WorldModel:
             objects: The new objects.
             created: The new `created`; by default it remains.
         """
-        updated = self._objects | {one.identity: one for one in objects}
+        updated = self._objects | {world_object.identity: world_object for world_object in objects}
         return WorldModel(updated.values(), created=self._created if created is None else created)
 
     def without(self, identities: Iterable[str]) -> WorldModel:
@@ -182,8 +181,8 @@ class WorldModel:
             KeyError: One of them is not there.
         """
         gone = {self[identity].identity for identity in identities}
-        left = [one for one in self if one.identity not in gone]
-        return WorldModel((_cut(one, gone) for one in left), created=self._created)
+        left = [world_object for world_object in self if world_object.identity not in gone]
+        return WorldModel((_cut(world_object, gone) for world_object in left), created=self._created)
 
     def _near(self, point: ArrayLike, distance: float) -> Rows:
         """Return the objects within a distance of a point, by row."""
@@ -203,10 +202,10 @@ class WorldModel:
         return self._index
 
 
-def _cut(one: WorldObject, gone: set[str]) -> WorldObject:
+def _cut(world_object: WorldObject, gone: set[str]) -> WorldObject:
     """Return an object without its relations to ``gone``."""
-    left = tuple(relation for relation in one.relations if relation.other not in gone)
-    return one if len(left) == len(one.relations) else replace(one, relations=left)
+    left = tuple(relation for relation in world_object.relations if relation.other not in gone)
+    return world_object if len(left) == len(world_object.relations) else replace(world_object, relations=left)
 
 
 def _point(point: ArrayLike, size: int) -> Array:
@@ -247,12 +246,12 @@ def _in_polygon(places: Array, rings: Sequence[ArrayLike]) -> NDArray[np.bool_]:
     return inside | on
 
 
-def _condition(name: str, wanted: str | tuple[float, float]) -> str | tuple[float, float]:
-    if isinstance(wanted, str):
-        return wanted
-    low, high = wanted if np.shape(wanted) == (2,) else (inf, -inf)
+def _condition(name: str, condition: str | tuple[float, float]) -> str | tuple[float, float]:
+    if isinstance(condition, str):
+        return condition
+    low, high = condition if np.shape(condition) == (2,) else (inf, -inf)
     if not -inf <= low <= high <= inf:
-        raise ValueError(f"the condition of {name} is a text, or the least and the largest number, not {wanted!r}")
+        raise ValueError(f"the condition of {name} is a text, or the least and the largest number, not {condition!r}")
     return (low, high)
 
 
@@ -269,20 +268,22 @@ def _encode(model: WorldModel) -> dict[str, np.ndarray]:
         raise ValueError(f"a WorldModel is expected here, not {model!r}")
     texts = [
         {
-            "identity": one.identity,
-            "kind": one.kind,
-            "attributes": {name: asdict(quantity) for name, quantity in one.attributes.items()},
-            "relations": [asdict(relation) for relation in one.relations],
-            "source": one.source,
-            "status": one.status,
+            "identity": world_object.identity,
+            "kind": world_object.kind,
+            "attributes": {name: asdict(quantity) for name, quantity in world_object.attributes.items()},
+            "relations": [asdict(relation) for relation in world_object.relations],
+            "source": world_object.source,
+            "status": world_object.status,
         }
-        for one in model
+        for world_object in model
     ]
     return {
-        "matrices": np.array([one.pose.matrix for one in model]).reshape(-1, 3, 4),
-        "covariances": np.array([one.pose.covariance for one in model]).reshape(-1, 6, 6),
-        "times": np.array([one.pose.time for one in model], dtype=float),
-        "counts": np.array([(one.hits, one.misses, one.conflicts) for one in model], dtype=np.int64).reshape(-1, 3),
+        "matrices": np.array([world_object.pose.matrix for world_object in model]).reshape(-1, 3, 4),
+        "covariances": np.array([world_object.pose.covariance for world_object in model]).reshape(-1, 6, 6),
+        "times": np.array([world_object.pose.time for world_object in model], dtype=float),
+        "counts": np.array(
+            [(world_object.hits, world_object.misses, world_object.conflicts) for world_object in model], dtype=np.int64
+        ).reshape(-1, 3),
         "created": np.array(model.created),
         "texts": np.frombuffer(json.dumps(texts).encode(), dtype=np.uint8),
     }

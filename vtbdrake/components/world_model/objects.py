@@ -170,7 +170,7 @@ class WorldObject:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         return partial(WorldObject, **values | {"attributes": dict(self.attributes)}), ()
 
 
@@ -206,16 +206,16 @@ def check_pose(owner: str, pose: PoseEstimate) -> None:
         raise ValueError(f"the pose of {owner} is missing: leave objects out of which no pose is known")
     if not np.isfinite(pose.matrix).all() or not isfinite(pose.time):
         raise ValueError(f"pose and time of {owner} are finite numbers")
-    known = finite_part(pose.covariance)
+    part = finite_part(pose.covariance)
     diagonal = np.diag(pose.covariance)
     if np.isnan(pose.covariance).any() or (diagonal < 0.0).any():
         raise ValueError(f"the covariance of {owner} has variances of at least 0, not {diagonal}")
-    if known[:3].any() and not known[:3].all():
+    if part[:3].any() and not part[:3].all():
         raise ValueError(f"the variances of the rotation of {owner} are all finite or all infinite, not {diagonal[:3]}")
-    block = pose.covariance[np.ix_(known, known)]
-    others = pose.covariance[~np.outer(known, known) & ~np.eye(6, dtype=bool)]
+    block = pose.covariance[np.ix_(part, part)]
+    mixed = pose.covariance[~np.outer(part, part) & ~np.eye(6, dtype=bool)]
     scale = float(np.max(np.abs(block), initial=0.0))
-    if others.any() or not np.isfinite(block).all() or np.abs(block - block.T).max(initial=0.0) > 1e-9 * scale:
+    if mixed.any() or not np.isfinite(block).all() or np.abs(block - block.T).max(initial=0.0) > 1e-9 * scale:
         raise ValueError(f"the covariance of {owner} is symmetric, and zero beside its infinite variances")
     if block.size and np.linalg.eigvalsh(block)[0] < -1e-9 * scale:
         raise ValueError(f"the covariance of {owner} is not positive semidefinite")

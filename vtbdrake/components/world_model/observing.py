@@ -88,28 +88,28 @@ def observe(
         KeyError: An expected object is not in the model.
         ValueError: One of the sightings is no `Sighting`.
     """
-    candidates = [one for one in model if one.status != RETIRED]
+    candidates = [world_object for world_object in model if world_object.status != RETIRED]
     pairs = associate(candidates, sightings, probability=rules.gate)
     changed: dict[str, WorldObject] = {}
     for i, j in pairs.items():
         changed[candidates[j].identity] = _hit(candidates[j], sightings[i], rules)
     unseen = [model[identity] for identity in dict.fromkeys(expected) if identity not in changed]
-    unseen = [one for one in unseen if one.status != RETIRED]
+    unseen = [world_object for world_object in unseen if world_object.status != RETIRED]
     left = [sighting for i, sighting in enumerate(sightings) if i not in pairs]
 
-    conflicts = _conflicts([one for one in unseen if one.is_known], left, rules)
+    conflicts = _conflicts([world_object for world_object in unseen if world_object.is_known], left, rules)
     for identity, sighting in conflicts.items():
         changed[identity] = _conflict(model[identity], sighting, rules)
     forgotten = []
-    for one in unseen:
-        if one.identity not in conflicts:
-            missed = replace(one, misses=one.misses + 1, conflicts=0)
-            if one.status == TENTATIVE and missed.misses >= rules.forget:
-                forgotten.append(one.identity)
-            elif one.is_known and missed.misses >= rules.retire:
-                changed[one.identity] = replace(missed, status=RETIRED)
+    for world_object in unseen:
+        if world_object.identity not in conflicts:
+            missed = replace(world_object, misses=world_object.misses + 1, conflicts=0)
+            if world_object.status == TENTATIVE and missed.misses >= rules.forget:
+                forgotten.append(world_object.identity)
+            elif world_object.is_known and missed.misses >= rules.retire:
+                changed[world_object.identity] = replace(missed, status=RETIRED)
             else:
-                changed[one.identity] = missed
+                changed[world_object.identity] = missed
 
     created, explained = model.created, set(map(id, conflicts.values()))
     for sighting in left:
@@ -176,13 +176,13 @@ def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[
     return attributes
 
 
-def _hit(one: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
-    hits = one.hits + 1
+def _hit(world_object: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
+    hits = world_object.hits + 1
     return replace(
-        one,
-        pose=fused(one.pose, sighting.pose),
-        attributes=_fused_attributes(one, sighting),
-        status=CONFIRMED if one.status == TENTATIVE and hits >= rules.confirm else one.status,
+        world_object,
+        pose=fused(world_object.pose, sighting.pose),
+        attributes=_fused_attributes(world_object, sighting),
+        status=CONFIRMED if world_object.status == TENTATIVE and hits >= rules.confirm else world_object.status,
         hits=hits,
         misses=0,
         conflicts=0,
@@ -200,13 +200,13 @@ def _conflicts(unseen: Sequence[WorldObject], left: Sequence[Sighting], rules: L
     return {unseen[i].identity: left[j] for i, j in zip(*one_to_one(gain), strict=True)}
 
 
-def _conflict(one: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
-    if one.conflicts + 1 < rules.revise:
-        return replace(one, conflicts=one.conflicts + 1)
+def _conflict(world_object: WorldObject, sighting: Sighting, rules: LifeCycleConfig) -> WorldObject:
+    if world_object.conflicts + 1 < rules.revise:
+        return replace(world_object, conflicts=world_object.conflicts + 1)
     return replace(
-        one,
+        world_object,
         pose=sighting.pose,
-        attributes={**one.attributes, **sighting.attributes},
+        attributes={**world_object.attributes, **sighting.attributes},
         source=sighting.source,
         status=REVISED,
         hits=1,
