@@ -69,7 +69,7 @@ def test_opti_solves_it_under_a_symbolic_constraint(gradient):
         lambda a: float(with_h([a, 0.5 - a])), bounds=(-1.0, 1.5), method="bounded", options={"xatol": 1e-9}
     )
     assert found == pytest.approx([line.x, 0.5 - line.x], abs=1e-4)
-    with_h.check()
+    with_h.raise_error()
     with_h.close()
 
 
@@ -85,7 +85,7 @@ def test_what_is_raised_inside_comes_out_as_itself():
     with contextlib.suppress(RuntimeError):
         solver(x0=[1.0, 0.0], lbx=-1.5, ubx=1.5)
     with pytest.raises(QualityError, match="out of my range"):
-        h.check()
+        h.raise_error()
 
 
 def test_a_point_outside_its_range_is_an_error():
@@ -93,7 +93,7 @@ def test_a_point_outside_its_range_is_an_error():
     with pytest.raises(RuntimeError):
         h([2.0, 0.0])
     with pytest.raises(ValueError, match="outside its range"):
-        h.check()
+        h.raise_error()
     assert float(h([1.5 + 1e-8, 0.0])) == float(h([1.5, 0.0]))
 
 

@@ -22,7 +22,7 @@ SPACE = [
 @given(st.sampled_from(SPACE), st.floats(0.0, 1.0))
 def test_every_place_of_the_unit_interval_leads_back(dimension, u):
     value = dimension.from_unit(u)
-    assert dimension.check(value) == value
+    assert dimension.as_value(value) == value
     again = dimension.from_unit(dimension.to_unit(value))
     assert again == (value if not isinstance(value, float) else pytest.approx(value))
 
@@ -54,12 +54,12 @@ def test_a_logarithmic_range_has_its_geometric_mean_in_the_middle():
         (lambda: Choice("a", [1, True]), "at least two different options"),
         (lambda: Choice("a", [np.nan, 1.0]), "which NaN never equals"),
         (lambda: Choice("a", [1.0, np.zeros(2)]), "numbers, words or booleans"),
-        (lambda: SPACE[0].check("x"), r"takes a number in \[-2, 6\], not 'x'"),
-        (lambda: SPACE[0].check(7.0), r"a = 7 lies outside its range \[-2, 6\]"),
-        (lambda: SPACE[0].check(np.nan), "outside its range"),
-        (lambda: SPACE[2].check(0.5), "takes whole numbers, not 0.5"),
-        (lambda: SPACE[4].check("blue"), "is one of {'red', 'green', 3, 2.5, False}, not 'blue'"),
-        (lambda: SPACE[4].check(0), "not 0"),
+        (lambda: SPACE[0].as_value("x"), r"takes a number in \[-2, 6\], not 'x'"),
+        (lambda: SPACE[0].as_value(7.0), r"a = 7 lies outside its range \[-2, 6\]"),
+        (lambda: SPACE[0].as_value(np.nan), "outside its range"),
+        (lambda: SPACE[2].as_value(0.5), "takes whole numbers, not 0.5"),
+        (lambda: SPACE[4].as_value("blue"), "is one of {'red', 'green', 3, 2.5, False}, not 'blue'"),
+        (lambda: SPACE[4].as_value(0), "not 0"),
     ],
 )
 def test_what_is_no_value_is_refused(make, message):

@@ -449,7 +449,7 @@ class Thinker(Solver):
         self._never.wait()
         return []
 
-    def _learn(self, asked, given):
+    def _learn(self, evaluations, by_hand):
         return
 
     def close(self):

@@ -56,7 +56,7 @@ def test_limited_trajectories_keep_all_limits_between_the_knots(order: str, star
         assert_kept(plan, tame)
         assert not plan.excess(tame)
         for parameter, value in zip(plan.parameters, tame, strict=True):
-            parameter.check(value)
+            parameter.as_value(value)
         if start is not None:
             np.testing.assert_array_equal(plan.values(tame, [0.0])[0], start)
 

@@ -148,13 +148,15 @@ def test_a_study_finds_the_same_optimum():
 
 
 def test_the_check_finds_a_short_memory():
-    assert not [f for f in problem(motion=RecordedMotion(MEMORY)).check().findings if "longer memory" in f]
-    assert [f for f in problem(motion=RecordedMotion(0.02)).check().findings if "longer memory" in f]
+    assert not [
+        f for f in problem(motion=RecordedMotion(MEMORY)).check_repeatability().findings if "longer memory" in f
+    ]
+    assert [f for f in problem(motion=RecordedMotion(0.02)).check_repeatability().findings if "longer memory" in f]
 
 
 def test_the_check_finds_a_filter_that_never_forgets():
     quality = Quality(seen, of=["dps.memory.total"])
-    findings = problem(quality=quality, motion=RecordedMotion(MEMORY)).check().findings
+    findings = problem(quality=quality, motion=RecordedMotion(MEMORY)).check_repeatability().findings
     assert [f for f in findings if "a longer memory than memory=" in f]
 
 

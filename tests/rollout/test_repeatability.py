@@ -50,7 +50,7 @@ class ForgetfulScenario(AcrobotScenario):
 
 @pytest.mark.parametrize("scenario", [AcrobotScenario(), PendulumScenario()])
 def test_nothing_is_found_where_nothing_is_wrong(scenario):
-    found = _problem(scenario, of=SHOULDER if isinstance(scenario, AcrobotScenario) else THETA).check()
+    found = _problem(scenario, of=SHOULDER if isinstance(scenario, AcrobotScenario) else THETA).check_repeatability()
     assert found.ok and found.findings == ()
     assert 0.0 < found.seconds <= 0.5
     assert str(found).startswith("nothing found: rollouts repeat over ")
@@ -61,7 +61,7 @@ def test_nothing_is_found_where_nothing_is_wrong(scenario):
     [(False, "a second rollout of the same point"), (True, "a rollout that runs beside another one")],
 )
 def test_memory_in_self_is_named_with_its_system(again, what):
-    found = _problem(ForgetfulScenario(again=again)).check()
+    found = _problem(ForgetfulScenario(again=again)).check_repeatability()
     (finding,) = found.findings
     assert finding.startswith(f"{what} differs from t = 0.05 s on: self._sum of dps (Forgetful) has memory outside")
     assert "DeclareDiscreteState" in finding
@@ -88,7 +88,7 @@ class ModelScenario(AcrobotScenario):
 
 
 def test_a_context_kept_in_self_is_named():
-    (finding,) = _problem(ModelScenario()).check().findings
+    (finding,) = _problem(ModelScenario()).check_repeatability().findings
     assert finding.startswith("self._model of dps (WithModel) is a Context: rollouts in threads share it")
 
 
@@ -99,7 +99,7 @@ def test_a_quality_with_memory_is_named():
         calls.append(theta)
         return abs(theta) + len(calls)
 
-    (finding,) = _problem(AcrobotScenario(), counted).check().findings
+    (finding,) = _problem(AcrobotScenario(), counted).check_repeatability().findings
     assert finding.startswith("a second rollout of the same point differs at t = 0 s in its quality counted")
 
 
@@ -109,7 +109,7 @@ def test_what_a_quality_holds_and_cannot_be_sent_is_named():
     def locked(theta):
         return abs(theta) + lock.locked()
 
-    (finding,) = _problem(AcrobotScenario(), locked).check().findings
+    (finding,) = _problem(AcrobotScenario(), locked).check_repeatability().findings
     assert finding.startswith("'lock', which the quality locked uses, cannot be sent to workers (TypeError: ")
     assert "executor='threads'" in finding
 
@@ -124,7 +124,7 @@ MAIN = int(os.environ.setdefault("VTB_TEST_MAIN", str(os.getpid())))
 
 
 def test_what_depends_on_the_process_is_found():
-    (finding,) = _problem(PidScenario()).check().findings
+    (finding,) = _problem(PidScenario()).check_repeatability().findings
     assert finding.startswith("in another process, a rollout of the same point gives another result")
 
 
@@ -137,7 +137,7 @@ def test_a_failing_simulation_is_compared_too():
         quality=vtb.Quality(abs, of=SHOULDER),
         horizon=2.0,
     )
-    found = problem.check()
+    found = problem.check_repeatability()
     assert found.ok
     assert f"the rollout fails after {found.seconds:g} s: {found.failure}" in str(found)
     assert "RuntimeError: " in found.failure

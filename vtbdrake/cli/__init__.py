@@ -86,8 +86,8 @@ class _Commands(click.Group):
             raise FailedError(one_line(error)) from error
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted and not ctx.resilient_parsing:
+def _print_version(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
+    if is_requested and not ctx.resilient_parsing:
         try:
             click.echo(f"vtbdrake {metadata.version('vtbdrake')}")
         except metadata.PackageNotFoundError:

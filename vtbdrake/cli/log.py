@@ -53,19 +53,19 @@ def replay(
     """
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
-    found = read_log(log)
-    recorded = found.header.scenario_name
-    if found.header.of_main_module:
-        found.header.make_scenario()  # It raises: the class is in a script or a notebook.
+    opened = read_log(log)
+    recorded = opened.header.scenario_name
+    if opened.header.of_main_module:
+        opened.header.make_scenario()  # It raises: the class is in a script or a notebook.
     if scenario is None and recorded:
         raise click.UsageError(
             f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "
             f"--scenario {recorded}"
         )
-    if scenario is not None and (given := class_name(scenario_class(scenario))) != recorded:
-        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {given}")
-    target = None if on == "recorded" else DpsAlone(found.scenario) if on == "dps" else found.scenario.build()
-    report = replay_log(found, target, values=settings(values), record=record)
+    if scenario is not None and (requested := class_name(scenario_class(scenario))) != recorded:
+        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
+    target = None if on == "recorded" else DpsAlone(opened.scenario) if on == "dps" else opened.scenario.build()
+    report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:
         save_recording(out, report.times, report.record)
     click.echo(report)
@@ -87,6 +87,6 @@ def export(log: Path, out: Path) -> None:
     Example:
       vtbdrake export run.lcm run.mcap
     """
-    found = read_log(log)
-    export_log(found, out)
-    click.echo(found)
+    opened = read_log(log)
+    export_log(opened, out)
+    click.echo(opened)

@@ -159,19 +159,19 @@ def make_constraint(text: str, *, limit: str) -> Constraint:
         click.BadParameter: The text has another form.
         click.UsageError: The function does not exist.
     """
-    what, _, bound = (part.strip() for part in text.rpartition("="))
+    subject, _, bound = (part.strip() for part in text.rpartition("="))
     form = "ADDRESS=LIMIT or MODULE:FUNCTION(ADDRESS,...)=LIMIT"
     try:
         limits: dict[str, Any] = {limit: float(bound)}
     except ValueError as error:
         raise click.BadParameter(f"expected {form}, LIMIT a number, not {text!r}") from error
-    call = _CALL.fullmatch(what)
+    call = _CALL.fullmatch(subject)
     if call is not None:
         of = [address.strip() for address in call[2].split(",") if address.strip()]
         return Constraint(_function(call[1]), of=of, **limits)
-    if not what or _FUNCTION.fullmatch(what):
+    if not subject or _FUNCTION.fullmatch(subject):
         raise click.BadParameter(f"expected {form}, not {text!r}")
-    return Constraint(largest if limit == "at_most" else smallest, of=what, **limits)
+    return Constraint(largest if limit == "at_most" else smallest, of=subject, **limits)
 
 
 def _function(text: str) -> Callable[..., Any]:
@@ -180,10 +180,10 @@ def _function(text: str) -> Callable[..., Any]:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise click.UsageError(f"cannot import {module_name} of the quality {text}: {error}") from error
-    found = getattr(module, name, None)
-    if not callable(found):
+    function = getattr(module, name, None)
+    if not callable(function):
         raise click.UsageError(f"{module_name} has no function {name!r}")
-    return found
+    return function
 
 
 @click.command()
@@ -270,11 +270,11 @@ def boundary(
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
-    found = make_problem(scenario, [vary], **problem).boundary(**search, **running)
-    assert found.sweep is not None
-    _write_files(found.sweep, boundary=found, **files)
-    _reject_failures(found.sweep)
-    click.echo(_report(found, found.sweep))
+    result = make_problem(scenario, [vary], **problem).boundary(**search, **running)
+    assert result.sweep is not None
+    _write_files(result.sweep, boundary=result, **files)
+    _reject_failures(result.sweep)
+    click.echo(_report(result, result.sweep))
 
 
 def _points_table(sweep: Sweep) -> str:
@@ -303,19 +303,19 @@ def _conclusion(sweep: Sweep) -> str:
     return "\n".join(lines)
 
 
-def _report(found: Boundary, sweep: Sweep) -> str:
-    lines = [str(found)]
+def _report(boundary: Boundary, sweep: Sweep) -> str:
+    lines = [str(boundary)]
     several = len(sweep.conditions) > 1
     if several:
-        for i, (lower, upper) in enumerate(found.by_condition):
-            lines.append(f"  {_condition(i, sweep.conditions[i])}: {found.interval_text(lower, upper)}")
-    for chance in found.worst_chances:
+        for i, (lower, upper) in enumerate(boundary.by_condition):
+            lines.append(f"  {_condition(i, sweep.conditions[i])}: {boundary.interval_text(lower, upper)}")
+    for chance in boundary.worst_chances:
         which = f" under condition {chance.condition}" if several else ""
-        lines.append(f"  {with_unit(number(chance.value), found.unit)}: {chance}{which}")
-    if found.failed_at:
-        values = ", ".join(map(number, found.failed_at))
-        lines.append(f"counted as unsafe: a rollout failed at {with_unit(values, found.unit)}")
-    rollouts = [*sweep.rollouts, *(found.repeated.rollouts if found.repeated is not None else ())]
+        lines.append(f"  {with_unit(number(chance.value), boundary.unit)}: {chance}{which}")
+    if boundary.failed_at:
+        values = ", ".join(map(number, boundary.failed_at))
+        lines.append(f"counted as unsafe: a rollout failed at {with_unit(values, boundary.unit)}")
+    rollouts = [*sweep.rollouts, *(boundary.repeated.rollouts if boundary.repeated is not None else ())]
     seconds = sum(rollout.wall_time for rollout in rollouts)
     return "\n".join([*lines, f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation"])
 

@@ -59,12 +59,12 @@ def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool) ->
         return
     testbed = scenario.build()
     listed = testbed.variables()
-    chosen = [variable for variable in listed.values() if match in variable.address]
-    if not chosen:
+    matches = [variable for variable in listed.values() if match in variable.address]
+    if not matches:
         raise BadInputError(f"no address contains {match!r}{suggestion(match, listed)}")
     context = testbed.default_context()
     if as_json:
-        click.echo(json.dumps([_plain(variable, context) for variable in chosen], indent=2))
+        click.echo(json.dumps([_plain(variable, context) for variable in matches], indent=2))
     else:
         click.echo(listed.table(context, pattern=match))
 
@@ -146,11 +146,11 @@ def rollout(
     result = runner.run(parameters)
 
     click.echo(_outcome(result))
-    asked = replace(result, record={address: result.record[address] for address in record})
-    if asked.times.size and asked.record:
-        click.echo("\n" + _extremes_table(asked, testbed.variables()))
+    recorded_result = replace(result, record={address: result.record[address] for address in record})
+    if recorded_result.times.size and recorded_result.record:
+        click.echo("\n" + _extremes_table(recorded_result, testbed.variables()))
     if save is not None:
-        save_recording(save, asked.times, asked.record)
+        save_recording(save, recorded_result.times, recorded_result.record)
     if html is not None:
         from vtbdrake.optimization import Motion
         from vtbdrake.visualization import make_meshcat, show_motion
@@ -193,5 +193,5 @@ def _extremes_table(result: RolloutResult, variables: Variables) -> str:
 
 
 def _extremes(values: np.ndarray) -> tuple[float, float]:
-    known = values[~np.isnan(values)]
-    return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+    numbers = values[~np.isnan(values)]
+    return (float(numbers.min()), float(numbers.max())) if numbers.size else (np.nan, np.nan)

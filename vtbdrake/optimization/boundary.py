@@ -49,8 +49,8 @@ class Chance:
         """Return the 95 % confidence interval of the probability of an unsafe rollout (Clopper and Pearson, 1934)."""
         from scipy.stats import binomtest  # It takes longer to load than all the rest.
 
-        found = binomtest(self.unsafe, self.rollouts).proportion_ci(0.95, method="exact")
-        return float(found.low), float(found.high)
+        interval = binomtest(self.unsafe, self.rollouts).proportion_ci(0.95, method="exact")
+        return float(interval.low), float(interval.high)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -196,11 +196,14 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
     values = sweep.points[:, 0]
     unsafe = {(float(value), int(c)): bad for value, c, bad in zip(values, sweep.condition, sweep.unsafe, strict=True)}
     shares = {key: float(bad) for key, bad in unsafe.items()} | {(c.value, c.condition): c.share for c in chances}
-    own = [sorted((v, share) for (v, c), share in shares.items() if c == k) for k in range(len(sweep.conditions))]
-    by_condition = np.array([_interval(outcomes) for outcomes in own])
-    first = [min((value for value, share in outcomes if share > 0.0), default=inf) for outcomes in own]
+    by_number = [sorted((v, share) for (v, c), share in shares.items() if c == k) for k in range(len(sweep.conditions))]
+    by_condition = np.array([_interval(outcomes) for outcomes in by_number])
+    first = [min((value for value, share in outcomes if share > 0.0), default=inf) for outcomes in by_number]
     beyond = {
-        v for outcomes, start in zip(own, first, strict=True) for v, share in outcomes if share == 0.0 and v > start
+        v
+        for outcomes, start in zip(by_number, first, strict=True)
+        for v, share in outcomes
+        if share == 0.0 and v > start
     }
     sweeps = [sweep] if repeated is None else [sweep, repeated]
     rows = [(float(v), r) for each in sweeps for v, r in zip(each.points[:, 0], each.rollouts, strict=True)]
@@ -213,7 +216,7 @@ def boundary_of(sweep: Sweep, chances: Sequence[Chance] = (), repeated: Sweep | 
         upper=upper,
         by_condition=by_condition,
         examined=(float(values.min()), float(values.max())),
-        gap=max(float(np.diff([v for v, _ in outcomes if v <= lower]).max(initial=0.0)) for outcomes in own),
+        gap=max(float(np.diff([v for v, _ in outcomes if v <= lower]).max(initial=0.0)) for outcomes in by_number),
         step=float(np.diff(np.unique(values)).min(initial=inf)),
         chances=tuple(sorted(chances, key=lambda chance: (chance.value, chance.condition))),
         safe_beyond=_distinct(beyond),
@@ -319,11 +322,11 @@ def find_boundary(
         index -> unsafe, for each condition.
     """
     outcomes: list[dict[int, bool]] = [{} for _ in range(conditions)]
-    wanted = [(index, condition) for index in refinement.start() for condition in range(conditions)]
-    while wanted:
-        for (index, condition), bad in zip(wanted, examine(wanted), strict=True):
+    candidates = [(index, condition) for index in refinement.start() for condition in range(conditions)]
+    while candidates:
+        for (index, condition), bad in zip(candidates, examine(candidates), strict=True):
             outcomes[condition][index] = bad
-        wanted = [(i, condition) for condition in range(conditions) for i in refinement.next(outcomes[condition])]
+        candidates = [(i, condition) for condition in range(conditions) for i in refinement.next(outcomes[condition])]
     return outcomes
 
 
@@ -336,13 +339,13 @@ def repeat_around(first: int, last: int, count: Callable[[Sequence[int]], Mappin
         count: Repeats values under all conditions; returns index -> the share of unsafe rollouts by condition.
     """
     down, up = min(first - 1, last), first
-    wanted = [index for index in (down, up) if 0 <= index <= last]
-    while wanted:
-        shares = count(wanted)
+    indices = [index for index in (down, up) if 0 <= index <= last]
+    while indices:
+        shares = count(indices)
         below = down - 1 if down in shares and max(shares[down]) > 0.0 else -1
         above = up + 1 if up in shares and max(shares[up]) < 1.0 else last + 1
         down, up = below, above
-        wanted = [index for index in (down, up) if 0 <= index <= last]
+        indices = [index for index in (down, up) if 0 <= index <= last]
 
 
 def parameter_with_boundary(problem: Problem) -> Parameter:
@@ -410,30 +413,30 @@ class BoundarySearch:
             self._sorted(self._results), chances, self._sorted(self._repeated) if self._chances else None
         )
 
-    def examine(self, wanted: Sequence[Candidate]) -> list[bool]:
+    def examine(self, candidates: Sequence[Candidate]) -> list[bool]:
         """Run one rollout for each candidate; return whether it was unsafe."""
-        keys: list[RolloutKey] = [((self._refinement.value(index),), condition) for index, condition in wanted]
+        keys: list[RolloutKey] = [((self._refinement.value(index),), condition) for index, condition in candidates]
         unsafe: list[bool] = self._roll(keys, self._results).tolist()
-        self._counts.update({candidate: (1, int(bad)) for candidate, bad in zip(wanted, unsafe, strict=True)})
+        self._counts.update({candidate: (1, int(bad)) for candidate, bad in zip(candidates, unsafe, strict=True)})
         return unsafe
 
     def repeat(self, indices: Sequence[int], *, repeats: int, jitter: float) -> dict[int, list[float]]:
         """Repeat values under all conditions; return index -> the share of unsafe rollouts under each condition."""
         count = len(self._problem.conditions)
-        wanted = [(index, condition) for index in indices for condition in range(count)]
-        new = [candidate for candidate in wanted if candidate not in self._counts]
+        candidates = [(index, condition) for index in indices for condition in range(count)]
+        new = [candidate for candidate in candidates if candidate not in self._counts]
         if new:
             self.examine(new)
         keys: list[RolloutKey] = [
-            ((value,), candidate[1]) for candidate in wanted for value in self._jittered(candidate, repeats, jitter)
+            ((value,), candidate[1]) for candidate in candidates for value in self._jittered(candidate, repeats, jitter)
         ]
         unsafe = self._roll(keys, self._repeated).reshape(-1, repeats).sum(axis=1)
         shares = []
-        for candidate, more in zip(wanted, unsafe.tolist(), strict=True):
+        for candidate, more in zip(candidates, unsafe.tolist(), strict=True):
             rollouts, bad = self._counts[candidate]
             self._counts[candidate] = rollouts + repeats, bad + more
             shares.append((bad + more) / (rollouts + repeats))
-        self._chances.update(wanted)
+        self._chances.update(candidates)
         return {index: shares[k * count : (k + 1) * count] for k, index in enumerate(indices)}
 
     def _jittered(self, candidate: Candidate, repeats: int, jitter: float) -> list[float]:
@@ -446,9 +449,9 @@ class BoundarySearch:
 
     def _roll(self, keys: Sequence[RolloutKey], results: list[tuple[RolloutKey, RolloutResult]]) -> np.ndarray:
         """Run rollouts and keep their results; return whether each was unsafe."""
-        found = roll_out(self._problem, self._executor, self._task, keys, name="boundary", progress=self._progress)
-        finished = [result for result in found if result is not None]
-        if len(finished) < len(found):
+        rolled_out = roll_out(self._problem, self._executor, self._task, keys, name="boundary", progress=self._progress)
+        finished = [result for result in rolled_out if result is not None]
+        if len(finished) < len(rolled_out):
             raise KeyboardInterrupt
         results += zip(keys, finished, strict=True)
         return make_sweep(self._problem, keys, finished).unsafe

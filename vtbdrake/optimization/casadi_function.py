@@ -32,7 +32,7 @@ class ProblemFunction(casadi.Callback):
     ``hessian_approximation="limited-memory"``, as there is no second derivative. Keep it alive while they work.
 
     A point whose simulation fails has the value NaN, from which solvers step back. CasADi's solvers suppress the
-    exceptions of a function: call `check` after them, which raises the last one.
+    exceptions of a function: call `raise_error` after them, which raises the last one.
 
     Args:
         problem: A problem with continuous parameters and one quality.
@@ -72,8 +72,8 @@ class ProblemFunction(casadi.Callback):
         rollouts = 2 * len(problem.parameters) * len(problem.conditions)
         self._executor = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, workers=workers)
         self._owned = self._executor is not executor
-        self._known: dict[RolloutKey, Outcome] = {}
-        self._evaluator = Evaluator(problem, self._known, self._roll_out)
+        self._outcomes: dict[RolloutKey, Outcome] = {}
+        self._evaluator = Evaluator(problem, self._outcomes, self._roll_out)
         self._jacobian: _Jacobian | None = None
         self.error: BaseException | None = None  # the last exception during an evaluation, or None
         self.construct(name, {})
@@ -81,14 +81,14 @@ class ProblemFunction(casadi.Callback):
     @property
     def rollouts(self) -> int:
         """Return the number of rollouts so far."""
-        return len(self._known)
+        return len(self._outcomes)
 
     def close(self) -> None:
         """Close the executor, unless it is the caller's."""
         if self._owned:
             self._executor.close()
 
-    def check(self) -> None:
+    def raise_error(self) -> None:
         """Raise the last exception during an evaluation, if there was one."""
         if self.error is not None:
             raise self.error
@@ -129,7 +129,7 @@ class ProblemFunction(casadi.Callback):
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
         points = [self._problem.values(point, condition=condition) for point, condition in keys]
         for index, result in self._executor.run(self._problem.task, points):
-            self._known[keys[index]] = Outcome.of(result)
+            self._outcomes[keys[index]] = Outcome.of(result)
 
     # -- what CasADi calls
 
@@ -142,7 +142,7 @@ class ProblemFunction(casadi.Callback):
 
     @contextmanager
     def kept_error(self) -> Iterator[None]:
-        """Keep the exception of an evaluation for `check`."""
+        """Keep the exception of an evaluation for `raise_error`."""
         try:
             yield
         except BaseException as error:

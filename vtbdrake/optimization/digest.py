@@ -77,8 +77,8 @@ def digest(value: Any) -> tuple[str, tuple[str, ...]]:
 
 def attributes(value: Any) -> dict[str, Any]:
     """Return the attributes of an object in Python, without those by which pydrake keeps other objects alive."""
-    own = getattr(value, "__dict__", {})
-    return {name: part for name, part in own.items() if not name.startswith("_pydrake_internal")}
+    values_by_name = getattr(value, "__dict__", {})
+    return {name: part for name, part in values_by_name.items() if not name.startswith("_pydrake_internal")}
 
 
 def is_own(thing: Any) -> bool:
@@ -187,12 +187,12 @@ class _Graph:
         code: Any = function.__code__
         names = code.co_freevars
         closure = dict(zip(names, map(_content, function.__closure__ or ()), strict=True))
-        held = (function.__defaults__, function.__kwdefaults__, closure, vars(function))
+        values = (function.__defaults__, function.__kwdefaults__, closure, vars(function))
         if not _is_own_module(home):
-            return self._made(f"function {home}.{code.co_qualname}", *held)
+            return self._made(f"function {home}.{code.co_qualname}", *values)
         if function.__doc__ is not None and code.co_consts and code.co_consts[0] == function.__doc__:
             code = code.replace(co_consts=(None, *code.co_consts[1:]))
-        return self._made("function", code, *held, _used(function))
+        return self._made("function", code, *values, _used(function))
 
     def _class(self, kind: type) -> _Node:
         if not is_own(kind):
@@ -311,23 +311,23 @@ class _References:
 
     def imports(self, package: str) -> list[str]:
         """Return the names of the user's modules that are imported in a package."""
-        found = []
+        modules = []
         for level, module, names in self._imports:
             base = "." * level + module
             candidates = [base, *(base + ("" if base.endswith(".") else ".") + name for name in names)]
-            found += [name for name in (_resolved(candidate, package) for candidate in candidates) if name]
-        return sorted(set(found))
+            modules += [name for name in (_resolved(candidate, package) for candidate in candidates) if name]
+        return sorted(set(modules))
 
 
 def _used(function: FunctionType) -> dict[str, Any]:
     """Return the globals that a function uses, and what it uses of the user's modules, by name."""
     references, scope = _References(function.__code__), function.__globals__
-    found = {
+    used = {
         name: _narrowed(scope[name], references.attributes, frozenset()) for name in references.globals if name in scope
     }
     # They may not be imported yet. Importing them here could have effects, so that their source counts, unlike below.
     imported = references.imports(str(scope.get("__package__") or ""))
-    return found | {f"import {name}": _source(name) for name in imported}
+    return used | {f"import {name}": _source(name) for name in imported}
 
 
 def _narrowed(value: Any, names: set[str], inside: frozenset[str]) -> Any:
@@ -343,8 +343,8 @@ def _resolved(name: str, package: str) -> str:
     try:
         full = importlib.util.resolve_name(name, package)
         # Finding a module imports the packages in which it lies.
-        own = _is_own_module(full.partition(".")[0]) and _is_own_module(full)
-        return full if own and importlib.util.find_spec(full) is not None else ""
+        is_own_file = _is_own_module(full.partition(".")[0]) and _is_own_module(full)
+        return full if is_own_file and importlib.util.find_spec(full) is not None else ""
     except (ImportError, ValueError, AttributeError):
         return ""
 

@@ -32,7 +32,7 @@ class Evaluator:
 
     Args:
         problem: The problem to evaluate.
-        known: The outcomes known so far; ``run`` adds to them.
+        outcomes: The outcomes so far; ``run`` adds to them.
         run: Function that runs the rollouts of the given keys.
         racing: Whether to drop a point as soon as it can no longer be better than the best one, whatever the results
             under its other conditions. The winner is never dropped: the risk does not fall when a quality rises, and a
@@ -49,7 +49,7 @@ class Evaluator:
     def __init__(
         self,
         problem: Problem,
-        known: Mapping[RolloutKey, Outcome | RolloutResult],
+        outcomes: Mapping[RolloutKey, Outcome | RolloutResult],
         run: Callable[[Sequence[RolloutKey]], None],
         *,
         racing: bool = False,
@@ -59,7 +59,7 @@ class Evaluator:
         if racing and len(problem.objectives) > 1:
             raise ValueError("racing compares one quality, but the problem has several: leave racing out")
         self._problem = problem
-        self._known = known
+        self._outcomes = outcomes
         self._run = run
         self._racing = racing and len(problem.conditions) > 1
         self._budget = budget
@@ -101,7 +101,7 @@ class Evaluator:
         new = dict.fromkeys(key for key in keys if key not in self._needed)
         self._needed.update(new)
         self._untold.update(point for point, _ in new)
-        missing = [key for key in keys if key not in self._known]
+        missing = [key for key in keys if key not in self._outcomes]
         if missing:
             self._run(missing)
 
@@ -130,7 +130,7 @@ class Evaluator:
         self._complete([(point, condition) for point in points for condition in first])
         leads = [point for point in points if self.evaluation(point, first).feasible]
         if leads:
-            leader = max(leads, key=lambda point: self._known[point, first[0]].value * self._signs[0])
+            leader = max(leads, key=lambda point: self._outcomes[point, first[0]].value * self._signs[0])
             self._complete([(leader, condition) for condition in self._conditions])
             self._remember(self.evaluation(leader))
 
@@ -138,7 +138,7 @@ class Evaluator:
         """Return the conditions, the worst ones of the best point first: they tell points apart best."""
         if self.best is None:
             return list(self._conditions)
-        h = [self._known[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
+        h = [self._outcomes[self.best.point, condition].value * self._signs[0] for condition in self._conditions]
         return sorted(self._conditions, key=lambda condition: h[condition])
 
     def _lost(self, evaluation: Evaluation) -> bool:
@@ -158,11 +158,11 @@ class Evaluator:
                 not run, the best possible outcome is assumed.
         """
         counted = self._conditions if conditions is None else conditions
-        outcomes = [self._known.get((point, c)) if c in counted else None for c in self._conditions]
-        seen = [outcome for outcome in outcomes if outcome is not None]
-        exact = len(seen) == len(outcomes) and all(outcome.end != PRUNED for outcome in seen)
+        outcomes = [self._outcomes.get((point, c)) if c in counted else None for c in self._conditions]
+        finished = [outcome for outcome in outcomes if outcome is not None]
+        exact = len(finished) == len(outcomes) and all(outcome.end != PRUNED for outcome in finished)
         constraints = len(self._problem.constraints)
-        if any(outcome.end == FAILED for outcome in seen):
+        if any(outcome.end == FAILED for outcome in finished):
             # After one failed simulation the other conditions change nothing.
             return Evaluation(point, (nan,) * self._signs.size, (nan,) * constraints, exact=exact)
         values, violations = aggregate(

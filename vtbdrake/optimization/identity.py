@@ -63,23 +63,23 @@ def describe(problem: Problem) -> dict[str, Any]:
     return plain
 
 
-def plain(values: Mapping[str, Any], what: str) -> dict[str, Any]:
+def plain(values: Mapping[str, Any], noun: str) -> dict[str, Any]:
     """Return values as JSON gives them back.
 
     Args:
         values: What is to be stored, by name.
-        what: A word for the values in the error.
+        noun: A word for the values in the error.
 
     Raises:
         ValueError: One is neither a number, nor a word, nor made of these.
     """
     try:
-        found: dict[str, Any] = json.loads(json.dumps(dict(values), default=lambda value: value.tolist()))
+        restored: dict[str, Any] = json.loads(json.dumps(dict(values), default=lambda value: value.tolist()))
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
-            f"a study keeps {what}, which are numbers, words, lists and dicts, not {dict(values)}"
+            f"a study keeps {noun}, which are numbers, words, lists and dicts, not {dict(values)}"
         ) from error
-    return found
+    return restored
 
 
 def _measure(measure: Quality | Constraint, unreadable: dict[str, list[str]]) -> dict[str, Any]:
@@ -97,10 +97,10 @@ def _object_text(value: Any) -> str:
 
 
 def _digest(name: str, value: Any, unreadable: dict[str, list[str]]) -> str:
-    found, types = digest(value)
+    text, types = digest(value)
     if types:
         unreadable.setdefault(name, []).extend(types)
-    return found
+    return text
 
 
 def _testbed_code(problem: Problem, unreadable: dict[str, list[str]]) -> dict[str, str]:
@@ -163,17 +163,17 @@ def dimensions(described: Mapping[str, Any]) -> tuple[Dimension, ...]:
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
     """Return the differences of two described problems except for their code, each as a phrase."""
-    found = []
+    phrases = []
     for key in sorted({*theirs, *ours} - _CODE):
         a, b = theirs.get(key), ours.get(key)
         if a == b or (key in _MEASURES and _without_code(a) == _without_code(b)):
             continue
         if isinstance(a, dict) and isinstance(b, dict):
             inner = [k for k in sorted({*a, *b}) if a.get(k) != b.get(k)]
-            found += [f"{key} {k}: {a.get(k)!r} there, {b.get(k)!r} here" for k in inner]
+            phrases += [f"{key} {k}: {a.get(k)!r} there, {b.get(k)!r} here" for k in inner]
         else:
-            found.append(f"{key}: {a!r} there, {b!r} here")
-    return found
+            phrases.append(f"{key}: {a!r} there, {b!r} here")
+    return phrases
 
 
 def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
@@ -181,7 +181,7 @@ def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str
     if theirs.get("python") != ours["python"]:
         return [f"Python {theirs.get('python', '')}, whose code cannot be compared with that of {ours['python']}"]
     pairs = ((a, b) for key in _MEASURES for a, b in zip(theirs[key], ours[key], strict=True))
-    found = [f"the function {a['name']} {_CHANGED}" for a, b in pairs if a["code"] != b["code"]]
+    phrases = [f"the function {a['name']} {_CHANGED}" for a, b in pairs if a["code"] != b["code"]]
     there, here = theirs["code"], ours["code"]
     for name in sorted({*there, *here}):
         if there.get(name) != here.get(name):
@@ -191,8 +191,8 @@ def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str
                 if name == _S0
                 else f"{name}, a part of the testbed, {how}"
             )
-            found.append(part)
-    return found
+            phrases.append(part)
+    return phrases
 
 
 def _without_code(measures: Any) -> list[dict[str, Any]]:
@@ -201,13 +201,13 @@ def _without_code(measures: Any) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages on which the numbers depend."""
-    found = {"python": platform.python_version()}
+    by_package = {"python": platform.python_version()}
     for package in ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "optuna", "casadi"):
         try:
-            found[package] = version(package)
+            by_package[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return by_package
 
 
 def revision(scenario: Scenario) -> str:

@@ -79,16 +79,16 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
     with quiet():
         opened = _open(optuna, storage, but=study.path)
         try:
-            found = optuna.load_study(study_name=name, storage=opened)
+            source = optuna.load_study(study_name=name, storage=opened)
         except KeyError as error:
             names = ", ".join(optuna.get_all_study_names(opened)) or "none"
             raise StudyError(f"Optuna's storage has no study {name!r}; it has {names}") from error
-        trials = found.get_trials(deepcopy=False)
+        trials = source.get_trials(deepcopy=False)
     # By their text: 1 and True are equal as numbers.
-    known = {encode(trial.point) for trial in study.trials}
-    known |= {encode(tuple(parameters.values())) for parameters in study.queue.values()}
+    present = {encode(trial.point) for trial in study.trials}
+    present |= {encode(tuple(parameters.values())) for parameters in study.queue.values()}
     points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
-    return [point for text, point in {encode(point): point for point in points}.items() if text not in known]
+    return [point for text, point in {encode(point): point for point in points}.items() if text not in present]
 
 
 def importances(study: Study) -> tuple[dict[str, float], ...]:
@@ -106,7 +106,7 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
     values = [trial.values for trial in study.trials if trial.exact and not trial.failed]
     if len(values) < _FEWEST:
         raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
-    found = []
+    shares = []
     with quiet(), warnings.catch_warnings():
         # Optuna warns about every target, also if its sign is right.
         warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes the importances")
@@ -117,12 +117,12 @@ def importances(study: Study) -> tuple[dict[str, float], ...]:
                 raise ValueError(f"{name} is {values[0][k]:g} at all points, so no parameter is important")
             # The evaluator takes small values of the target for good ones.
             sign = 1.0 if direction == "minimize" else -1.0
-            found.append(
+            shares.append(
                 optuna.importance.get_param_importances(
                     exported, evaluator=evaluator, target=lambda trial, k=k, sign=sign: sign * trial.values[k]
                 )
             )
-    return tuple(found)
+    return tuple(shares)
 
 
 def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseStorage:
@@ -150,8 +150,8 @@ def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> opt
     """Return the study in the storage; create it if it is missing."""
     record = json.loads(json.dumps(study.record))
     if name in optuna.get_all_study_names(storage):
-        found = optuna.load_study(study_name=name, storage=storage)
-        there = found.user_attrs
+        exported = optuna.load_study(study_name=name, storage=storage)
+        there = exported.user_attrs
         same = all(there.get(key) == record.get(key) for key in _IDENTITY)
         # Its code may have changed since, see `Problem.study`.
         if not same or "problem" not in there or differences(there["problem"], record["problem"]):
@@ -160,12 +160,12 @@ def _exported(optuna: Any, storage: BaseStorage, study: Study, name: str) -> opt
                 "the other"
             )
     else:
-        found = optuna.create_study(storage=storage, study_name=name, directions=study.directions)
-        found.set_metric_names(list(study.names))
+        exported = optuna.create_study(storage=storage, study_name=name, directions=study.directions)
+        exported.set_metric_names(list(study.names))
     for key, value in record.items():
-        if found.user_attrs.get(key) != value:
-            found.set_user_attr(key, value)
-    return found
+        if exported.user_attrs.get(key) != value:
+            exported.set_user_attr(key, value)
+    return exported
 
 
 def _key(batch: int, params: Mapping[str, Any]) -> tuple[int, str]:
@@ -230,8 +230,8 @@ def _plain(numbers: Iterable[float]) -> list[float | None]:
 def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
     if not isinstance(parameter, Choice):
         return distribution(parameter, optuna)
-    found: BaseDistribution = optuna.distributions.CategoricalDistribution(parameter.options)
-    return found
+    categorical: BaseDistribution = optuna.distributions.CategoricalDistribution(parameter.options)
+    return categorical
 
 
 def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
@@ -247,4 +247,4 @@ def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
         )
     if missing:
         return None
-    return tuple(p.check(params[p.address]) for p in study.parameters)
+    return tuple(p.as_value(params[p.address]) for p in study.parameters)

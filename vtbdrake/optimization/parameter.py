@@ -94,8 +94,8 @@ class Parameter(_Addressed):
         """Return the range as text."""
         return f"[{self.lower:g}, {self.upper:g}]"
 
-    def check(self, value: Any) -> float | int:
-        """Check a value, and return it as a number of the range.
+    def as_value(self, value: Any) -> float | int:
+        """Return a value as a number of the range.
 
         Raises:
             ValueError: The value is no number, lies outside the range, or is not whole for an integer.
@@ -164,9 +164,11 @@ class Choice(_Addressed):
 
     def __init__(self, address: str, options: Sequence[Any]) -> None:
         _check_address(address)
-        given: tuple[Any, ...] = all_of(object, options, name=f"the options of {address}", form="[option, option, ...]")
+        values: tuple[Any, ...] = all_of(
+            object, options, name=f"the options of {address}", form="[option, option, ...]"
+        )
         object.__setattr__(self, "address", address)
-        object.__setattr__(self, "options", tuple(o.item() if isinstance(o, np.generic) else o for o in given))
+        object.__setattr__(self, "options", tuple(o.item() if isinstance(o, np.generic) else o for o in values))
         for option in self.options:
             if not isinstance(option, bool | int | float | str):
                 raise ValueError(f"the options of {address} are numbers, words or booleans, unlike {option!r}")
@@ -189,7 +191,7 @@ class Choice(_Addressed):
         """Return the options as text."""
         return "{" + ", ".join(repr(option) for option in self.options) + "}"
 
-    def check(self, value: Any) -> Any:
+    def as_value(self, value: Any) -> Any:
         """Return the option that equals a value.
 
         Raises:
@@ -207,7 +209,7 @@ class Choice(_Addressed):
 
     def to_unit(self, value: Any) -> float:
         """Return the place of a value in [0, 1], the middle of its share."""
-        return (self.options.index(self.check(value)) + 0.5) / len(self.options)
+        return (self.options.index(self.as_value(value)) + 0.5) / len(self.options)
 
     def find(self, variables: Variables) -> Variable:
         """Return the variable that is varied.
@@ -236,8 +238,8 @@ def point_text(parameters: Sequence[Dimension], point: Sequence[Any], units: Seq
             continue
         near = _AT_END * (parameter.upper - parameter.lower)
         end = "lower" if value - parameter.lower <= near else "upper" if parameter.upper - value <= near else ""
-        told = f" (the {end} end of its range)" if end else ""
-        texts.append(f"{parameter.address} = {with_unit(f'{value:.6g}', unit)}{told}")
+        end_text = f" (the {end} end of its range)" if end else ""
+        texts.append(f"{parameter.address} = {with_unit(f'{value:.6g}', unit)}{end_text}")
     return ", ".join(texts)
 
 
@@ -257,7 +259,7 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
     if shape != (len(addresses),):
         raise ValueError(f"a point has {len(addresses)} entries, but the one given has shape {shape}")
     entries = list(point) if isinstance(point, list | tuple) else np.atleast_1d(np.asarray(point)).tolist()
-    return tuple(parameter.check(value) for parameter, value in zip(parameters, entries, strict=True))
+    return tuple(parameter.as_value(value) for parameter, value in zip(parameters, entries, strict=True))
 
 
 def _check_address(address: Any) -> None:

@@ -149,8 +149,8 @@ class Problem:
         self.parameters: tuple[Dimension, ...] = all_of(
             Dimension, parameters, name="parameters", form="[Parameter(address, lower, upper), ...]"
         )
-        given = all_of(Mapping, conditions, name="conditions", form="[{address: value, ...}, ...]")
-        self.conditions = tuple({**condition} for condition in given)
+        mappings = all_of(Mapping, conditions, name="conditions", form="[{address: value, ...}, ...]")
+        self.conditions = tuple({**condition} for condition in mappings)
         qualities = (quality,) if isinstance(quality, Quality) else quality
         self.objectives = all_of(Quality, qualities, name="quality", form="Quality(f, of=[address, ...]) or several")
         self.constraints = all_of(
@@ -176,7 +176,7 @@ class Problem:
         if start is not None:
             self.testbed.restore(self.testbed.default_context(), start)
         self._testbeds = Testbeds(self.testbed)
-        self._check()
+        self._check_addresses()
 
     def __repr__(self) -> str:
         varied = ", ".join(f"{p.address} in {p.range_text}" for p in self.parameters)
@@ -207,7 +207,7 @@ class Problem:
                 )
         return replace(motion, varied=[parameter.address for parameter in self.parameters])
 
-    def _check(self) -> None:
+    def _check_addresses(self) -> None:
         if not self.conditions:
             raise ValueError("a problem has at least one condition; {} is the scenario as it is")
         variables = self.testbed.variables()
@@ -263,8 +263,8 @@ class Problem:
         Raises:
             ValueError: As in `point`, or there is no such condition.
         """
-        chosen = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
-        return chosen if condition is None else {**self._condition(condition), **chosen}
+        values = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
+        return values if condition is None else {**self._condition(condition), **values}
 
     def _condition(self, number: int) -> Condition:
         count, index = len(self.conditions), as_whole("the number of a condition", number)
@@ -289,10 +289,10 @@ class Problem:
             run_on: Whether to simulate to t_m although the threshold was exceeded.
         """
         task = replace(self.task, record=record, run_on=run_on, keep_state=True)
-        chosen = self._condition(condition)
-        parameters = {**chosen, **self.values(point)}
+        condition_values = self._condition(condition)
+        parameters = {**condition_values, **self.values(point)}
         result = replace(self._runner(task, parameters).run(split(parameters)[1]), parameters=parameters)
-        return ProblemRollout(**vars(result), problem=self, condition=chosen)
+        return ProblemRollout(**vars(result), problem=self, condition=condition_values)
 
     def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
         """Return s(t) = Gamma'(s^0, t), equation (10), at a sample time t in seconds."""
@@ -317,7 +317,7 @@ class Problem:
         scenario = self._scenario(values)
         return replace(task, scenario=scenario), self._testbeds.get(scenario)
 
-    def check(self) -> Check:
+    def check_repeatability(self) -> Check:
         """Find obstacles to parallel rollouts: memory outside the Context, values that cannot be sent to workers.
 
         The first part of a rollout is simulated four times, which takes about a second: twice in a row, beside another
@@ -332,8 +332,8 @@ class Problem:
         ends = [{p.address: p.ends[k] for p in self.parameters if not p.is_field} for k in (0, -1)]
         points = [{**split(self.conditions[k])[1], **ends[k]} for k in (0, -1)]
         with Interruptible():
-            found = check_rollouts(self.task, self.testbed, points)
-        findings = list(found.findings)
+            result = check_rollouts(self.task, self.testbed, points)
+        findings = list(result.findings)
         for values in (*self.conditions, *({p.address: end} for p in self.parameters for end in p.ends)):
             try:
                 pack(values)
@@ -341,7 +341,7 @@ class Problem:
                 findings.append(str(error))
         if self.task.motion is not None:
             findings += self._check_memory()
-        return replace(found, findings=tuple(findings))
+        return replace(result, findings=tuple(findings))
 
     def _check_memory(self) -> list[str]:
         """Return a sentence if rollouts along the motion differ from whole ones at the ends of the ranges."""

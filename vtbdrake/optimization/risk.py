@@ -121,10 +121,10 @@ def aggregate(
     """
     values = []
     for k, (cost, bound) in enumerate(zip(minimize, bounds, strict=True)):
-        own = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]
+        qualities = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]
         # A user's risk may make NaN of infinities if nothing bounds the conditions that have not run.
         with np.errstate(invalid="ignore"):
-            value = float(risk(np.array([-number if cost else number for number in own])))
+            value = float(risk(np.array([-number if cost else number for number in qualities])))
         values.append(inf if isnan(value) and None in outcomes else value)
     tried = [outcome for outcome in outcomes if outcome is not None]
     first = len(values) - 1

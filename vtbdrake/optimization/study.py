@@ -104,7 +104,7 @@ class Study:
         made = _solver(problem, meta, rollouts=None)
         made.close()
         meta["solver"] = made.name
-        given = {"solver": solver, "seed": seed, "options": options, "parallel": parallel}
+        requested = {"solver": solver, "seed": seed, "options": options, "parallel": parallel}
         study = cls(StudyFile(path, meta=meta), problem)
         try:
             changed = differences(study._meta["problem"], meta["problem"])
@@ -119,7 +119,7 @@ class Study:
                     f"{path} was made with other code ({'; '.join(code)}): give another file, restore the code, or, if "
                     "its rollouts would come out the same, go on with allow_changed_code=True"
                 )
-            for key, value in given.items():
+            for key, value in requested.items():
                 if value is not None and study._meta.get(key) != meta[key]:
                     raise StudyError(
                         f"{path} was begun with {key} {study._meta.get(key)!r}, not {meta[key]!r}: leave {key} out to "
@@ -265,7 +265,7 @@ class Study:
         Raises:
             ValueError: A point has other entries than the study, or one lies outside its range.
         """
-        self._file.give([checked_point(self.parameters, point) for point in points])
+        self._file.enqueue([checked_point(self.parameters, point) for point in points])
 
     def edit(self, number: int, point: Any) -> None:
         """Replace a point of the `queue`.
@@ -299,8 +299,8 @@ class Study:
         """
         if not isinstance(key, str) or not key or key != safe_text(key):
             raise ValueError(f"an attribute has a name, such as 'operator', not {key!r}")
-        (kept,) = plain({key: value}, "attributes").values()
-        self._file.set_attribute(None if point is None else checked_point(self.parameters, point), key, kept)
+        (stored,) = plain({key: value}, "attributes").values()
+        self._file.set_attribute(None if point is None else checked_point(self.parameters, point), key, stored)
 
     @property
     def queue(self) -> dict[int, dict[str, Any]]:
@@ -381,20 +381,22 @@ class Study:
         """
         if len(self.directions) > 1:
             raise ValueError("several qualities have no single best point: use pareto()")
-        found = [trial for trial in self.trials if trial.counts]
-        if not found:
+        candidates = [trial for trial in self.trials if trial.counts]
+        if not candidates:
             if not len(self):
                 raise ValueError("no rollout is finished yet: call run()")
-            kept = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
-            raise ValueError(f"no point has a quality{kept}{self._failures()}")
+            feasible = " and keeps the constraints" if self._meta["problem"]["constraints"] else ""
+            raise ValueError(f"no point has a quality{feasible}{self._failures()}")
         (sign,) = self.signs
-        return max(found, key=lambda trial: sign * trial.value)
+        return max(candidates, key=lambda trial: sign * trial.value)
 
     def pareto(self) -> tuple[Trial, ...]:
         """Return the points that no other point beats in one quality without losing in another."""
-        found = [trial for trial in self.trials if trial.counts]
-        signed = [[s * v for s, v in zip(self.signs, trial.values, strict=True)] for trial in found]
-        return tuple(t for t, own in zip(found, signed, strict=True) if not any(_dominates(o, own) for o in signed))
+        candidates = [trial for trial in self.trials if trial.counts]
+        signed = [[s * v for s, v in zip(self.signs, trial.values, strict=True)] for trial in candidates]
+        return tuple(
+            t for t, values in zip(candidates, signed, strict=True) if not any(_dominates(o, values) for o in signed)
+        )
 
     def _failures(self) -> str:
         messages = [outcome.message for outcome in self.rollouts.values() if outcome.failed]
@@ -550,7 +552,7 @@ class Study:
         from vtbdrake.optimization.optuna_bridge import points_from_optuna
 
         points = points_from_optuna(self, storage, name=name)
-        self._file.give(points)
+        self._file.enqueue(points)
         return len(points)
 
 

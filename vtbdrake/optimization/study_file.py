@@ -168,11 +168,11 @@ class StudyFile:
     def _rows(self, table: str, more: str = "", values: Sequence[Any] = ()) -> list[sqlite3.Row]:
         """Return checked rows of a table; ``more`` says which, and in which order."""
         with self._lock, _explained(self.path):
-            found = self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall()
-        for *row, checksum in found:
+            rows = self._db.execute(f"SELECT * FROM {table} {more}", values).fetchall()
+        for *row, checksum in rows:
             if checksum != _checksum(table, row):
                 raise _damaged(self.path, f"a row of {table} has changed")
-        return found
+        return rows
 
     def _number(self, query: str, values: Sequence[Any] = ()) -> int:
         """Return the single number that a query finds."""
@@ -268,7 +268,7 @@ class StudyFile:
         """Return the number of finished rollouts."""
         return self._number("SELECT count(*) FROM rollouts")
 
-    def told(self) -> int:
+    def completed_batches(self) -> int:
         """Return the number of batches whose evaluations the solver was told."""
         return self._get("told", 0)
 
@@ -313,7 +313,7 @@ class StudyFile:
         self._set({"told": 0, "first_position": max(after, self._get("first_position", 0))})
 
     def change_code(
-        self, problem: Mapping[str, Any], what: Sequence[str], *, versions: Mapping[str, str], revision: str
+        self, problem: Mapping[str, Any], parts: Sequence[str], *, versions: Mapping[str, str], revision: str
     ) -> None:
         """Note that the code of the problem has changed, and forget the rollouts in which a quality function failed.
 
@@ -328,7 +328,7 @@ class StudyFile:
                 "DELETE FROM rollouts WHERE substr(message, 1, ?) = ?", (len(QUALITY_FAILED), QUALITY_FAILED)
             )
             self._withdraw()
-            change = {"at": _now(), "what": list(what), "versions": dict(versions), "revision": revision}
+            change = {"at": _now(), "what": list(parts), "versions": dict(versions), "revision": revision}
             self._set({"problem": problem, "changes": [*self.meta.get("changes", []), change]})
 
     def trials(self) -> list[Trial]:
@@ -380,13 +380,13 @@ class StudyFile:
 
     # -- points given by hand
 
-    def give(self, points: Sequence[Point]) -> None:
+    def enqueue(self, points: Sequence[Point]) -> None:
         """Put points into the queue, to be evaluated with the next batch."""
         with self._transaction():
             first = self._number("SELECT coalesce(max(number), 0) + 1 FROM given")
             self._insert("given", [(first + k, encode(point), None) for k, point in enumerate(points)])
 
-    def take(self, batch: int, *, new: bool) -> list[Point]:
+    def points_by_hand(self, batch: int, *, new: bool) -> list[Point]:
         """Return the points given by hand that belong to a batch; with ``new``, the queue joins the batch first."""
         if new and self._rows("given", "WHERE batch IS NULL"):
             with self._transaction():
@@ -426,10 +426,10 @@ class StudyFile:
 
     def attributes(self) -> dict[Point | None, dict[str, Any]]:
         """Return all attributes by point; those of the study under None."""
-        found: dict[Point | None, dict[str, Any]] = {}
+        by_point: dict[Point | None, dict[str, Any]] = {}
         for point, key, value, _ in self._rows("attributes", "ORDER BY rowid"):
-            found.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
-        return found
+            by_point.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
+        return by_point
 
 
 def _checksum(table: str, row: Sequence[Any]) -> int:

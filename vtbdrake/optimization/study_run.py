@@ -73,12 +73,12 @@ class StudyRun:
         self._warned = False
         self._solver = solver
         self._executor = executor
-        self._known: dict[RolloutKey, Outcome] = file.outcomes()
+        self._outcomes: dict[RolloutKey, Outcome] = file.outcomes()
         # Not the budget of this run: how points are evaluated must not depend on where a study is interrupted.
         budget, parallel = file.meta["budget"], file.meta.get("parallel")
         self._evaluator = Evaluator(
             problem,
-            self._known,
+            self._outcomes,
             self._roll_out,
             racing=racing,
             budget=inf if budget is None else budget,
@@ -86,10 +86,10 @@ class StudyRun:
         )
         self._gradients = Gradients(problem) if solver.wants_gradient else None
         self._slopes = file.gradients()
-        self._told = file.told()
+        self._completed = file.completed_batches()
         # The trials of earlier solvers, made for other budgets: point -> whether one of them is exact.
         self._earlier: dict[Point, bool] = {}
-        self._new_from = self._told
+        self._new_from = self._completed
         for trial in file.earlier_trials():
             self._earlier[trial.point] = trial.exact or self._earlier.get(trial.point, False)
             self._new_from = max(self._new_from, trial.batch + 1)
@@ -111,29 +111,31 @@ class StudyRun:
         name = f"study ({self._solver.name})"
         if self._progress and not shown:
             self._next_log = time.monotonic() + LOG_PERIOD
-        with tqdm(total=rollouts, initial=len(self._known), desc=name, unit="rollout", disable=not shown) as self._bar:
+        with tqdm(
+            total=rollouts, initial=len(self._outcomes), desc=name, unit="rollout", disable=not shown
+        ) as self._bar:
             try:
                 return self._batches()
             except _RunEnd as end:
                 return end.reason, end.message
             except KeyboardInterrupt:
-                _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._known))
+                _log.warning("interrupted: the %d rollouts that are finished are kept", len(self._outcomes))
                 return INTERRUPTED, "it was interrupted"
             finally:
                 self._solver.close()
 
     def _batches(self) -> tuple[str, str]:
-        if self._told < self._new_from:
+        if self._completed < self._new_from:
             self._roll_out_queue()
         batch, silent = 0, 0
         while silent < _KNOWN_BATCHES:
-            before = len(self._known)
+            before = len(self._outcomes)
             if not self._one_batch(batch):
                 return self._end_of_solver()
-            if batch >= self._told and self._after_batch(batch):
+            if batch >= self._completed and self._after_batch(batch):
                 return STOPPED, "stop() was called"
             if batch >= self._new_from:
-                silent = 0 if len(self._known) > before else silent + 1
+                silent = 0 if len(self._outcomes) > before else silent + 1
             self._show_best()
             batch += 1
         return SOLVER, f"{self._solver.name} asks only for points that are known"
@@ -141,21 +143,21 @@ class StudyRun:
     def _one_batch(self, batch: int) -> bool:
         """Evaluate the points given by hand, then those of the solver; return whether there were any."""
         # A batch that was told before gets no new points by hand: it is repeated as it was.
-        given = self._file.take(batch, new=batch >= self._new_from)
-        asked: list[Point] = []
+        points_by_hand = self._file.points_by_hand(batch, new=batch >= self._new_from)
+        proposed: list[Point] = []
         try:
             # By hand first: a solver may ask for all that the budget allows.
-            by_hand = self._evaluate(given)
-            asked = [self._problem.point(point) for point in self._ask()]
-            evaluations = self._evaluate(asked)
+            by_hand = self._evaluate(points_by_hand)
+            proposed = [self._problem.point(point) for point in self._ask()]
+            evaluations = self._evaluate(proposed)
         except BaseException:
             # It is evaluated again in the next run. Until then, the complete points can be seen.
-            known = ([self._evaluator.evaluation(point) for point in points] for points in (given, asked))
-            self._record(batch, *known, complete=False)
+            so_far = ([self._evaluator.evaluation(point) for point in points] for points in (points_by_hand, proposed))
+            self._record(batch, *so_far, complete=False)
             raise
-        if batch >= self._told and (given or asked):
+        if batch >= self._completed and (points_by_hand or proposed):
             self._record(batch, by_hand, evaluations, complete=True)
-        return bool(given or asked)
+        return bool(points_by_hand or proposed)
 
     def _roll_out_queue(self) -> None:
         """Run the points given by hand before a new solver, which repeats known points, reaches new ones.
@@ -166,10 +168,10 @@ class StudyRun:
         points = [tuple(point.values()) for point in self._file.queue().values()]
         keys = [(point, condition) for point in points for condition in range(len(self._problem.conditions))]
         try:
-            self._roll_out([key for key in dict.fromkeys(keys) if key not in self._known])
+            self._roll_out([key for key in dict.fromkeys(keys) if key not in self._outcomes])
         finally:
-            known = [self._evaluator.evaluation(point) for point in points]
-            self._record(self._new_from, known, [], complete=False)
+            evaluations = [self._evaluator.evaluation(point) for point in points]
+            self._record(self._new_from, evaluations, [], complete=False)
 
     def _evaluate(self, points: Sequence[Point]) -> list[Evaluation]:
         """Evaluate points and tell the solver."""
@@ -188,7 +190,7 @@ class StudyRun:
         return points
 
     def _end_of_solver(self) -> tuple[str, str]:
-        left, point = self._limit - len(self._known), len(self._problem.conditions)
+        left, point = self._limit - len(self._outcomes), len(self._problem.conditions)
         rest = f" but for {left:g}, fewer than the {point} that a point takes" if 0 < left < point else ""
         spent = f"the budget of {self._limit:g} rollouts is spent{rest}"
         if self._solver.success is False and left < point:
@@ -198,7 +200,7 @@ class StudyRun:
         return SOLVER, ": ".join(part for part in parts if part)
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
-        now = keys[: max(0, int(min(self._limit - len(self._known), len(keys))))]
+        now = keys[: max(0, int(min(self._limit - len(self._outcomes), len(keys))))]
         points = [self._problem.values(point, condition=condition) for point, condition in now]
         self._end_at_deadline()
         results = self._executor.run(self._task, points) if points else iter(())
@@ -207,7 +209,7 @@ class StudyRun:
                 for index, result in results:
                     point, condition = now[index]
                     outcome = Outcome.of(result)
-                    self._known[point, condition] = outcome
+                    self._outcomes[point, condition] = outcome
                     self._file.add(point, condition, outcome)
                     self._warn(outcome)
                     if time.monotonic() >= self._next_log:
@@ -233,8 +235,8 @@ class StudyRun:
     def _log_progress(self) -> None:
         of = "" if self._limit == inf else f" of {self._limit:g}"
         best = self._evaluator.best
-        found = "" if best is None else f", best {self._evaluator.in_user_terms(best)[0]:.6g}"
-        _log.info("study (%s): %d%s rollouts%s", self._solver.method, len(self._known), of, found)
+        best_text = "" if best is None else f", best {self._evaluator.in_user_terms(best)[0]:.6g}"
+        _log.info("study (%s): %d%s rollouts%s", self._solver.method, len(self._outcomes), of, best_text)
 
     def _with_gradient(self, evaluation: Evaluation) -> Evaluation:
         if self._gradients is None or evaluation.failed:
@@ -258,9 +260,11 @@ class StudyRun:
         if time.monotonic() >= self._deadline:
             raise _RunEnd(TIME, "the time is over")
 
-    def _record(self, batch: int, given: Sequence[Evaluation], asked: Sequence[Evaluation], *, complete: bool) -> None:
+    def _record(
+        self, batch: int, by_hand: Sequence[Evaluation], proposed: Sequence[Evaluation], *, complete: bool
+    ) -> None:
         """Record the evaluated points; an incomplete batch is evaluated again in the next run."""
-        origins = [*(("user", "by hand") for _ in given), *(("solver", self._solver.method) for _ in asked)]
+        origins = [*(("user", "by hand") for _ in by_hand), *(("solver", self._solver.method) for _ in proposed)]
         addresses = [parameter.address for parameter in self._problem.parameters]
         trials = {
             position: Trial(
@@ -272,7 +276,7 @@ class StudyRun:
                 method=method,
                 batch=batch,
             )
-            for position, (evaluation, (origin, method)) in enumerate(zip([*given, *asked], origins, strict=True))
+            for position, (evaluation, (origin, method)) in enumerate(zip([*by_hand, *proposed], origins, strict=True))
             if (complete or evaluation.exact) and not self._recorded(evaluation)
         }
         self._file.save_trials(batch, trials, complete=complete)

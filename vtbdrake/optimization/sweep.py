@@ -152,11 +152,13 @@ class Sweep:
         """
         if len(self.minimize) > 1:
             raise ValueError("several qualities have no single best point: use problem.study() and its pareto()")
-        found = [evaluation for evaluation in self.evaluations if evaluation.feasible]
-        if not found:
-            kept = " and keeps the constraints" if self.constraints else ""
-            raise ValueError(f"no point of the sweep has a quality under all conditions{kept}{self._first_failure()}")
-        best = max(found, key=lambda evaluation: evaluation.values[0])
+        candidates = [evaluation for evaluation in self.evaluations if evaluation.feasible]
+        if not candidates:
+            feasible = " and keeps the constraints" if self.constraints else ""
+            raise ValueError(
+                f"no point of the sweep has a quality under all conditions{feasible}{self._first_failure()}"
+            )
+        best = max(candidates, key=lambda evaluation: evaluation.values[0])
         value = -best.values[0] if self.minimize[0] else best.values[0]
         # Adding 0 makes 0 of -0.
         return {p.address: v for p, v in zip(self.parameters, best.point, strict=True)}, value + 0.0

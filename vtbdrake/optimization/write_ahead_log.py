@@ -57,8 +57,8 @@ def lost_writes(path: Path) -> LostWrites | None:
 
 
 def _is_new(log: bytes, start: int, salts: list[int], which: Callable[[Iterable[bool]], bool]) -> bool:
-    _, _, *own, _, _ = _FRAME.unpack_from(log, start)
-    return which(a == b for a, b in zip(own, salts, strict=True))
+    _, _, *frame_salts, _, _ = _FRAME.unpack_from(log, start)
+    return which(a == b for a, b in zip(frame_salts, salts, strict=True))
 
 
 def _add(sums: tuple[int, int], data: bytes, order: str) -> tuple[int, int]:

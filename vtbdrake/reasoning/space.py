@@ -81,10 +81,10 @@ class DecisionSpace:
             if isinstance(element, Trajectory):
                 begin, *knots = element.as_numbers(value)
                 for parameter, knot in zip(element.parameters, knots, strict=True):
-                    parameter.check(knot)
+                    parameter.as_value(knot)
                 point += element.shifted(knots, time - begin).tolist()
             else:
-                point.append(element.check(value))
+                point.append(element.as_value(value))
         return tuple(point)
 
     def values(self, point: Point, plan: Mapping[str, Any], time: float) -> dict[str, Any]:

@@ -40,10 +40,11 @@ class RecordedMotion:
     is not simulated. A candidate takes about memory / sample period of the time of a whole rollout.
 
     The followers are found from the connections of the Diagram. If the plant or an actuator is one, the motion is
-    refused. At each sample, the state of all other systems is compared with the recorded one. `Problem.check` compares
-    whole rollouts with those along the motion, and finds a memory that is too short. The testbed must have no
-    continuous state: a discrete plant continues exactly from a recorded state, an integrator with error control does
-    not. A failure between the windows (a camera that is inside a link for a moment) is not noticed.
+    refused. At each sample, the state of all other systems is compared with the recorded one.
+    `Problem.check_repeatability` compares whole rollouts with those along the motion, and finds a memory that is too
+    short. The testbed must have no continuous state: a discrete plant continues exactly from a recorded state, an
+    integrator with error control does not. A failure between the windows (a camera that is inside a link for a moment)
+    is not noticed.
 
     Attributes:
         memory: Memory of the followers in seconds. For a camera of period T and a detector of latency D that samples

@@ -131,7 +131,7 @@ class Scale:
         """Return the positions of points on the axis, shape (n,)."""
         positions = [trial.parameters[self.dimension.address] for trial in trials]
         if isinstance(self.dimension, Choice):
-            positions = [self.dimension.options.index(self.dimension.check(value)) for value in positions]
+            positions = [self.dimension.options.index(self.dimension.as_value(value)) for value in positions]
         return np.array(positions, dtype=float)
 
     def set_up(self, axes: Axes, which: str, *, width: int = 60) -> None:

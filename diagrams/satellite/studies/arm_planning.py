@@ -275,6 +275,6 @@ class MomentumDescent(Solver):
         ends = [parameter.ends for parameter in self.search.space]
         return [tuple(float(np.clip(value, *pair)) for value, pair in zip(z, ends, strict=True))]
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        if any(evaluation.feasible and -evaluation.values[0] <= self._good for evaluation in asked):
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        if any(evaluation.feasible and -evaluation.values[0] <= self._good for evaluation in evaluations):
             self._end(True, f"q is at most {self._good:.2g} rad")

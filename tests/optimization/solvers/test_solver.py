@@ -48,7 +48,7 @@ def test_it_asks_for_points_of_the_space_within_its_budget(name):
     log = drive(solver, ROSENBROCK.cost)
     assert 1 <= len(log) <= 90
     for told in log:
-        assert [parameter.check(value) for parameter, value in zip(ROSENBROCK.space, told.point, strict=True)] == [
+        assert [parameter.as_value(value) for parameter, value in zip(ROSENBROCK.space, told.point, strict=True)] == [
             *told.point
         ]
     assert solver.success is not None and solver.message
@@ -86,7 +86,7 @@ def test_edge_cases_work_or_are_refused(name, edge):
         )
         assert 1 <= len(log) <= budget
         for told in log:
-            assert tuple(parameter.check(value) for parameter, value in zip(space, told.point, strict=True)) == (
+            assert tuple(parameter.as_value(value) for parameter, value in zip(space, told.point, strict=True)) == (
                 told.point
             )
         assert solver.success is not None and solver.message

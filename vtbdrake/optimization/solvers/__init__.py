@@ -116,7 +116,7 @@ def _find(name: object) -> str:
         raise SolverError(f"a solver is given by its name, one of {', '.join(CATALOGUE)}, not by {name!r}")
     if name in CATALOGUE:
         return name
-    names = {_plain(known): known for known in CATALOGUE}
+    names = {_plain(solver): solver for solver in CATALOGUE}
     if _plain(name) in names:
         return names[_plain(name)]
     near = difflib.get_close_matches(_plain(name), names, n=1, cutoff=0.5)

@@ -60,7 +60,7 @@ class Auto(Solver):
     Bayesian optimization.
 
     The local searches (BOBYQA, or COBYQA with constraints or one continuous parameter) stay in a box around the point
-    from which they begin, and hold its integers. They need at most 20 parameters, of which at least one is continuous.
+    from which they begin, and keep its integers. They need at most 20 parameters, of which at least one is continuous.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
     """
@@ -75,8 +75,8 @@ class Auto(Solver):
         self._solver: Solver
         self._patience = math.inf
         self._limit = math.inf
-        # The start of a local search, whose integers are held.
-        self._held: Point | None = None
+        # The start of a local search, whose integers stay.
+        self._local_start: Point | None = None
         # The starts of all local searches.
         self._searched: list[Point] = []
         self._stage_best: Evaluation | None = None
@@ -124,9 +124,9 @@ class Auto(Solver):
             yield
         self._begin_model()
         yield
-        found = self._best
-        if found is not None and self._has_local:
-            yield from self._descent(found.point)
+        model_best = self._best
+        if model_best is not None and self._has_local:
+            yield from self._descent(model_best.point)
             yield from self._other_basins()
         fruitless, start = 0, 0
         while fruitless < PATIENCE and self._left_but_polish() > 0:
@@ -135,7 +135,7 @@ class Auto(Solver):
             yield
             start += 1
             fruitless = 0 if self._progress(before, self._best) else fruitless + 1
-        if self._has_local and self._progress(found, self._best):
+        if self._has_local and self._progress(model_best, self._best):
             assert self._best is not None
             self._begin_local(self._best.point, radius=POLISH_RADIUS, limit=math.inf)
             yield
@@ -194,8 +194,7 @@ class Auto(Solver):
             points = int(left)
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
         # These evaluations are charged already.
-        known = [*self._before, *([] if self._best is None else [self._best])]
-        model.tell([replace(evaluation, effort=0.0) for evaluation in known])
+        model.tell([replace(evaluation, effort=0.0) for evaluation in (*self._before, self._best) if evaluation])
         # With racing, the budget may allow many more points: the number of points is limited, too.
         self._begin(MODEL, model, limit=points)
 
@@ -249,7 +248,7 @@ class Auto(Solver):
         return self._left - reserve
 
     def _begin_local(self, start: Point, *, radius: float, limit: float, tolerance: float | None = None) -> None:
-        """Begin a local search at a point, whose integers are held."""
+        """Begin a local search at a point, whose integers stay."""
         varied = self._continuous
         u = self.search.unit(start)
         self._searched.append(start)
@@ -264,7 +263,7 @@ class Auto(Solver):
         options: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
         make = Cobyqa if name == "COBYQA" else Nlopt
         self._begin(f"{name} {place}", make(search, name=name, **options))
-        self._held = start
+        self._local_start = start
 
     # -- its steps
 
@@ -278,7 +277,7 @@ class Auto(Solver):
             limit: The number of points after which the method ends.
         """
         self._method = method
-        self._held = None
+        self._local_start = None
         self._changes.append((self._count, method))
         self._solver = solver
         self._stage_best = None
@@ -289,7 +288,7 @@ class Auto(Solver):
     def _next(self) -> list[Point]:
         while self.success is None:
             ended = self._without_progress > self._patience or self._count >= self._limit
-            points = [] if ended else [self._with_held(point) for point in self._solver.ask()]
+            points = [] if ended else [self._with_integers(point) for point in self._solver.ask()]
             if points:
                 self._count += len(points)
                 return points
@@ -297,30 +296,30 @@ class Auto(Solver):
             next(self._plan, None)
         return []
 
-    def _with_held(self, point: Point) -> Point:
-        """Return a point of the method, completed by the integers that are held."""
-        if self._held is None:
+    def _with_integers(self, point: Point) -> Point:
+        """Return a point of the method, completed by the integers of the start."""
+        if self._local_start is None:
             return point
         varied = dict(zip(self._continuous, point, strict=True))
-        return tuple(varied.get(i, held) for i, held in enumerate(self._held))
+        return tuple(varied.get(i, value) for i, value in enumerate(self._local_start))
 
-    def _without_held(self, point: Point) -> Point:
-        return point if self._held is None else tuple(point[i] for i in self._continuous)
+    def _without_integers(self, point: Point) -> Point:
+        return point if self._local_start is None else tuple(point[i] for i in self._continuous)
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        self._solver.tell([replace(e, point=self._without_held(e.point)) for e in (*asked, *given)])
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        self._solver.tell([replace(e, point=self._without_integers(e.point)) for e in (*evaluations, *by_hand)])
         if self.search.objectives > 1:
             return
         if not self._changes or self._solver.name in ("start", MODEL, "sobol"):
-            self._before += [*asked, *given]
-            values = [evaluation.values[0] for evaluation in asked if evaluation.counts]
+            self._before += [*evaluations, *by_hand]
+            values = [evaluation.values[0] for evaluation in evaluations if evaluation.counts]
             self._spread = max(self._spread, max(values, default=0.0) - min(values, default=0.0))
-        best = best_of([*asked, *([self._stage_best] if self._stage_best else [])])
+        best = best_of([*evaluations, self._stage_best])
         progress = self._progress(self._stage_best, best)
-        self._without_progress = 0 if progress else self._without_progress + len(asked)
+        self._without_progress = 0 if progress else self._without_progress + len(evaluations)
         if progress:
             self._stage_best = best
-        self._best = best_of([*([self._best] if self._best else []), *asked, *given])
+        self._best = best_of([self._best, *evaluations, *by_hand])
 
     def _progress(self, before: Evaluation | None, after: Evaluation | None) -> bool:
         """Return whether the best has improved by more than `PROGRESS`."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence, Set
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import log_ndtr, ndtri
 
 from vtbdrake.optimization.parameter import Choice
+from vtbdrake.optimization.solvers.designs import sobol_units
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError, rank_key
 
 if TYPE_CHECKING:
@@ -56,9 +58,9 @@ class Bayesian(Solver):
         self, search: Search, *, name: str, initial: int | None = None, batch: int | None = None, memory: int = 100
     ) -> None:
         super().__init__(search, name=name)
-        for option, given in (("initial", initial), ("batch", batch), ("memory", memory)):
-            if given is not None and given < 1:
-                raise SolverError(f"{option} is a number of points, at least one, not {given}")
+        for option, number in (("initial", initial), ("batch", batch), ("memory", memory)):
+            if number is not None and number < 1:
+                raise SolverError(f"{option} is a number of points, at least one, not {number}")
         most = search.budget if search.budget is None else max(1, search.budget // 2)
         self._initial = initial or min(search.batch(2 * (search.size + 1)), most or 1 << 16)
         self._batch = batch or search.batch(4)
@@ -68,8 +70,8 @@ class Bayesian(Solver):
         self._rng = np.random.default_rng(search.seed)
         self._models = [_Model() for _ in range(search.objectives + search.constraints)]
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        self._evaluations.update({evaluation.point: evaluation for evaluation in (*asked, *given)})
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        self._evaluations.update({evaluation.point: evaluation for evaluation in (*evaluations, *by_hand)})
 
     def _next(self) -> list[Point]:
         begun, self._begun = self._begun, True
@@ -85,10 +87,7 @@ class Bayesian(Solver):
         return points
 
     def _design(self) -> list[Point]:
-        # Imported here because it is slow.
-        from scipy.stats import qmc
-
-        units = qmc.Sobol(self.search.size, rng=self.search.seed).random(1 << (self._initial - 1).bit_length())
+        units = islice(sobol_units(self.search), 1 << (self._initial - 1).bit_length())
         start = [] if self.search.start is None else [self.search.start]
         return list(dict.fromkeys([*start, *(self.search.point(u) for u in units)]))[: self._initial]
 
@@ -109,7 +108,7 @@ class Bayesian(Solver):
         points: list[Point] = []
         while len(points) < self._batch:
             near = centres[: self._best_count(len(centres))]
-            u = self._maximize(self._acquisition(X, targets, counted), near, known={*self._evaluations, *points})
+            u = self._maximize(self._acquisition(X, targets, counted), near, exclude={*self._evaluations, *points})
             if u is None:
                 break
             points.append(self.search.point(u))
@@ -122,33 +121,36 @@ class Bayesian(Solver):
 
     def _remembered(self) -> list[Evaluation]:
         """Return the points that the model is fitted to: all, or the best and the latest, half each."""
-        told = list(self._evaluations.values())
-        if len(told) <= self._memory:
-            return told
-        costs = np.array([[-value for value in e.values] if e.usable else [np.inf] * len(e.values) for e in told])
-        ranks = self._best_first(told, costs)[: self._memory // 2].tolist()
-        latest = [i for i in range(len(told) - 1, -1, -1) if i not in set(ranks)][: self._memory - len(ranks)]
-        return [told[i] for i in sorted([*ranks, *latest])]
+        evaluations = list(self._evaluations.values())
+        if len(evaluations) <= self._memory:
+            return evaluations
+        costs = np.array(
+            [[-value for value in e.values] if e.usable else [np.inf] * len(e.values) for e in evaluations]
+        )
+        ranks = self._best_first(evaluations, costs)[: self._memory // 2].tolist()
+        latest = [i for i in range(len(evaluations) - 1, -1, -1) if i not in set(ranks)][: self._memory - len(ranks)]
+        return [evaluations[i] for i in sorted([*ranks, *latest])]
 
-    def _best_first(self, told: Sequence[Evaluation], costs: np.ndarray) -> np.ndarray:
-        """Return indices of ``told``, the best first; of several objectives, by the number of points that dominate."""
+    def _best_first(self, evaluations: Sequence[Evaluation], costs: np.ndarray) -> np.ndarray:
+        """Return the indices of evaluations, the best first; of several objectives, by how many points dominate."""
         if self.search.objectives == 1:
-            return np.array(sorted(range(len(told)), key=lambda i: rank_key(told[i])))
+            return np.array(sorted(range(len(evaluations)), key=lambda i: rank_key(evaluations[i])))
         costs = costs[:, : self.search.objectives]
-        feasible = np.array([evaluation.feasible for evaluation in told])
+        feasible = np.array([evaluation.feasible for evaluation in evaluations])
         return np.lexsort((_domination(costs)[feasible].sum(axis=0), ~feasible))
 
-    def _targets(self, told: Sequence[Evaluation]) -> np.ndarray:
+    def _targets(self, evaluations: Sequence[Evaluation]) -> np.ndarray:
         """Return the models' targets, shape (k, objectives + constraints): costs, and violations scaled around 0."""
         rows = [
-            [*(-value for value in e.values), *e.violations] if e.usable else [np.nan] * len(self._models) for e in told
+            [*(-value for value in e.values), *e.violations] if e.usable else [np.nan] * len(self._models)
+            for e in evaluations
         ]
         table = np.array(rows)
         table[~np.isfinite(table)] = np.nan
         columns = []
         for i, column in enumerate(table.T):
-            known = column[np.isfinite(column)]
-            filled = np.where(np.isfinite(column), column, known.max() if known.size else 0.0)
+            finite = column[np.isfinite(column)]
+            filled = np.where(np.isfinite(column), column, finite.max() if finite.size else 0.0)
             columns.append(_normal(filled) if i < self.search.objectives else _scaled(filled))
         return np.column_stack(columns)
 
@@ -207,9 +209,9 @@ class Bayesian(Solver):
     # -- candidates
 
     def _maximize(
-        self, acquisition: Callable[[np.ndarray], np.ndarray], centres: np.ndarray, *, known: Set[Point]
+        self, acquisition: Callable[[np.ndarray], np.ndarray], centres: np.ndarray, *, exclude: Set[Point]
     ) -> np.ndarray | None:
-        """Return the best place found that is not known, shape (n,); None if all are known."""
+        """Return the best place found, shape (n,), that is none of some points; None if all places are."""
         around = [self._moved(np.repeat(centres, AROUND // len(centres), axis=0), width) for width in (0.1, 0.01)]
         units = np.vstack([self._rng.random((SPREAD, self.search.size)), *around])
         units = self._snapped(units)
@@ -220,7 +222,7 @@ class Bayesian(Solver):
             units, values = np.vstack([units[top], moved]), np.concatenate([values[top], acquisition(moved)])
         best = units[np.argsort(-values, kind="stable")]
         spare = self._snapped(self._rng.random((SPREAD, self.search.size)))
-        return next((u for u in (*best, *spare) if self.search.point(u) not in known), None)
+        return next((u for u in (*best, *spare) if self.search.point(u) not in exclude), None)
 
     def _moved(self, units: np.ndarray, width: float) -> np.ndarray:
         """Return normal steps along at least half of the coordinates; integers and choices may jump anywhere."""
@@ -316,13 +318,13 @@ def _most_probable(objective: Any, start: np.ndarray, bounds: np.ndarray) -> tup
         z = (theta - centre) / width
         return value + 0.5 * float(z @ z), gradient + z / width
 
-    found = minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15})
-    return found.x, float(found.fun)
+    result = minimize(density, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15})
+    return result.x, float(result.fun)
 
 
-def _expected_improvement(model: _Model, known: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the logarithm of the EI over the least mean at the ``known`` places."""
-    best = model.predict(known)[0].min()
+def _expected_improvement(model: _Model, examined: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the logarithm of the EI over the least mean at the ``examined`` places."""
+    best = model.predict(examined)[0].min()
 
     def improvement(places: np.ndarray) -> np.ndarray:
         mean, deviation = model.predict(places)

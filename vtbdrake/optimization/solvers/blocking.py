@@ -50,7 +50,8 @@ class BlockingSolver(Solver):
         self._stopping = False
         self._circling = 0
         self._error: BaseException | None = None
-        self._known: dict[bytes, tuple[Evaluation, float, np.ndarray]] = {}
+        # By the bytes of the place in the unit cube.
+        self._answered: dict[bytes, tuple[Evaluation, float, np.ndarray]] = {}
         self._lowest, self._highest = np.inf, -np.inf
         self._broken = np.ones(search.constraints)
 
@@ -62,7 +63,7 @@ class BlockingSolver(Solver):
 
     def _evaluate(self, U: np.ndarray) -> None:
         """Have the unknown ones among points of the unit cube, shape (k, n), evaluated as one batch."""
-        new = list({u.tobytes(): u for u in U if u.tobytes() not in self._known}.values())
+        new = list({u.tobytes(): u for u in U if u.tobytes() not in self._answered}.values())
         self._circling = 0 if new else self._circling + 1
         if self._circling >= CIRCLES:
             self._stopping = True
@@ -71,7 +72,7 @@ class BlockingSolver(Solver):
         if not new:
             return
         for u, evaluation in zip(new, self._request([self.search.point(u) for u in new]), strict=True):
-            self._known[u.tobytes()] = (evaluation, *self._numbers(evaluation))
+            self._answered[u.tobytes()] = (evaluation, *self._numbers(evaluation))
 
     def _request(self, points: list[Point]) -> Sequence[Evaluation]:
         self._requests.put(points)
@@ -96,19 +97,19 @@ class BlockingSolver(Solver):
     def _at(self, u: np.ndarray) -> tuple[Evaluation, float, np.ndarray]:
         """Return the evaluation at ``u``, shape (n,), and its cost and violations, shape (constraints,)."""
         self._evaluate(u[np.newaxis])
-        return self._known[u.tobytes()]
+        return self._answered[u.tobytes()]
 
     def _callback(self, function: Callable[P, R]) -> Callable[P, R]:
         """Wrap a function to keep its exceptions: some libraries swallow or wrap them."""
 
-        def kept(*args: P.args, **kwargs: P.kwargs) -> R:
+        def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
             try:
                 return function(*args, **kwargs)
             except BaseException as error:
                 self._error = self._error or error
                 raise
 
-        return kept
+        return wrapped
 
     def _run(self) -> None:
         outcome: tuple[bool, str] | BaseException
@@ -138,9 +139,9 @@ class BlockingSolver(Solver):
         self._end(*request)
         return []
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        if asked:
-            self._answers.put(asked)
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        if evaluations:
+            self._answers.put(evaluations)
 
     def close(self) -> None:
         """End the method and its thread, and an `ask` that waits in another thread."""

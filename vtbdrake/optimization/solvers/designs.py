@@ -49,7 +49,7 @@ class Design(Solver):
     def _spent(self) -> None:
         self._end(True, "the design is complete")
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
         return
 
 
@@ -111,12 +111,7 @@ class Sobol(Design):
         super().__init__(search, name=name, as_budgeted=as_budgeted)
 
     def _generate(self) -> Iterator[Point]:
-        # Imported here because it is slow.
-        from scipy.stats import qmc
-
-        sequence = qmc.Sobol(self.search.size, scramble=True, rng=self.search.seed)
-        units = itertools.chain.from_iterable(sequence.random(BATCH) for _ in itertools.count())
-        for u in itertools.islice(units, self._count):
+        for u in itertools.islice(sobol_units(self.search), self._count):
             yield self.search.point(u)
 
 
@@ -162,6 +157,16 @@ class RandomSearch(Design):
         generator = np.random.default_rng(self.search.seed)
         for _ in itertools.count() if self._count is None else range(self._count):
             yield self.search.point(generator.random(self.search.size))
+
+
+def sobol_units(search: Search) -> Iterator[np.ndarray]:
+    """Yield the Sobol sequence in the unit cube, scrambled by the seed of the search; it does not end."""
+    # Imported here because it is slow.
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(search.size, scramble=True, rng=search.seed)
+    while True:
+        yield from sequence.random(BATCH)
 
 
 def _count(search: Search, points: int | None) -> int:

@@ -223,9 +223,9 @@ class ProgramSolver(BlockingSolver):
         values = np.concatenate([[cost], violations])
         for i in range(self.search.size):
             neighbours, weights = self._stencil(u, i)
-            found = [self._at(neighbour) for neighbour in neighbours]
-            if all(evaluation.usable for evaluation, _, _ in found):
-                beside = np.array([np.concatenate([[cost], violations]) for _, cost, violations in found])
+            evaluated = [self._at(neighbour) for neighbour in neighbours]
+            if all(evaluation.usable for evaluation, _, _ in evaluated):
+                beside = np.array([np.concatenate([[cost], violations]) for _, cost, violations in evaluated])
                 derivatives[:, i] = weights @ (beside - values)
         return derivatives
 

@@ -42,16 +42,14 @@ class CmaEs(Solver):
     def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.3) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)
-        population = search.batch(default_population(search.size)) if population is None else population
-        if population < 3:
-            raise SolverError(f"a population has at least 3 points, not {population}")
+        population = search.batch(default_population(search.size), requested=population, least=3)
         if not sigma > 0.0:
             raise SolverError(f"sigma is a part of the ranges, above 0, not {sigma}")
         self.population = population
         self._counts = np.array([_grid_count(parameter) for parameter in search.space])
         self._strategy = _strategy(self._encode(search.start_unit()), sigma, self._counts, population, search.seed)
         self._drawn: list[np.ndarray] = []
-        self._found = False
+        self._succeeded = False
 
     def _encode(self, u: np.ndarray) -> np.ndarray:
         """Move integers from the middle of their shares of the unit cube to k / (count - 1)."""
@@ -68,7 +66,9 @@ class CmaEs(Solver):
 
     def _next(self) -> list[Point]:
         if self._strategy.should_stop():
-            self._end(self._found, "converged" if self._found else "no point was found whose simulation succeeds")
+            self._end(
+                self._succeeded, "converged" if self._succeeded else "no point was found whose simulation succeeds"
+            )
             return []
         drawn = [self._strategy.ask() for _ in range(self.population)]
         # With margin, each is a pair: the point to evaluate, and the drawn point before its integers were rounded.
@@ -76,10 +76,10 @@ class CmaEs(Solver):
         self._drawn = [raw for _, raw in pairs]
         return [self.search.point(self._decode(x)) for x, _ in pairs]
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        if asked:
-            self._found |= any(not evaluation.failed for evaluation in asked)
-            self._strategy.tell(list(zip(self._drawn, costs(asked), strict=True)))
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        if evaluations:
+            self._succeeded |= any(not evaluation.failed for evaluation in evaluations)
+            self._strategy.tell(list(zip(self._drawn, costs(evaluations), strict=True)))
 
 
 def _grid_count(parameter: Dimension) -> int:

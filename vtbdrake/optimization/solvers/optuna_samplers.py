@@ -62,9 +62,7 @@ class OptunaSolver(Solver):
         if name.startswith("NSGA") and wide > usual:
             # A batch is a generation.
             options.setdefault("population_size", wide)
-        self._batch = batch if batch is not None else options.get("population_size", wide)
-        if self._batch < 1:
-            raise SolverError(f"a batch has at least one point, not {self._batch}")
+        self._batch = search.batch(wide, requested=options.get("population_size") if batch is None else batch)
         self._keys = [f"{i} {parameter.address}" for i, parameter in enumerate(search.space)]
         self._optuna = import_optuna(name)
         self._distributions = {
@@ -87,13 +85,13 @@ class OptunaSolver(Solver):
 
     def _parameters(self, point: Point) -> dict[str, Any]:
         return {
-            key: parameter.options.index(parameter.check(value)) if isinstance(parameter, Choice) else value
+            key: parameter.options.index(parameter.as_value(value)) if isinstance(parameter, Choice) else value
             for key, parameter, value in zip(self._keys, self.search.space, point, strict=True)
         }
 
     def _point(self, parameters: Mapping[str, Any]) -> Point:
         return tuple(
-            parameter.options[parameters[key]] if isinstance(parameter, Choice) else parameter.check(parameters[key])
+            parameter.options[parameters[key]] if isinstance(parameter, Choice) else parameter.as_value(parameters[key])
             for key, parameter in zip(self._keys, self.search.space, strict=True)
         )
 
@@ -102,12 +100,12 @@ class OptunaSolver(Solver):
             self._trials = [self._study.ask(self._distributions) for _ in range(self._batch)]
         return [self._point(trial.params) for trial in self._trials]
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
         with quiet():
-            if asked:
-                for trial, evaluation in zip(self._trials, asked, strict=True):
+            if evaluations:
+                for trial, evaluation in zip(self._trials, evaluations, strict=True):
                     self._tell(trial, evaluation)
-            for evaluation in given:
+            for evaluation in by_hand:
                 if evaluation.usable:
                     self._study.add_trial(
                         self._optuna.create_trial(

@@ -44,10 +44,7 @@ class SamplingSolver(Solver):
     def __init__(self, search: Search, *, name: str, population: int | None, sigma: float) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)
-        usual = search.batch(2 * default_population(search.size))
-        self.population = usual if population is None else population
-        if self.population < 2:
-            raise SolverError(f"a batch of {name} has at least 2 points, not {population}")
+        self.population = search.batch(2 * default_population(search.size), requested=population, least=2)
         if not sigma > 0.0:
             raise SolverError(f"sigma is a part of the ranges, above 0, not {sigma}")
         self._mu = search.start_unit()
@@ -63,9 +60,9 @@ class SamplingSolver(Solver):
         """Return points of the distribution, clipped to the unit cube."""
         return np.clip(self._mu + self._sigma * self._generator.standard_normal(shape), 0.0, 1.0)
 
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
-        if any(evaluation.usable for evaluation in asked):
-            self._move(self._U, asked)
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
+        if any(evaluation.usable for evaluation in evaluations):
+            self._move(self._U, evaluations)
 
     @abstractmethod
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
@@ -96,8 +93,7 @@ class PredictiveSampling(SamplingSolver):
         self._best: Evaluation | None = None
 
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
-        known = [] if self._best is None else [self._best]
-        best = best_of([*known, *evaluations])
+        best = best_of([self._best, *evaluations])
         if best is not None and best is not self._best:
             # The first of equal points, as in `best_of`.
             self._best, self._mu = best, U[evaluations.index(best)]
@@ -153,8 +149,8 @@ class Cem(SamplingSolver):
         return np.clip(drawn, 0.0, 1.0)
 
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
-        known = [(u, evaluation) for u, evaluation in zip(U, evaluations, strict=True) if evaluation.usable]
-        elites = sorted([*self._best, *known], key=lambda pair: rank_key(pair[1]))[: self._elites]
+        usable = [(u, evaluation) for u, evaluation in zip(U, evaluations, strict=True) if evaluation.usable]
+        elites = sorted([*self._best, *usable], key=lambda pair: rank_key(pair[1]))[: self._elites]
         self._best = elites[:1]
         X, a = np.array([u for u, _ in elites]), self._smoothing
         self._mu = (1.0 - a) * self._mu + a * X.mean(axis=0)

@@ -99,9 +99,10 @@ def rank_key(evaluation: Evaluation) -> tuple[int, float]:
     return (0 if evaluation.exact else 1), -evaluation.values[0]
 
 
-def best_of(evaluations: Iterable[Evaluation]) -> Evaluation | None:
-    """Return the best evaluation of one objective by Deb's rule; None if all failed."""
-    return min((evaluation for evaluation in evaluations if evaluation.usable), key=rank_key, default=None)
+def best_of(evaluations: Iterable[Evaluation | None]) -> Evaluation | None:
+    """Return the best evaluation of one objective by Deb's rule; None if all failed or are None."""
+    usable = (evaluation for evaluation in evaluations if evaluation is not None and evaluation.usable)
+    return min(usable, key=rank_key, default=None)
 
 
 def costs(evaluations: Sequence[Evaluation]) -> list[float]:
@@ -154,7 +155,9 @@ class Search:
             if len(self.start) != self.size:
                 raise SolverError(f"a start has one value per parameter, {self.size}, not {len(self.start)}")
             try:
-                start = tuple(parameter.check(value) for parameter, value in zip(self.space, self.start, strict=True))
+                start = tuple(
+                    parameter.as_value(value) for parameter, value in zip(self.space, self.start, strict=True)
+                )
             except ValueError as error:
                 raise SolverError(f"the start lies outside of the space: {error}") from error
             object.__setattr__(self, "start", start)
@@ -169,9 +172,16 @@ class Search:
         """Return whether more than one point at a time is asked for."""
         return self.parallel is not None and self.parallel > 1
 
-    def batch(self, usual: int) -> int:
-        """Return the size of a batch: the method's usual one, or as many as are evaluated side by side."""
-        return max(usual, self.parallel or 1)
+    def batch(self, usual: int, *, requested: int | None = None, least: int = 1) -> int:
+        """Return the size of a batch: the requested one, or the usual one or as many as are evaluated side by side.
+
+        Raises:
+            SolverError: The requested number is below ``least``.
+        """
+        if requested is not None and requested < least:
+            points = "one point" if least == 1 else f"{least} points"
+            raise SolverError(f"a batch has at least {points}, not {requested}")
+        return max(usual, self.parallel or 1) if requested is None else requested
 
     def point(self, u: Any) -> Point:
         """Return the point at ``u`` in the unit cube, shape (n,); coordinates outside are clipped."""
@@ -273,12 +283,13 @@ class Solver(ABC):
         self.search = search
         self.success: bool | None = None
         self.message = ""
-        self._asked: list[Point] = []
+        # The points asked for, until their evaluations are told.
+        self._pending: list[Point] = []
         self._budget: float | None = search.budget
         # The remaining points of the method's present batch, and the evaluations received for it.
         self._rest: list[Point] = []
-        self._told: list[Evaluation] = []
-        self._given: list[Evaluation] = []
+        self._evaluated: list[Evaluation] = []
+        self._by_hand: list[Evaluation] = []
 
     @property
     def method(self) -> str:
@@ -290,7 +301,7 @@ class Solver(ABC):
         """Return the next batch; an empty one after a call of `_end`."""
 
     @abstractmethod
-    def _learn(self, asked: Sequence[Evaluation], given: Sequence[Evaluation]) -> None:
+    def _learn(self, evaluations: Sequence[Evaluation], by_hand: Sequence[Evaluation]) -> None:
         """Learn from a complete batch (empty before the first), and from points given by hand."""
 
     def _end(self, success: bool, message: str) -> None:
@@ -314,8 +325,8 @@ class Solver(ABC):
             SolverError: The evaluations of the points asked for before have not been told yet.
             Exception: Any error of the method.
         """
-        if self._asked:
-            raise SolverError(f"{self.name} was not told yet of the {len(self._asked)} points that it asked for")
+        if self._pending:
+            raise SolverError(f"{self.name} was not told yet of the {len(self._pending)} points that it asked for")
         if self.success is None and self._left == 0:
             self._spent()
         if self.success is not None:
@@ -325,7 +336,7 @@ class Solver(ABC):
         points, self._rest = self._rest[: self._left], self._rest[self._left :] if self._left is not None else []
         if self._budget is not None:
             self._budget -= len(points)
-        self._asked = points
+        self._pending = points
         return list(points)
 
     def tell(self, evaluations: Sequence[Evaluation]) -> None:
@@ -338,8 +349,8 @@ class Solver(ABC):
             SolverError: The batch is incomplete or in another order, or has another number of values or violations than
                 the problem.
         """
-        count = len(self._asked)
-        if [evaluation.point for evaluation in evaluations[:count]] != self._asked:
+        count = len(self._pending)
+        if [evaluation.point for evaluation in evaluations[:count]] != self._pending:
             raise SolverError(
                 f"{self.name} asked for {count} points and is to be told of those first, in their order; "
                 f"it was told of {len(evaluations)}"
@@ -351,14 +362,14 @@ class Solver(ABC):
             ):
                 if len(numbers) != expected:
                     raise SolverError(f"an evaluation of this problem has {expected} {name}, not {len(numbers)}")
-        self._asked = []
+        self._pending = []
         if self._budget is not None:
             self._budget += count - sum(evaluation.effort for evaluation in evaluations)
-        self._told += evaluations[:count]
-        self._given += evaluations[count:]
+        self._evaluated += evaluations[:count]
+        self._by_hand += evaluations[count:]
         if not self._rest:
-            told, given, self._told, self._given = self._told, self._given, [], []
-            self._learn(told, given)
+            evaluated, by_hand, self._evaluated, self._by_hand = self._evaluated, self._by_hand, [], []
+            self._learn(evaluated, by_hand)
 
     def close(self) -> None:
         """Release the resources of the solver; called after the last `ask`."""
