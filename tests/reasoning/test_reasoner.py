@@ -41,7 +41,7 @@ def make(scenario=None, **changes):
         name: config(**{field.name: settings.pop(field.name) for field in fields(config) if field.name in settings})
         for name, config in (("search", SearchConfig), ("belief", BeliefConfig))
     }
-    return Reasoner(scenario=scenario or MassScenario(), **groups, **settings)
+    return Reasoner(scenario=scenario or MassScenario(), **{**groups, **settings})
 
 
 @pytest.fixture(scope="module")
@@ -622,6 +622,8 @@ def test_a_senseless_budget_is_refused(arguments, message):
         ({"decision": [SWITCH, SWITCH]}, "given twice"),
         ({"quality": [MISS, MISS]}, "a decision has one quality"),
         ({"quality": Quality(abs, of="sim.nothing")}, "sim.nothing"),
+        ({"search": {"method": "CEM"}}, r"configured by a SearchConfig\(...\), not by {'method': 'CEM'}"),
+        ({"belief": 8}, r"configured by a BeliefConfig\(...\), not by 8"),
         ({"method": "simulated annealing"}, "there is no solver 'simulated annealing'"),
         ({"method": "CEM", "options": {"popsize": 3}}, "CEM has no option 'popsize'"),
         ({"method": "CEM", "decision": [Choice("u.switch", [0.5, 1.0])]}, "CEM varies numbers"),

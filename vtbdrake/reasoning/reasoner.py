@@ -123,7 +123,11 @@ class Reasoner:
     ) -> None:
         if not isinstance(quality, Quality):
             raise ValueError(f"a decision has one quality, Quality(f, of=[address, ...]), not {quality!r}")
-        search, belief = search or SearchConfig(), belief or BeliefConfig()
+        search = SearchConfig() if search is None else search
+        belief = BeliefConfig() if belief is None else belief
+        for config, kind in ((search, SearchConfig), (belief, BeliefConfig)):
+            if not isinstance(config, kind):
+                raise ValueError(f"a reasoner is configured by a {kind.__name__}(...), not by {config!r}")
         self.samples = belief.samples
         check_budget(budget, self.samples)
         self.budget = budget
