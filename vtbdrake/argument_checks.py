@@ -78,18 +78,18 @@ def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
     """
     if not isinstance(values, Iterable) or isinstance(values, str | Mapping):
         raise ValueError(f"give {name} as {form}, not as {values!r}")
-    found = tuple(values)
-    for value in found:
+    entries = tuple(values)
+    for value in entries:
         if not isinstance(value, kind):
             raise ValueError(f"give {name} as {form}; {value!r} does not fit")
-    return found
+    return entries
 
 
-def suggestion(address: str, known: Iterable[str]) -> str:
+def suggestion(address: str, addresses: Iterable[str]) -> str:
     """Return the end of an error message that suggests addresses similar to ``address``."""
-    known = list(dict.fromkeys(known))  # A variable and an output port may share an address.
-    near = difflib.get_close_matches(address, known, n=3, cutoff=0.6)
+    addresses = list(dict.fromkeys(addresses))  # A variable and an output port may share an address.
+    near = difflib.get_close_matches(address, addresses, n=3, cutoff=0.6)
     if near:
         return "; did you mean " + " or ".join(near) + "?"
-    tops = sorted({".".join(name.split(".")[:2]) for name in known})
+    tops = sorted({".".join(name.split(".")[:2]) for name in addresses})
     return "; addresses begin with " + ", ".join(tops) if tops else ""

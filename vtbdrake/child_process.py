@@ -291,8 +291,8 @@ def _search_path() -> list[str]:
     entries = [entry for entry in sys.path if isinstance(entry, str)]  # Imports ignore all others.
     path = list(dict.fromkeys(os.path.join(directory, entry) for entry in entries for directory in directories))
     package = Path(__file__).parent
-    found = PathFinder.find_spec(package.name, path)
-    if found is None or found.origin is None or not package.samefile(Path(found.origin).parent):
+    spec = PathFinder.find_spec(package.name, path)
+    if spec is None or spec.origin is None or not package.samefile(Path(spec.origin).parent):
         path.insert(0, str(package.parent))
     return path
 

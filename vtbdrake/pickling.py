@@ -33,10 +33,10 @@ class _Pickler(cloudpickle.Pickler):
 
 
 def _importable(kind: type) -> bool:
-    found: Any = sys.modules.get(kind.__module__)
+    attribute: Any = sys.modules.get(kind.__module__)
     for name in kind.__qualname__.split("."):
-        found = getattr(found, name, None)
-    return found is kind and kind.__module__ != "__main__"
+        attribute = getattr(attribute, name, None)
+    return attribute is kind and kind.__module__ != "__main__"
 
 
 def dumps(value: Any) -> bytes:

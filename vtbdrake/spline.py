@@ -77,16 +77,16 @@ class Spline:
         # Imported here: it takes as long as the rest of the package.
         from scipy.interpolate import BSpline, CubicSpline
 
-        n, one = self.knots, np.eye(self.knots)
+        n, identity = self.knots, np.eye(self.knots)
         if self.order == "zero":
-            c = one[:, None]
+            c = identity[:, None]
         elif self.order == "linear":
-            c = np.stack((one[:-1], np.diff(one, axis=0) * (n - 1) / self.duration), axis=1)
+            c = np.stack((identity[:-1], np.diff(identity, axis=0) * (n - 1) / self.duration), axis=1)
         elif self.order == "cubic":
-            c = CubicSpline(np.linspace(0.0, self.duration, n), one, bc_type="natural").c[::-1].swapaxes(0, 1)
+            c = CubicSpline(np.linspace(0.0, self.duration, n), identity, bc_type="natural").c[::-1].swapaxes(0, 1)
         else:
             begins = np.linspace(0.0, self.duration, n - 2)
-            basis = BSpline(np.concatenate(([0.0] * 3, begins, [self.duration] * 3)), one, 3)
+            basis = BSpline(np.concatenate(([0.0] * 3, begins, [self.duration] * 3)), identity, 3)
             c = np.stack([basis(begins[:-1], nu=k) / factorial(k) for k in range(4)], axis=1)
         pieces = np.concatenate((c, np.zeros((len(c), 4 - c.shape[1], n))), axis=1)
         pieces.flags.writeable = False

@@ -92,7 +92,7 @@ def test_truncated_log_is_read_up_to_its_end(whole: bytes, reference: ControlLog
         assert_same(log, reference, list(range(complete)))
         assert not log.closed
         torn = cut not in [end for places in find_events(whole[:cut])[0].values() for end in places[:, 3]]
-        assert [damage.what for damage in log.damages] == ["the file ends in the middle of an event"] * torn
+        assert [damage.description for damage in log.damages] == ["the file ends in the middle of an event"] * torn
         assert not torn or log.damages[0].offset < cut
 
 
@@ -149,7 +149,7 @@ def test_repeated_cycle_counts_once(whole: bytes, reference: ControlLog, tmp_pat
     bounds = ends(reference)
     log = read(tmp_path, whole[: bounds[5]] + whole[bounds[2] :])
     assert_same(log, reference, list(range(CYCLES)))
-    assert [damage.what for damage in log.damages] == [f"cycle {n} follows cycle 6" for n in (4, 5, 6)]
+    assert [damage.description for damage in log.damages] == [f"cycle {n} follows cycle 6" for n in (4, 5, 6)]
 
 
 def test_events_of_a_repeated_cycle_count_once(whole: bytes, reference: ControlLog, tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_damaged_end_is_ignored(whole: bytes, reference: ControlLog, tmp_path: P
     log = read(tmp_path, whole[:number] + (CYCLES + 1000).to_bytes(8, "big") + whole[number + 8 :])
     assert_same(log, reference, list(range(CYCLES)))
     assert not log.gaps
-    assert [(damage.offset, damage.what) for damage in log.damages] == [
+    assert [(damage.offset, damage.description) for damage in log.damages] == [
         (begin, "the checksum of the log's end is wrong")
     ]
 
@@ -400,7 +400,7 @@ def test_impossible_change_is_damage(
     log = read(tmp_path, whole + framed(100, ("VTB_CHANGE", good.encode()), reference=reference, whole=whole))
     assert log.numbers[-1] == 100
     [damage] = log.damages
-    assert told in damage.what
+    assert told in damage.description
     assert all(index < len(log) - 1 for index, _ in log.changes)
 
 

@@ -240,7 +240,7 @@ def test_one_bit_of_actuation_is_found(tmp_path: Path) -> None:
     servo = Servo()
     report = replay(recorded(tmp_path, servo), Altered(servo.scenario))
     assert report.outcome == "different" and report.first_difference is not None
-    assert (report.first_difference.what, report.first_difference.cycle) == ("velocity", 21)
+    assert (report.first_difference.subject, report.first_difference.cycle) == ("velocity", 21)
     assert 0.0 < report.max_difference["velocity"] < 1e-15
     assert "velocity in cycle 21 (t = 0.021 s)" in str(report)
 
@@ -252,7 +252,7 @@ def test_hidden_state_is_found_by_digest(tmp_path: Path) -> None:
     object.__setattr__(log, "digests", [(i, bytes(16) if i >= 40 else digest) for i, digest in log.digests])
     report = replay(log)
     assert report.outcome == "different" and report.first_difference is not None
-    assert (report.first_difference.what, report.first_difference.cycle) == ("state", 41)
+    assert (report.first_difference.subject, report.first_difference.cycle) == ("state", 41)
 
 
 def test_another_scenario_is_rejected(tmp_path: Path) -> None:

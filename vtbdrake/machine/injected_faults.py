@@ -133,8 +133,8 @@ class Freeze(InjectedFault):
     name = "freeze"
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
-        held: dict[str, bytes] = {}
-        return lambda packet: (packet._replace(data=held.setdefault(packet.channel, packet.data)),)
+        frozen: dict[str, bytes] = {}
+        return lambda packet: (packet._replace(data=frozen.setdefault(packet.channel, packet.data)),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,12 +200,12 @@ class Reorder(InjectedFault):
     name = "reorder"
 
     def effect(self, random: np.random.Generator, period: float) -> Effect:
-        held: dict[str, Packet] = {}
+        waiting: dict[str, Packet] = {}
 
         def effect(packet: Packet) -> Iterable[Packet]:
-            first = held.pop(packet.channel, None)
+            first = waiting.pop(packet.channel, None)
             if first is None:
-                held[packet.channel] = packet
+                waiting[packet.channel] = packet
                 return ()
             return (packet, first._replace(due=packet.due))
 
@@ -228,12 +228,12 @@ def fault_from_dict(data: Mapping[str, Any]) -> InjectedFault:
     kind = FAULTS.get(name) if isinstance(name, str) else None
     if kind is None:
         raise InjectedFaultError(f"a fault must be one of {', '.join(FAULTS)}, not {name!r}")
-    given = {key: value for key, value in data.items() if key != "fault"}
-    known = [item.name for item in fields(kind)]
-    if unknown := sorted(map(str, given.keys() - set(known))):
-        raise InjectedFaultError(f"the fault {name} has no {', '.join(unknown)}; it has: {', '.join(known)}")
+    values = {key: value for key, value in data.items() if key != "fault"}
+    names = [item.name for item in fields(kind)]
+    if unknown := sorted(map(str, values.keys() - set(names))):
+        raise InjectedFaultError(f"the fault {name} has no {', '.join(unknown)}; it has: {', '.join(names)}")
     try:
-        return kind(**given)
+        return kind(**values)
     except TypeError as error:
         raise InjectedFaultError(f"the fault {name} is not complete: {error}") from None
 

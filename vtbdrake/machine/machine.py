@@ -219,8 +219,8 @@ class Machine:
         Such commands have waited somewhere, in a hub that was stopped for example. This needs a sender whose clock
         runs as fast as this computer's, so not in lock-step. A sender that does not tell the time is never late.
         """
-        wanted = reject and self.config.max_latency < inf
-        self._latencies = {n: LatencyMonitor(self.config.max_latency) for n in self._received} if wanted else {}
+        is_limited = reject and self.config.max_latency < inf
+        self._latencies = {n: LatencyMonitor(self.config.max_latency) for n in self._received} if is_limited else {}
 
     # -- cycles
 
@@ -285,11 +285,11 @@ class Machine:
         Raises:
             InjectedFaultError: The machine has no such channel.
         """
-        known = self._sensors.channels if fault.side == SENSE else self.channels
+        channels = self._sensors.channels if fault.side == SENSE else self.channels
         for channel in fault.channels:
-            if channel not in known:
+            if channel not in channels:
                 raise InjectedFaultError(
-                    f"the machine has no {fault.side} channel {channel!r}; it has: {', '.join(known)}"
+                    f"the machine has no {fault.side} channel {channel!r}; it has: {', '.join(channels)}"
                 )
         self._lines[fault.side].begin(fault)
 
@@ -354,12 +354,12 @@ class HoldingBrake:
             return
         self.engaged = engaged
         if self._plant is not None:
-            own = self._plant.GetMyMutableContextFromRoot(context)
+            plant_context = self._plant.GetMyMutableContextFromRoot(context)
             for joint in self._joints:
                 if engaged:
-                    joint.Lock(own)
+                    joint.Lock(plant_context)
                 else:
-                    joint.Unlock(own)
+                    joint.Unlock(plant_context)
 
 
 class _Sensors:
@@ -384,9 +384,9 @@ class _Sensors:
         self._random = random
         self._actuation = actuation  # Kept up to date by the machine.
         carriers = reported_signals(world.interface, protocol.reported)
-        known = signals | {signal.name: signal for signal in carriers.values()}
+        signals_by_name = signals | {signal.name: signal for signal in carriers.values()}
         self._reported = {signal.name: name for name, signal in carriers.items()}
-        self._maps = [(map, map.encoder([known[name] for name in map.signals])) for map in protocol.sense]
+        self._maps = [(map, map.encoder([signals_by_name[name] for name in map.signals])) for map in protocol.sense]
         self._cycles = {
             map.channel: max(1, round(protocol.periods.get(map.channel, period) / period)) for map in protocol.sense
         }

@@ -152,10 +152,10 @@ _FIELDS: dict[str, tuple[type, ...]] = {
 def installed_versions() -> dict[str, str]:
     """Return the versions of vtbdrake, drake and Python that run here."""
     try:
-        own = metadata.version("vtbdrake")
+        vtbdrake_version = metadata.version("vtbdrake")
     except metadata.PackageNotFoundError:
-        own = "not installed"
-    return {"vtbdrake": own, "drake": metadata.version("drake"), "python": platform.python_version()}
+        vtbdrake_version = "not installed"
+    return {"vtbdrake": vtbdrake_version, "drake": metadata.version("drake"), "python": platform.python_version()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,7 +315,7 @@ def _entries(values: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
 
 def decode_changes(messages: Iterable[lcmt_vtb_change]) -> list[tuple[int, Change]]:
     """Return the changes of messages that `change_value` accepts, in order, each with the number of its cycle."""
-    found = []
+    changes = []
     for (number, _), group in groupby(messages, key=lambda message: (message.number, message.change)):
         values: dict[str, Any] = {}
         kind = ""
@@ -327,8 +327,8 @@ def decode_changes(messages: Iterable[lcmt_vtb_change]) -> list[tuple[int, Chang
                     parts[message.name] = change_value(message)
             elif message.address:
                 values[message.address] = change_value(message)
-        found.append((number, Change(kind, values)))
-    return found
+        changes.append((number, Change(kind, values)))
+    return changes
 
 
 def change_value(message: lcmt_vtb_change) -> Any:

@@ -57,10 +57,10 @@ class Damage(NamedTuple):
     """Unreadable bytes of a file: their offset and the kind of damage."""
 
     offset: int
-    what: str
+    description: str
 
     def __str__(self) -> str:
-        return f"at byte {self.offset}: {self.what}"
+        return f"at byte {self.offset}: {self.description}"
 
 
 class Gap(NamedTuple):
@@ -100,9 +100,9 @@ class LogEvents:
         with path.open("rb") as file:
             empty = file.seek(0, 2) == 0  # An empty file cannot be mapped.
             self.content: mmap.mmap | bytes = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        found, self.damages = find_events(self.content)
+        places_by_channel, self.damages = find_events(self.content)
         self._places: dict[str, np.ndarray] = {}
-        for channel, places in found.items():
+        for channel, places in places_by_channel.items():
             name = channel.decode(errors="replace")
             self._places[name] = np.concatenate([self.places(name), places])
 
@@ -320,13 +320,13 @@ def _of_cycles(
     places = events.places(channel)
     begins = np.append(frames[:, 0], np.iinfo(np.int64).max)
     within = places[places[:, 2] >= begins[np.searchsorted(frames[:, 1], places[:, 3])]]
-    found = []
+    decoded = []
     for begin, message in _decoded(events, channel, message_type, damages, within):
         if message.number in numbers:
-            found.append(message)
+            decoded.append(message)
         else:
             damages.append(Damage(begin, f"an event on {channel} is of cycle {message.number}, which is missing"))
-    return found
+    return decoded
 
 
 def _decoded(
@@ -353,8 +353,8 @@ def _last_numbers(events: LogEvents, damages: list[Damage]) -> list[int]:
 
 
 def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
-    known = np.concatenate([[header.first_cycle - 1], numbers, np.array(ends, int) + 1])
-    return [Gap(int(known[i]) + 1, int(known[i + 1]) - 1) for i in np.flatnonzero(np.diff(known) > 1)]
+    present = np.concatenate([[header.first_cycle - 1], numbers, np.array(ends, int) + 1])
+    return [Gap(int(present[i]) + 1, int(present[i + 1]) - 1) for i in np.flatnonzero(np.diff(present) > 1)]
 
 
 def _clock_jumps(records: np.ndarray) -> list[int]:

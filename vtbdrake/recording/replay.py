@@ -53,18 +53,18 @@ _TOLERANCE = 1e-9  # s, of the time of a sample
 class Difference(NamedTuple):
     """A difference between a replay and its log.
 
-    It has the number of the cycle, the DPS's time after it in seconds, ``what`` differs (an actuator signal, ``time``,
-    or ``state`` by its digest), and what was recorded and replayed.
+    It has the number of the cycle, the DPS's time after it in seconds, the ``subject`` that differs (an actuator
+    signal, ``time``, or ``state`` by its digest), and what was recorded and replayed.
     """
 
     cycle: int
     time: float
-    what: str
+    subject: str
     recorded: Any
     replayed: Any
 
     def __str__(self) -> str:
-        return f"{self.what} in cycle {self.cycle} (t = {self.time:g} s): {self.replayed} instead of {self.recorded}"
+        return f"{self.subject} in cycle {self.cycle} (t = {self.time:g} s): {self.replayed} instead of {self.recorded}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,14 +136,14 @@ def replay(
     if run is None:
         run = _Replay(log, target or _recorded_target(log), dict(values or {}), record)
         run.run()
-    found = run.differences()
-    outcome = NOT_COMPARED if values else DIFFERENT if found else IDENTICAL
+    differences = run.differences()
+    outcome = NOT_COMPARED if values else DIFFERENT if differences else IDENTICAL
     here = installed_versions()
     return ReplayReport(
         outcome=outcome,
         cycles=run.count,
         ended=run.ended or log.incomplete,
-        first_difference=found[0] if outcome == DIFFERENT else None,
+        first_difference=differences[0] if outcome == DIFFERENT else None,
         max_difference={} if values else _largest_differences(log, run.actuation),
         digests=len(run.digests),
         versions=tuple(
@@ -276,12 +276,14 @@ class _Replay:
 
     def differences(self) -> list[Difference]:
         """Return the first difference of every kind from the log, in the order of the cycles."""
-        log, found = self._log, []
+        log, differences = self._log, []
 
-        def look(what: str, differs: np.ndarray, recorded: np.ndarray, replayed: np.ndarray) -> None:
+        def look(subject: str, differs: np.ndarray, recorded: np.ndarray, replayed: np.ndarray) -> None:
             if differs.any():
                 i = int(np.argmax(differs))
-                found.append(Difference(int(log.numbers[i]), float(log.times[i]), what, recorded[i], replayed[i]))
+                differences.append(
+                    Difference(int(log.numbers[i]), float(log.times[i]), subject, recorded[i], replayed[i])
+                )
 
         n = len(self.times)
         look("time", log.times[:n] != self.times, log.times, self.times)
@@ -297,9 +299,9 @@ class _Replay:
         for i, digest in self.digests:
             if digest != digests[i]:
                 both = digests[i].hex(), digest.hex()
-                found.append(Difference(int(log.numbers[i]), float(log.times[i]), "state", *both))
+                differences.append(Difference(int(log.numbers[i]), float(log.times[i]), "state", *both))
                 break
-        return sorted(found, key=lambda difference: difference.cycle)
+        return sorted(differences, key=lambda difference: difference.cycle)
 
     # -- changes
 
@@ -381,10 +383,10 @@ def _restore(log: ControlLog, target: Target, context: Context) -> None:
 
 def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> None:
     """Restore the DPS and its commands u; the simulated world restarts."""
-    own = testbed.snapshot(context)
+    snapshot = testbed.snapshot(context)
     groups = {key: value for key, value in start.groups.items() if key.partition("/")[0].split(".")[0] == "dps"}
     values = {address: value for address, value in start.values.items() if address.startswith("dps.")}
-    testbed.restore(context, Snapshot(start.time, {**own.values, **values}, {**own.groups, **groups}))
+    testbed.restore(context, Snapshot(start.time, {**snapshot.values, **values}, {**snapshot.groups, **groups}))
     commands = [f"{COMMAND}{signal.name}" for signal in testbed.interface.commands]
     testbed.write(context, {a: start[a] for a in commands if a in testbed.variables()})
 
@@ -411,13 +413,13 @@ def _abstract_decoders(log: ControlLog, target: AddressedDiagram) -> dict[str, C
         return {}
     if target.scenario is None:
         raise LogError(f"the target has no scenario, whose protocol says how to decode {', '.join(abstract)}")
-    found = {}
+    decoders = {}
     for map in protocol_of(target.scenario).sense:
         decoder = map.decoder([signals[name] for name in map.signals])
         for name in map.signals:
             if name in abstract:
-                found[name] = _message_decoder(log, map.channel, decoder, name)
-    return found
+                decoders[name] = _message_decoder(log, map.channel, decoder, name)
+    return decoders
 
 
 def _message_decoder(log: ControlLog, channel: str, decoder: Decoder, name: str) -> Callable[[int], Any]:
@@ -453,8 +455,8 @@ def _replay_in_batches(log: ControlLog) -> _Replay | None:
     except FAILURES as error:
         _log.info("replayed cycle by cycle: %s", error)
         return None
-    if found := run.differences():
-        _log.info("replayed cycle by cycle: %s", found[0])
+    if differences := run.differences():
+        _log.info("replayed cycle by cycle: %s", differences[0])
         return None
     return run
 

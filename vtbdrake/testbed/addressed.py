@@ -270,8 +270,8 @@ class AddressedDiagram:
             nothing = np.full(port.size(), np.nan)
 
             def read_vector(context: Context) -> np.ndarray:
-                own = self._own_context(context)
-                return np.array(port.Eval(own) if port.HasValue(own) else nothing)
+                port_context = self._own_context(context)
+                return np.array(port.Eval(port_context) if port.HasValue(port_context) else nothing)
 
             return read_vector
 
@@ -365,26 +365,26 @@ def _is_no_board(path: str) -> bool:
 
 
 def _sampling_part(diagram: Diagram) -> SlowPart | None:
-    found = {path: part for path, part in slow_parts(diagram).items() if part.samples_dps}
-    if len(found) > 1:
+    sampling = {path: part for path, part in slow_parts(diagram).items() if part.samples_dps}
+    if len(sampling) > 1:
         # The samples of each would contain those of the other that are under way, and so on.
         raise ValueError(
-            f"a DPS has at most one slow part that samples its state, not {len(found)}: {', '.join(found)}"
+            f"a DPS has at most one slow part that samples its state, not {len(sampling)}: {', '.join(sampling)}"
         )
-    return next(iter(found.values()), None)
+    return next(iter(sampling.values()), None)
 
 
 def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:
-    found = []
+    systems = []
     for system in diagram.GetSystems():
         below = f"{path}.{system.get_name()}".lstrip(".")
-        found.append((below, system))
+        systems.append((below, system))
         if isinstance(system, Diagram):
-            found += _all_systems(system, below)
-    return found
+            systems += _all_systems(system, below)
+    return systems
 
 
-def _port_reader(port: OutputPort, own: Callable[[Context], Context]) -> Callable[[Context], Any]:
+def _port_reader(port: OutputPort, context_of: Callable[[Context], Context]) -> Callable[[Context], Any]:
     if port.get_data_type() == PortDataType.kVectorValued:
-        return lambda context: np.array(port.Eval(own(context)))
-    return lambda context: port.EvalAbstract(own(context)).Clone().get_value()
+        return lambda context: np.array(port.Eval(context_of(context)))
+    return lambda context: port.EvalAbstract(context_of(context)).Clone().get_value()

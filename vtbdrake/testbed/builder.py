@@ -168,14 +168,15 @@ class VirtualTestbedBuilder:
         signals: Sequence[Signal], name: str, kind: str, taken: dict[str, P], port: P, kind_of_port: type[P]
     ) -> None:
         """Check that ``port`` can carry the signal ``name``, which has no port yet, and add it to ``taken``."""
-        known = {signal.name: signal for signal in signals}
-        if name not in known:
-            raise SignalError(f"the interface has no {kind} signal {name!r}; it has: {', '.join(known) or 'none'}")
+        signals_by_name = {signal.name: signal for signal in signals}
+        if name not in signals_by_name:
+            names = ", ".join(signals_by_name) or "none"
+            raise SignalError(f"the interface has no {kind} signal {name!r}; it has: {names}")
         if not isinstance(port, kind_of_port):
             raise SignalError(f"the {kind} signal {name} takes an {kind_of_port.__name__} of a system, not {port!r}")
         if name in taken:
             raise SignalError(f"two ports are given for the {kind} signal {name}")
-        known[name].check_port(port, str(port.get_system().get_name()))
+        signals_by_name[name].check_port(port, str(port.get_system().get_name()))
         taken[name] = port
 
     def set_dps(self, dps: S) -> S:
@@ -191,10 +192,10 @@ class VirtualTestbedBuilder:
     def _check_ports(self, dps: System) -> None:
         inputs = {dps.get_input_port(i).get_name(): dps.get_input_port(i) for i in range(dps.num_input_ports())}
         outputs = {dps.get_output_port(i).get_name(): dps.get_output_port(i) for i in range(dps.num_output_ports())}
-        known = ", ".join(inputs) or "none"
+        port_names = ", ".join(inputs) or "none"
         for signal in [*self.interface.sense, *self.interface.commands]:
             if signal.name not in inputs:
-                raise SignalError(f"the DPS has no input port {signal.name}; it has: {known}. {_PORTS}")
+                raise SignalError(f"the DPS has no input port {signal.name}; it has: {port_names}. {_PORTS}")
             signal.check_port(inputs.pop(signal.name), "the DPS")
         for signal in self.interface.act:
             if signal.name not in outputs:
@@ -337,8 +338,8 @@ class VirtualTestbedBuilder:
             return {}
         if not any(system.num_continuous_states() for system in self.diagram_builder.GetSystems()):
             return {}
-        own = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
-        in_python = any(is_python(system) for _, system in own)
+        dps_systems = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
+        in_python = any(is_python(system) for _, system in dps_systems)
         vectors = [signal.name for signal in self.interface.act if signal.is_vector]
         into_plant = {name: is_plant(self.actuators[name].get_system()) for name in vectors}
         return {name: plant for name, plant in into_plant.items() if plant or in_python}

@@ -26,22 +26,22 @@ def followers(diagram: Diagram, sources: Iterable[str]) -> dict[str, str]:
     readers: dict[str, list[str]] = {path: [] for path in paths.values()}
     for source, reader in _connections(diagram):
         readers[paths[source]].append(paths[reader])
-    found = {source: source for source in sources}
-    waiting = deque(found)
+    predecessors = {source: source for source in sources}
+    waiting = deque(predecessors)
     while waiting:
         path = waiting.popleft()
         for reader in readers[path]:
-            if reader not in found:
-                found[reader] = path
+            if reader not in predecessors:
+                predecessors[reader] = path
                 waiting.append(reader)
-    return found
+    return predecessors
 
 
-def chain(found: dict[str, str], path: str) -> list[str]:
+def chain(predecessors: dict[str, str], path: str) -> list[str]:
     """Return the paths from a source to the follower ``path``, both included, in what `followers` returned."""
     passed = [path]
-    while found[passed[-1]] != passed[-1]:
-        passed.append(found[passed[-1]])
+    while predecessors[passed[-1]] != passed[-1]:
+        passed.append(predecessors[passed[-1]])
     return passed[::-1]
 
 

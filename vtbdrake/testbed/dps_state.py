@@ -69,9 +69,9 @@ class DpsReader:
         commands = {name: np.array(read(root), dtype=float) for name, read in self._commands.items()}
         received = {}
         for name, (dps, port) in self._sensors.items():
-            own = dps.GetMyContextFromRoot(root)
-            if port.HasValue(own):
-                received[name] = np.array(port.Eval(own))
+            dps_context = dps.GetMyContextFromRoot(root)
+            if port.HasValue(dps_context):
+                received[name] = np.array(port.Eval(dps_context))
         return DpsState(root.get_time(), self._layout.take(root), commands, received)
 
 

@@ -188,13 +188,15 @@ def _renderer(config: CameraConfig) -> RenderEngine:
         RenderEngineGlParams: MakeRenderEngineGl,
         RenderEngineGltfClientParams: MakeRenderEngineGltfClient,
     }
-    chosen = config.renderer_class
-    if isinstance(chosen, str):
+    renderer = config.renderer_class
+    if isinstance(renderer, str):
         named = {f"RenderEngine{name}": globals()[f"RenderEngine{name}Params"] for name in ("Vtk", "Gl", "GltfClient")}
-        if chosen not in ("", *named):
-            raise ScenarioError(f"the renderer_class of {config.name} is one of {', '.join(named)}, not {chosen!r}")
+        if renderer not in ("", *named):
+            raise ScenarioError(f"the renderer_class of {config.name} is one of {', '.join(named)}, not {renderer!r}")
         rgb = config.background
-        chosen = (
-            RenderEngineVtkParams(default_clear_color=[rgb.r(), rgb.g(), rgb.b()]) if not chosen else named[chosen]()
+        renderer = (
+            RenderEngineVtkParams(default_clear_color=[rgb.r(), rgb.g(), rgb.b()])
+            if not renderer
+            else named[renderer]()
         )
-    return makers[type(chosen)](chosen)
+    return makers[type(renderer)](renderer)

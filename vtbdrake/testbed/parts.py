@@ -77,15 +77,15 @@ class DpsAlone(AddressedDiagram):
 
     def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:
         """Return a context in which the DPS continues from a context of its testbed, at the same time."""
-        own = self.default_context()
+        copied = self.default_context()
         if id(testbed) not in self._copiers:
             self._copiers[id(testbed)] = StateCopier(
                 testbed.diagram, testbed.variables(), self.diagram, self.variables(), only=is_dps
             )
-        self._copiers[id(testbed)].copy(context, own)
+        self._copiers[id(testbed)].copy(context, copied)
         commands = [f"{COMMAND}{signal.name}" for signal in self.interface.commands]
-        self.write(own, {a: testbed.read(context, a) for a in commands if a in testbed.variables()})
-        return own
+        self.write(copied, {a: testbed.read(context, a) for a in commands if a in testbed.variables()})
+        return copied
 
     def restore(self, context: Context, snapshot: Snapshot) -> None:
         """Make ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
@@ -102,12 +102,12 @@ class DpsAlone(AddressedDiagram):
 
 def _unpaced(config: SimulatorConfig, *, has_plant: bool = True) -> SimulatorConfig:
     """Return a config for a loop that sets the pace itself."""
-    own = copy.deepcopy(config)
-    own.target_realtime_rate = 0.0
+    unpaced = copy.deepcopy(config)
+    unpaced.target_realtime_rate = 0.0
     # CENIC integrates a MultibodyPlant.
-    if own.integration_scheme == "cenic" and not has_plant:
-        own.integration_scheme = "runge_kutta3"
-    return own
+    if unpaced.integration_scheme == "cenic" and not has_plant:
+        unpaced.integration_scheme = "runge_kutta3"
+    return unpaced
 
 
 class WorldAlone(AddressedDiagram):
@@ -131,9 +131,9 @@ class WorldAlone(AddressedDiagram):
         """
         check_is_scenario(scenario)
         scenario.validate()
-        own = copy.deepcopy(scenario)
-        parts = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)
-        own.add_world(parts)
+        scenario_copy = copy.deepcopy(scenario)
+        parts = VirtualTestbedBuilder(scenario_copy.interface(), simulator_config=scenario_copy.simulator_config)
+        scenario_copy.add_world(parts)
         parts.finish_world()
         for signal in parts.interface.sense:
             parts.diagram_builder.ExportOutput(parts.sensors[signal.name], f"sense.{signal.name}")
@@ -143,8 +143,8 @@ class WorldAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=parts.interface,
-            simulator_config=_unpaced(own.simulator_config),
-            scenario=own,
+            simulator_config=_unpaced(scenario_copy.simulator_config),
+            scenario=scenario_copy,
             plant_roles=parts.plant_roles(),
         )
         self.plant = parts.plant

@@ -122,10 +122,10 @@ class Scenario(ABC):
         config = self.simulator_config
         if not isinstance(config, SimulatorConfig):
             raise ScenarioError(f"{name}.simulator_config is a SimulatorConfig of Drake, not {config!r}")
-        known = GetIntegrationSchemes()
-        if config.integration_scheme not in known:
+        schemes = GetIntegrationSchemes()
+        if config.integration_scheme not in schemes:
             raise ScenarioError(
-                f"{name}.simulator_config.integration_scheme is one of {', '.join(known)}, not "
+                f"{name}.simulator_config.integration_scheme is one of {', '.join(schemes)}, not "
                 f"{config.integration_scheme!r}"
             )
         if config.integration_scheme == "cenic" and not config.use_error_control and not _CENIC_IS_FRESH:
@@ -158,12 +158,12 @@ class Scenario(ABC):
             RuntimeError: Drake rejects what is built; a failed assertion in it, which would end the process, too.
         """
         self.validate()
-        own = copy.deepcopy(self)  # The caller may change this one afterwards.
-        builder = VirtualTestbedBuilder(own.interface(), simulator_config=own.simulator_config)
+        scenario = copy.deepcopy(self)  # The caller may change this one afterwards.
+        builder = VirtualTestbedBuilder(scenario.interface(), simulator_config=scenario.simulator_config)
         try:
-            builder.set_dps(own.make_dps())
-            own.add_world(builder)
-            return builder.build(mode=mode, scenario=own, meshcat=meshcat, prefix=prefix)
+            builder.set_dps(scenario.make_dps())
+            scenario.add_world(builder)
+            return builder.build(mode=mode, scenario=scenario, meshcat=meshcat, prefix=prefix)
         except SystemExit as error:
             raise RuntimeError(f"{self!r} cannot be built: {error}") from error
 

@@ -80,15 +80,15 @@ def scenario_class(name: str) -> type[Scenario]:
         ) from error
     except Exception as error:
         raise ScenarioError(f"cannot import {module_name}, of the scenario {name}: {error!r}") from error
-    found = getattr(module, class_, None)
-    if isinstance(found, type) and issubclass(found, Scenario) and isabstract(found):
-        raise ScenarioError(f"{name} is abstract: it lacks the methods {', '.join(sorted(found.__abstractmethods__))}")
-    if not (isinstance(found, type) and issubclass(found, Scenario)):
-        known = [
+    kind = getattr(module, class_, None)
+    if isinstance(kind, type) and issubclass(kind, Scenario) and isabstract(kind):
+        raise ScenarioError(f"{name} is abstract: it lacks the methods {', '.join(sorted(kind.__abstractmethods__))}")
+    if not (isinstance(kind, type) and issubclass(kind, Scenario)):
+        alternatives = [
             k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and not isabstract(v)
         ]
-        raise ScenarioError(f"{module_name} has no scenario {class_!r}; it has: {', '.join(known) or 'none'}")
-    return found
+        raise ScenarioError(f"{module_name} has no scenario {class_!r}; it has: {', '.join(alternatives) or 'none'}")
+    return kind
 
 
 def is_imported(name: str) -> bool:
@@ -120,12 +120,12 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
             f"as package.module:Class@{path}#KEY"
         )
     _check_nodes(document, path)
-    known = {str(node.value): content for node, content in document.value}
-    if key and key not in known:
-        raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(known) or 'none'}")
-    name = key or next(iter(known))
-    if named and ":" in name and name not in (named, class_name(found := scenario_class(named))):
-        raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(found)}")
+    contents = {str(node.value): content for node, content in document.value}
+    if key and key not in contents:
+        raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(contents) or 'none'}")
+    name = key or next(iter(contents))
+    if named and ":" in name and name not in (named, class_name(expected := scenario_class(named))):
+        raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(expected)}")
     if not named and ":" in name and not is_imported(name):
         raise ScenarioError(
             f"{path} names the scenario {name}, and to import its module runs its code: if that is what you want, "
@@ -134,7 +134,7 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
     try:
         schema = scenario_class(named or name)
         _resolve_types(schema)
-        content = known[name]
+        content = contents[name]
         _use_new_keys(content, schema)
         _refuse_unknown(content, schema)
         return yaml_load_typed(schema=schema, data=yaml.serialize(content))
@@ -146,8 +146,8 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
 
 def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
     """Rename the keys of older files to those of the fields."""
-    known = field_types(schema)
-    renamed = {old: new for new, old in FILE_KEYS.items() if new in known and old not in known}
+    keys = field_types(schema)
+    renamed = {old: new for new, old in FILE_KEYS.items() if new in keys and old not in keys}
     for key, _ in content.value if isinstance(content, yaml.MappingNode) else []:
         key.value = renamed.get(key.value, key.value)
 
@@ -202,7 +202,7 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
     # A tag chooses one of several classes; the first one needs no tag.
     classes = [part for part in alternatives if isinstance(part, type) and field_types(part)]
     expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
-    known = field_types(expected)
+    types = field_types(expected)
     for key, value in node.value:
         below = f"{name}.{key.value}".lstrip(".")
         if expected is None:  # A dict, say.
@@ -210,11 +210,11 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
         elif key.value == "<<":  # Keys merged from elsewhere in the file.
             for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
                 _refuse_unknown(merged, expected, name)
-        elif key.value in known:
-            _refuse_unknown(value, known[key.value], below)
+        elif key.value in types:
+            _refuse_unknown(value, types[key.value], below)
         else:
-            near = difflib.get_close_matches(key.value, known, n=1, cutoff=0.5)
-            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known)}"
+            near = difflib.get_close_matches(key.value, types, n=1, cutoff=0.5)
+            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(types)}"
             raise ScenarioError(
                 f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}; {hint_text}"
             )

@@ -165,16 +165,16 @@ class Signal:
                 f"{port.size()}"
             )
         if not is_vector and isinstance(port, OutputPort):
-            found, expected = port.Allocate().get_value(), self.abstract_value().get_value()
-            if type(found) is not type(expected):
+            actual, expected = port.Allocate().get_value(), self.abstract_value().get_value()
+            if type(actual) is not type(expected):
                 raise SignalError(
                     f"signal {self.name} carries a {type(expected).__name__}, but the port {port.get_name()} of "
-                    f"{owner} carries a {type(found).__name__}"
+                    f"{owner} carries a {type(actual).__name__}"
                 )
-            if _ANY_SIZE not in (_pixels(expected), _pixels(found)) and _pixels(expected) != _pixels(found):
+            if _ANY_SIZE not in (_pixels(expected), _pixels(actual)) and _pixels(expected) != _pixels(actual):
                 raise SignalError(
                     f"signal {self.name} carries images of {_pixels(expected)}, but the port {port.get_name()} of "
-                    f"{owner} those of {_pixels(found)}: give a model_value of that size"
+                    f"{owner} those of {_pixels(actual)}: give a model_value of that size"
                 )
 
 
@@ -213,10 +213,10 @@ class Interface:
 
     def __post_init__(self) -> None:
         for name in ("sense", "act", "commands"):
-            given = getattr(self, name)
-            if not isinstance(given, Signal | Iterable):
-                raise SignalError(f"an interface's {name} is a list of Signal(...), [] for none, not {given!r}")
-            signals = (given,) if isinstance(given, Signal) else tuple(given)
+            declared = getattr(self, name)
+            if not isinstance(declared, Signal | Iterable):
+                raise SignalError(f"an interface's {name} is a list of Signal(...), [] for none, not {declared!r}")
+            signals = (declared,) if isinstance(declared, Signal) else tuple(declared)
             if wrong := [item for item in signals if not isinstance(item, Signal)]:
                 raise SignalError(f"an interface's {name} is a list of Signal(...), but has {wrong[0]!r}")
             object.__setattr__(self, name, signals)
@@ -237,11 +237,11 @@ class Interface:
         return f"Interface({', '.join(f'{side}=[{names}]' for side, names in sides.items())})"
 
     @staticmethod
-    def _refuse_twins(signals: Sequence[Signal], what: str) -> None:
+    def _refuse_twins(signals: Sequence[Signal], kind: str) -> None:
         names = [signal.name for signal in signals]
         twins = sorted({name for name in names if names.count(name) > 1})
         if twins:
-            raise SignalError(f"the names of {what} must differ, but these occur twice: {', '.join(twins)}")
+            raise SignalError(f"the names of {kind} must differ, but these occur twice: {', '.join(twins)}")
 
 
 class Feed:
@@ -258,14 +258,14 @@ class Feed:
 
     def __call__(self, name: str, value: Any) -> None:
         """Set the value of a signal's port: for a vector signal an array of its size."""
-        known = self._fixed.get(name)
-        if known is None:
+        access = self._fixed.get(name)
+        if access is None:
             signal, port = self._ports[name]
             fixed = port.FixValue(self._context, value if signal.is_vector else _wrapped(signal, value))
             numbers = fixed.GetMutableData().get_mutable_value().get_mutable_value() if signal.is_vector else None
             self._fixed[name] = (fixed.GetMutableData, numbers)
             return
-        changed, numbers = known
+        changed, numbers = access
         data = changed()
         if numbers is None:
             data.set_value(value)

@@ -86,8 +86,8 @@ class SlowFunction:
         if not isinstance(outputs, Mapping) and len(self.outputs) == 1:
             return dict.fromkeys(self.outputs, outputs)
         if not isinstance(outputs, Mapping) or set(outputs) != set(self.outputs):
-            found = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else repr(outputs)
-            raise SlowPartError(f"a slow part returns its outputs by name ({', '.join(self.outputs)}), not {found}")
+            returned = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else repr(outputs)
+            raise SlowPartError(f"a slow part returns its outputs by name ({', '.join(self.outputs)}), not {returned}")
         return outputs
 
 
@@ -104,16 +104,16 @@ def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, 
         except (ValueError, TypeError, AttributeError) as error:
             raise SlowPartError(f"{name}: {error}") from error
         for part, value in parts.items():
-            arrays[f"{name}.{part}" if part else name] = _own(value)
+            arrays[f"{name}.{part}" if part else name] = _read_only_copy(value)
     return arrays
 
 
-def kept(arrays: Arrays) -> dict[str, np.ndarray]:
+def read_only(arrays: Arrays) -> dict[str, np.ndarray]:
     """Return the arrays as `encode` makes them; read-only ones are not copied."""
-    return {name: _own(array) if array.flags.writeable else array for name, array in arrays.items()}
+    return {name: _read_only_copy(array) if array.flags.writeable else array for name, array in arrays.items()}
 
 
-def _own(value: np.ndarray) -> np.ndarray:
+def _read_only_copy(value: np.ndarray) -> np.ndarray:
     array = np.array(value)
     array.flags.writeable = False
     return array
@@ -190,7 +190,7 @@ class Progress:
         memory, outputs = split_memory(arrays)
         result = Work(tick, WorkStatus.DONE if outputs else WorkStatus.MISSING, outputs)
         awaited = (work.tick == tick and work.status == WorkStatus.WAITING for work in self.under_way)
-        under_way = tuple(result if found else work for work, found in zip(self.under_way, awaited, strict=True))
+        under_way = tuple(result if due else work for work, due in zip(self.under_way, awaited, strict=True))
         return replace(self, memory=memory or self.memory, under_way=under_way)
 
     def after(self, work: Work, shown: Arrays) -> Progress:
@@ -308,15 +308,15 @@ class SlowPart(AddressedSystem):
         special = {**({_REQUEST: 1} if on_request else {}), **({_DPS: RootReference()} if samples_dps else {})}
         _check_names(inputs, outputs, initial or {}, {name: models.get(name) for name in codecs or {}}, bool(special))
         self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
-        known = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
-        taken = {name: known[name] for name in inputs}
+        codecs_by_name = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
+        taken = {name: codecs_by_name[name] for name in inputs}
         if on_request:
             inputs = {**inputs, _REQUEST: 1}
             taken[_REQUEST] = array_codec((1,))
         if samples_dps:
             taken[_DPS] = DPS_STATE_CODEC
-        made = {name: known[name] for name in outputs}
-        remembered = {MEMORY: known[MEMORY]} if MEMORY in known else {}
+        made = {name: codecs_by_name[name] for name in outputs}
+        remembered = {MEMORY: codecs_by_name[MEMORY]} if MEMORY in codecs_by_name else {}
         first = {name: np.zeros(model) if _is_size(model) else model for name, model in outputs.items()}
         shown = encode({**first, **(initial or {})}, made)
         remembers = encode({MEMORY: memory}, remembered)
@@ -491,8 +491,8 @@ class SlowPart(AddressedSystem):
             SlowPartError: The arrays have other names or shapes.
         """
         self._check_result(arrays)
-        own = self.GetMyMutableContextFromRoot(context)
-        own.SetAbstractState(self._progress, self._read(own).having(tick, kept(arrays)))
+        part_context = self.GetMyMutableContextFromRoot(context)
+        part_context.SetAbstractState(self._progress, self._read(part_context).having(tick, read_only(arrays)))
 
     def _check_result(self, arrays: Arrays) -> None:
         memory, outputs = split_memory(arrays)
@@ -508,8 +508,8 @@ class SlowPart(AddressedSystem):
 
 def slow_parts(diagram: Diagram) -> dict[str, SlowPart]:
     """Return the slow parts in the DPS of a testbed's diagram, by path."""
-    found = {path: system for path, system in leaves(diagram) if path == "dps" or path.startswith("dps.")}
-    return {path: system for path, system in found.items() if isinstance(system, SlowPart)}
+    dps_systems = {path: system for path, system in leaves(diagram) if path == "dps" or path.startswith("dps.")}
+    return {path: system for path, system in dps_systems.items() if isinstance(system, SlowPart)}
 
 
 def _is_size(model: Any) -> bool:
@@ -533,10 +533,10 @@ def _check_times(period: float, latency: float, offset: float, patience: float) 
 
 def _check_under_way(period: float, latency: float, offset: float, most: int) -> None:
     if ceil(latency / period) > most:
-        what = "a slow part" if most > 1 else "a slow part that samples the state of the DPS"
+        owner = "a slow part" if most > 1 else "a slow part that samples the state of the DPS"
         raise ValueError(
-            f"with a period of {period:g} s and a latency of {latency:g} s, {ceil(latency / period)} samples of {what} "
-            f"would be under way; choose a period of at least {latency / most:g} s"
+            f"with a period of {period:g} s and a latency of {latency:g} s, {ceil(latency / period)} samples of "
+            f"{owner} would be under way; choose a period of at least {latency / most:g} s"
         )
     if most == 1 and offset > 0.0 and latency >= period:
         raise ValueError(

@@ -383,7 +383,7 @@ def _arrays(message: Mapping[str, Any], addresses: Sequence[str], channel: str) 
     values = message.get("values")
     if not isinstance(values, dict) or not set(addresses) <= values.keys():
         raise _invalid(channel, f"the values of {', '.join(addresses)}", message)
-    found: Values = {}
+    checked: Values = {}
     for address, value in values.items():
         try:
             array = np.array(value)
@@ -391,8 +391,8 @@ def _arrays(message: Mapping[str, Any], addresses: Sequence[str], channel: str) 
             array = np.array(None)
         if array.dtype.kind not in "iuf" and array.size:
             raise _invalid(channel, f"a number or an array of numbers for {address}", value)
-        found[address] = array.astype(float) if isinstance(value, list) else value
-    return found
+        checked[address] = array.astype(float) if isinstance(value, list) else value
+    return checked
 
 
 def _invalid(channel: str, expected: str, got: Any) -> LiveError:

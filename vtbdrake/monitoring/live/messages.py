@@ -141,28 +141,28 @@ def _request(channel: str, message: dict[str, Any]) -> Request:
 
 
 def _field(message: dict[str, Any], name: str, *optional: str) -> Any:
-    known = ("id", name, *optional)
-    if name not in message or not message.keys() <= set(known):
-        raise RequestError(f"this request must have {', '.join(known)}, not {_short(', '.join(message))}")
+    keys = ("id", name, *optional)
+    if name not in message or not message.keys() <= set(keys):
+        raise RequestError(f"this request must have {', '.join(keys)}, not {_short(', '.join(message))}")
     return message[name]
 
 
-def _addresses(given: Any, *, least: int) -> tuple[str, ...]:
-    if not isinstance(given, list) or not all(isinstance(address, str) for address in given):
-        raise RequestError(f"addresses must be a list of strings, not {_short(given)}")
-    if not least <= len(given) <= MAX_ADDRESSES:
-        raise RequestError(f"a request must have {least} to {MAX_ADDRESSES} addresses, not {len(given)}")
-    return tuple(dict.fromkeys(given))
+def _addresses(addresses: Any, *, least: int) -> tuple[str, ...]:
+    if not isinstance(addresses, list) or not all(isinstance(address, str) for address in addresses):
+        raise RequestError(f"addresses must be a list of strings, not {_short(addresses)}")
+    if not least <= len(addresses) <= MAX_ADDRESSES:
+        raise RequestError(f"a request must have {least} to {MAX_ADDRESSES} addresses, not {len(addresses)}")
+    return tuple(dict.fromkeys(addresses))
 
 
-def _values(given: Any) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise RequestError(f"values must be an object of addresses and values, not {_short(given)}")
-    if not 1 <= len(given) <= MAX_ADDRESSES:
-        raise RequestError(f"a request must have 1 to {MAX_ADDRESSES} values, not {len(given)}")
-    for address, value in given.items():
+def _values(values: Any) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        raise RequestError(f"values must be an object of addresses and values, not {_short(values)}")
+    if not 1 <= len(values) <= MAX_ADDRESSES:
+        raise RequestError(f"a request must have 1 to {MAX_ADDRESSES} values, not {len(values)}")
+    for address, value in values.items():
         _check_value(address, value)
-    return given
+    return values
 
 
 def _check_value(address: str, value: Any) -> None:

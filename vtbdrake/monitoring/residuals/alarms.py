@@ -96,10 +96,10 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
         raise CalibrationError(f"a calibration needs at least {_MIN_WINDOWS} windows, not {len(table)}: run longer")
     batches = table[: len(table) // _BATCH * _BATCH].reshape(-1, _BATCH, table.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        known = ~np.isnan(batches)
-        counts = known.sum(axis=1)
-        means = np.where(known, batches, 0.0).sum(axis=1) / counts
-        squares = np.where(known, batches - means[:, None], 0.0) ** 2
+        is_number = ~np.isnan(batches)
+        counts = is_number.sum(axis=1)
+        means = np.where(is_number, batches, 0.0).sum(axis=1) / counts
+        squares = np.where(is_number, batches - means[:, None], 0.0) ** 2
         deviations = np.sqrt(squares.sum(axis=1) / (counts - 1))
         mean = np.nan_to_num(np.where(counts > 0, means * counts, 0.0).sum(axis=0) / counts.sum(axis=0))
         apart = np.where(counts > 0, np.abs(means - mean), 0.0).max(axis=0)
@@ -121,8 +121,10 @@ def _scatter(table: Array) -> tuple[Array, Array]:
     Args:
         table: Deviations of consecutive windows from the mean, of shape (windows, size), NaN where unknown.
     """
-    known = ~np.isnan(table)
-    sums, counts = (np.pad(np.cumsum(a, axis=0), ((1, 0), (0, 0))) for a in (np.where(known, table, 0.0), known))
+    is_number = ~np.isnan(table)
+    sums, counts = (
+        np.pad(np.cumsum(a, axis=0), ((1, 0), (0, 0))) for a in (np.where(is_number, table, 0.0), is_number)
+    )
     once, ratio, length = np.zeros(table.shape[1]), np.ones(table.shape[1]), 1
     while length <= min(_LONGEST, len(table) // 8):
         square = ((sums[length:] - sums[:-length]) ** 2).sum(axis=0) / (counts[length:] - counts[:-length]).sum(axis=0)
@@ -130,8 +132,8 @@ def _scatter(table: Array) -> tuple[Array, Array]:
             once = np.nan_to_num(np.sqrt(square))
         else:
             error = np.sqrt(length / (3.0 * counts[-1]))
-            found = np.sqrt(square) / once
-            ratio = np.maximum(ratio, np.where(found > 1.0 + 3.0 * error, found * (1.0 + 2.0 * error), 1.0))
+            growth = np.sqrt(square) / once
+            ratio = np.maximum(ratio, np.where(growth > 1.0 + 3.0 * error, growth * (1.0 + 2.0 * error), 1.0))
         length *= 2
     return once, ratio
 
@@ -189,10 +191,10 @@ class Cusum:
 
     def update(self, z: Array) -> Array:
         """Return the larger of both sums after further values, of shape (size,); a NaN changes nothing."""
-        known = np.where(np.isnan(z), 0.0, z)
+        increments = np.where(np.isnan(z), 0.0, z)
         k = np.where(np.isnan(z), 0.0, self._allowance)
-        self.upper = np.clip(self.upper + known - k, 0.0, 2.0 * self.threshold)
-        self.lower = np.clip(self.lower - known - k, 0.0, 2.0 * self.threshold)
+        self.upper = np.clip(self.upper + increments - k, 0.0, 2.0 * self.threshold)
+        self.lower = np.clip(self.lower - increments - k, 0.0, 2.0 * self.threshold)
         return np.maximum(self.upper, self.lower)
 
 

@@ -185,7 +185,7 @@ class Comparison:
 
     def add(self, rows: Array) -> list[Window]:
         """Add rows, of shape (n, width), and return the windows that they complete."""
-        horizon, found = self._config.horizon, []
+        horizon, windows = self._config.horizon, []
         for row in rows:
             index = int(row[INDEX])
             if self._newest is not None and self._newest - horizon <= index <= self._newest:
@@ -199,10 +199,10 @@ class Comparison:
                 window = self._window(self._next)
                 self._next += horizon
                 if window is not None:
-                    found.append(window)
+                    windows.append(window)
                 oldest = self._next - max(self._config.delay, 1)
-                self._rows = {i: kept for i, kept in self._rows.items() if i >= oldest}
-        return found
+                self._rows = {i: values for i, values in self._rows.items() if i >= oldest}
+        return windows
 
     def _complete(self, index: int, late: Array) -> None:
         """Add late values to a row. Of two actuator commands for one period the second one acts."""
@@ -241,9 +241,9 @@ class Comparison:
         if not whole:
             self.skipped += 1
             return None
-        known = ~np.isnan(differences)
+        is_number = ~np.isnan(differences)
         with np.errstate(invalid="ignore"):
-            mean = np.where(known, differences, 0.0).sum(axis=0) / known.sum(axis=0)
+            mean = np.where(is_number, differences, 0.0).sum(axis=0) / is_number.sum(axis=0)
         return Window(float(self._rows[s + self._config.horizon][TIME]), mean)
 
     def _compare(self, s: int) -> tuple[Array, bool]:
@@ -266,12 +266,12 @@ class Comparison:
         if not self._started and s in self._rows:
             self._predictor.set_time(round(self._rows[s][TIME] / self._config.period) - 1)
             self._started = True
-        known = self._started
+        is_complete = self._started
         for age, addresses in self._predictor.estimates.items():
             row = self._rows.get(s + age)
             estimates = {} if row is None else {address: row[self._where.estimates[address]] for address in addresses}
             if not estimates or any(np.isnan(value).any() for value in estimates.values()):
-                known = False
+                is_complete = False
             else:
                 self._predictor.set_belief(age, estimates)
-        return known
+        return is_complete

@@ -202,8 +202,8 @@ class ResidualMonitor:
                 self.alarms.append(alarm)
                 _log.warning("%s", alarm)
                 continue
-            for k, known in enumerate(self.alarms):
-                if (known.signal, known.entry, known.began) == (alarm.signal, alarm.entry, alarm.began):
+            for k, listed in enumerate(self.alarms):
+                if (listed.signal, listed.entry, listed.began) == (alarm.signal, alarm.entry, alarm.began):
                     self.alarms[k] = alarm
 
     def _cause(self) -> str:
@@ -389,10 +389,10 @@ class Sampler:
         """
         times = {name: self._sensed[name].sent for name in cycle.fed}
         if any(map(isnan, times.values())):
-            known = [received.sent for received in self._sensed.values() if not isnan(received.sent)]
-            if not known:
+            sent_times = [received.sent for received in self._sensed.values() if not isnan(received.sent)]
+            if not sent_times:
                 return {cycle.number: list(times)}
-            times = {name: max(known) if isnan(sent) else sent for name, sent in times.items()}
+            times = {name: max(sent_times) if isnan(sent) else sent for name, sent in times.items()}
         oldest = min(times.values())
         if not self._first <= oldest:  # also at first, when it is NaN, and when the sender's time was set back
             self._first = oldest
