@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues, LeafSystem, System
 from pydrake.systems.primitives import Adder, Demultiplexer, Gain, ZeroOrderHold
 
-from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PENDULUM = "package://drake/examples/pendulum/Pendulum.urdf"
@@ -72,7 +72,7 @@ class PendulumScenario(Scenario):
         builder.sim_actuator("torque", plant.get_actuation_input_port())
 
 
-class SampledFeedback(LeafSystem):
+class SampledFeedback(AddressedSystem):
     """Discrete state feedback with a counter, in Python.
 
     .. pydrake_system::
@@ -86,27 +86,23 @@ class SampledFeedback(LeafSystem):
 
     def __init__(self, period: float) -> None:
         super().__init__()
-        gain = self.DeclareNumericParameter(BasicVector([0.0, 0.0, -3.0, -1.0]))
-        torque = self.DeclareDiscreteState(1)
-        ticks = self.DeclareDiscreteState(1)
+        self._settings = self.declare_parameters(
+            gain=Quantity([0.0, 0.0, -3.0, -1.0], "N m/rad, N m s/rad", (-1e3, 1e3))
+        )
+        self._command = self.declare_discrete_state(torque=Quantity(unit="N m"))
+        self._counter = self.declare_discrete_state(ticks=Quantity())
         self._state = self.DeclareVectorInputPort("joint_state", 4)
         self.DeclareVectorOutputPort(
             "torque",
             1,
             lambda context, output: output.SetFromVector(context.get_discrete_state(0).value()),
-            prerequisites_of_calc={self.discrete_state_ticket(torque)},
+            prerequisites_of_calc={self.discrete_state_ticket(self._command.index)},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.variables = (
-            parameter("gain", gain, shape=(4,), unit="N m/rad, N m s/rad", bounds=(-1e3, 1e3)),
-            discrete_state("torque", torque, unit="N m"),
-            discrete_state("ticks", ticks),
-        )
 
-    def _update(self, context: Context, discrete: object) -> None:
-        gain = context.get_numeric_parameter(0).value()
-        discrete.set_value(0, [gain @ self._state.Eval(context)])  # type: ignore[attr-defined]
-        discrete.set_value(1, context.get_discrete_state(1).value() + 1.0)  # type: ignore[attr-defined]
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+        self._command.mutable(discrete).torque = self._settings.view(context).gain @ self._state.Eval(context)
+        self._counter.mutable(discrete).ticks += 1.0
 
 
 @dataclass

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
+from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeIntegrator, ZeroOrderHold
 
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.state import discrete_state, parameter
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.001
@@ -61,7 +61,7 @@ class ScriptedBridge(Bridge):
         return ()
 
 
-class Servo(LeafSystem):
+class Servo(AddressedSystem):
     """A DPS: velocity = gain (target - position), sampled; it raises or commands NaN when it is told to.
 
     .. pydrake_system::
@@ -80,29 +80,23 @@ class Servo(LeafSystem):
         self._position = self.DeclareVectorInputPort("position", 2)
         self.DeclareVectorInputPort("speed", 2)
         self._target = self.DeclareVectorInputPort("target", 2)
-        gain = self.DeclareNumericParameter(BasicVector([5.0]))
-        trouble = self.DeclareNumericParameter(BasicVector([0.0]))
-        velocity, ticks, seen = (self.DeclareDiscreteState(size) for size in (2, 1, 2))
-        self.DeclareStateOutputPort("velocity", velocity)
+        self._gain = self.declare_parameters(gain=Quantity(5.0, "1/s", (0.0, 1e3)))
+        self._faults = self.declare_parameters(trouble=Quantity(bounds=(0.0, 2.0)))
+        self._command = self.declare_discrete_state(velocity=Quantity([0.0, 0.0], "m/s"))
+        self._counter = self.declare_discrete_state(ticks=Quantity())
+        self._sensed = self.declare_discrete_state(seen=Quantity([0.0, 0.0], "m"))
+        self.DeclareStateOutputPort("velocity", self._command.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
-        self.variables = (
-            parameter("gain", gain, unit="1/s", bounds=(0.0, 1e3)),
-            parameter("trouble", trouble, bounds=(0.0, 2.0)),
-            discrete_state("velocity", velocity, shape=(2,), unit="m/s"),
-            discrete_state("ticks", ticks),
-            discrete_state("seen", seen, shape=(2,), unit="m"),
-        )
 
     def _update(self, context: Context, discrete: Any) -> None:
-        (trouble,) = context.get_numeric_parameter(1).value()
+        trouble = self._faults.view(context).trouble
         if trouble == 1.0:
             raise RuntimeError("out of ideas")
-        (gain,) = context.get_numeric_parameter(0).value()
         position = self._position.Eval(context)
-        velocity = gain * (self._target.Eval(context) - position)
-        discrete.set_value(0, velocity if trouble == 0.0 else [np.nan, 0.0])
-        discrete.set_value(1, context.get_discrete_state(1).value() + 1.0)
-        discrete.set_value(2, position)
+        velocity = self._gain.view(context).gain * (self._target.Eval(context) - position)
+        self._command.mutable(discrete).velocity = velocity if trouble == 0.0 else [np.nan, 0.0]
+        self._counter.mutable(discrete).ticks += 1.0
+        self._sensed.mutable(discrete).seen = position
 
 
 @dataclass

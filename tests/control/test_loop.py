@@ -21,7 +21,7 @@ import lcm
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_command
-from pydrake.systems.framework import BasicVector, Context, System
+from pydrake.systems.framework import Context, System
 
 from tests.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
 from vtbdrake.control.guards import Guards
@@ -31,7 +31,7 @@ from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Freeze, InjectedFault, MachineProcess, Reorder
-from vtbdrake.state import parameter
+from vtbdrake.state import Quantity
 from vtbdrake.testbed import DpsAlone, Interface, Signal, VirtualTestbed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,11 +45,10 @@ class TroubledSwing(Swing):
 
     def __init__(self, period: float) -> None:
         super().__init__(period)
-        trouble = self.DeclareNumericParameter(BasicVector([0.0]))
-        self.variables = (parameter("trouble", trouble, bounds=(0.0, 2.0)),)
+        self._faults = self.declare_parameters(trouble=Quantity(bounds=(0.0, 2.0)))
 
     def _update(self, context: Context, discrete: Any) -> None:
-        (trouble,) = context.get_numeric_parameter(0).value()
+        trouble = self._faults.view(context).trouble
         if trouble == 1.0:
             raise RuntimeError("out of ideas")
         super()._update(context, discrete)

@@ -19,15 +19,14 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
 from pydrake.systems.primitives import PassThrough
 
 from vtbdrake.control.fallback import Brake, Fallback, Hold, gravity_compensation
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import HardwareSimScenario, Interface, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.005
@@ -68,7 +67,7 @@ def arm_plant() -> MultibodyPlant:
     return plant
 
 
-class Impedance(LeafSystem):
+class Impedance(AddressedSystem):
     """Torques on top of the gravity compensation of an arm, or positions, which follow a target.
 
     .. pydrake_system::
@@ -83,29 +82,25 @@ class Impedance(LeafSystem):
     The reference r moves to the target at `SPEED`; ``joint_torque`` is K (r - q) - D v, ``joint_position_command`` r.
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, interface: Interface) -> None:
         super().__init__()
         (command,) = interface.act
         for signal in (*interface.sense, *interface.commands):
             self.DeclareVectorInputPort(signal.name, JOINTS)
-        reference, torque = self.DeclareDiscreteState(HOME), self.DeclareDiscreteState(JOINTS)
-        self.DeclareStateOutputPort(command.name, torque if command.name == "joint_torque" else reference)
+        self._reference = self.declare_discrete_state(reference=Quantity(HOME, "rad"))
+        self._torque = self.declare_discrete_state(torque=Quantity(np.zeros(JOINTS), "N m"))
+        shown = self._torque if command.name == "joint_torque" else self._reference
+        self.DeclareStateOutputPort(command.name, shown.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
-        self.variables = (
-            discrete_state("reference", reference, shape=(JOINTS,), unit="rad"),
-            discrete_state("torque", torque, shape=(JOINTS,), unit="N m"),
-        )
 
     def _update(self, context: Context, discrete: Any) -> None:
         q, v, target = (
             self.GetInputPort(name).Eval(context) for name in ("joint_position", "joint_velocity", "target")
         )
-        before = context.get_discrete_state(0).value()
+        before = self._reference.view(context).reference
         reference = before + np.clip(target - before, -SPEED * PERIOD, SPEED * PERIOD)
-        discrete.set_value(0, reference)
-        discrete.set_value(1, STIFFNESS * (reference - q) - DAMPING * v)
+        self._reference.mutable(discrete).reference = reference
+        self._torque.mutable(discrete).torque = STIFFNESS * (reference - q) - DAMPING * v
 
 
 @dataclass

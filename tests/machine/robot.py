@@ -13,13 +13,14 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
+from pydrake.systems.framework import BasicVector, Context, System
 from pydrake.systems.primitives import Demultiplexer
 
 from tests.testbeds import ACROBOT
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.state import AddressedSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.001
@@ -28,7 +29,7 @@ STATUS, COMMAND = "IIWA_STATUS", "IIWA_COMMAND"
 SENSE = {"position": "joint_position_measured", "velocity": "joint_velocity_estimated"}
 
 
-class Swing(LeafSystem):
+class Swing(AddressedSystem):
     """Torque against the elbow's motion, and a rhythm; sampled.
 
     .. pydrake_system::

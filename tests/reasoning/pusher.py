@@ -8,7 +8,7 @@ from math import inf
 import numpy as np
 from drake import lcmt_acrobot_u, lcmt_acrobot_x, lcmt_scope
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import LinearSystem
 
 from vtbdrake.control import Zero
@@ -18,8 +18,7 @@ from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig
 from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.01
@@ -28,7 +27,7 @@ CANDIDATE = f"{PLANNER}.candidate"
 STATE = "sim.sys.mass.discrete_state_0"
 
 
-class Law(LeafSystem):
+class Law(AddressedSystem):
     """A spring and a damper to the set point; to the origin while there is no valid one.
 
     .. pydrake_system::
@@ -42,22 +41,19 @@ class Law(LeafSystem):
         - force
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self) -> None:
         super().__init__()
-        force = self.DeclareDiscreteState(1)
+        self._command = self.declare_discrete_state(force=Quantity(unit="N"))
         self._state = self.DeclareVectorInputPort("state", BasicVector(2))
         self._setpoint = self.DeclareVectorInputPort("setpoint", BasicVector(1))
         self._valid = self.DeclareVectorInputPort("valid", BasicVector(1))
-        self.DeclareStateOutputPort("force", force)
+        self.DeclareStateOutputPort("force", self._command.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
-        self.variables = (discrete_state("force", force, unit="N"),)
 
-    def _update(self, context: Context, discrete: object) -> None:
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
         x, v = self._state.Eval(context)
         (setpoint,), (valid,) = self._setpoint.Eval(context), self._valid.Eval(context)
-        discrete.set_value(0, [9.0 * (valid * setpoint - x) - 1.5 * v])  # type: ignore[attr-defined]
+        self._command.mutable(discrete).force = 9.0 * (valid * setpoint - x) - 1.5 * v
 
 
 def missed_by(state: np.ndarray, goal: float) -> float:

@@ -11,12 +11,11 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
 from pydrake.systems.primitives import LinearSystem
 
 from tests.testbeds import PENDULUM
-from vtbdrake.state import discrete_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.01
@@ -25,7 +24,7 @@ PERIOD = 0.01
 KILL, HANG = 2.25, 2.5
 
 
-class BangBang(LeafSystem):
+class BangBang(AddressedSystem):
     """Pushes with all its force until the switching time, then pulls with it, until twice that time.
 
     .. pydrake_system::
@@ -38,23 +37,17 @@ class BangBang(LeafSystem):
         - force
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, strength: float, *, ends: bool = True, treacherous: bool = False) -> None:
         super().__init__()
         self._strength, self._ends, self._treacherous = strength, ends, treacherous
-        # Force; the estimate of position and velocity.
-        force, estimate = self.DeclareDiscreteState(1), self.DeclareDiscreteState(2)
+        self._command = self.declare_discrete_state(force=Quantity(unit="N"))
+        self._position_and_velocity = self.declare_discrete_state(estimate=Quantity([0.0, 0.0], "m, m/s"))
         self._sensor = self.DeclareVectorInputPort("state", BasicVector(2))
         self._switch = self.DeclareVectorInputPort("switch", BasicVector(1))
-        self.DeclareStateOutputPort("force", force)
+        self.DeclareStateOutputPort("force", self._command.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
-        self.variables = (
-            discrete_state("force", force, unit="N"),
-            discrete_state("estimate", estimate, shape=(2,), unit="m, m/s"),
-        )
 
-    def _update(self, context: Context, discrete: object) -> None:
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
         (switch,) = self._switch.Eval(context)
         while self._treacherous and switch == HANG:
             time.sleep(1.0)
@@ -62,8 +55,8 @@ class BangBang(LeafSystem):
             os.kill(os.getpid(), signal.SIGKILL)
         t = context.get_time() + 1e-9
         force = self._strength * (1.0 if t < switch else -1.0 if t < 2.0 * switch or not self._ends else 0.0)
-        discrete.set_value(0, [force])
-        discrete.set_value(1, self._sensor.Eval(context))
+        self._command.mutable(discrete).force = force
+        self._position_and_velocity.mutable(discrete).estimate = self._sensor.Eval(context)
 
 
 @dataclass
@@ -97,10 +90,8 @@ class MassScenario(Scenario):
         builder.believe("sim.sys.mass.discrete_state_0", of=["dps.estimate"], age=PERIOD)
 
 
-class Fence(LeafSystem):
+class Fence(AddressedSystem):
     """Ends the simulation when the mass is past a position, in m."""
-
-    __slots__ = NO_DICT
 
     def __init__(self, position: float) -> None:
         super().__init__()

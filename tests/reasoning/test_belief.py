@@ -8,14 +8,14 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, LeafSystem
+from pydrake.systems.framework import BasicVector
 
 from tests.testbeds import PENDULUM, AcrobotScenario, PendulumScenario
 from vtbdrake.components.sensors import JointEncoders
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.reasoning import Belief, BeliefError, BeliefToStart
 from vtbdrake.rollout import ProcessExecutor, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
-from vtbdrake.state import discrete_state
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
@@ -24,7 +24,7 @@ ARM_MASS = "sim.sys.Pendulum.arm.mass"
 T = 0.02
 
 
-class Tracker(LeafSystem):
+class Tracker(AddressedSystem):
     """Estimates angle and rate from the last two angles, and commands no torque.
 
     .. pydrake_system::
@@ -38,18 +38,16 @@ class Tracker(LeafSystem):
 
     def __init__(self) -> None:
         super().__init__()
-        estimate, torque = self.DeclareDiscreteState(2), self.DeclareDiscreteState(1)
+        self._estimate = self.declare_discrete_state(angle=Quantity(unit="rad"), rate=Quantity(unit="rad/s"))
+        torque = self.DeclareDiscreteState(1)
         self._angle = self.DeclareVectorInputPort("angle", BasicVector(1))
         self.DeclareStateOutputPort("torque", torque)
         self.DeclarePeriodicDiscreteUpdateEvent(T, 0.0, self._update)
-        self.variables = (
-            discrete_state("angle", estimate, unit="rad"),
-            discrete_state("rate", estimate, start=1, unit="rad/s"),
-        )
 
     def _update(self, context, discrete):
         (angle,) = self._angle.Eval(context)
-        discrete.set_value(0, [angle, (angle - context.get_discrete_state(0)[0]) / T])
+        estimate = self._estimate.mutable(discrete)
+        estimate.angle, estimate.rate = angle, (angle - estimate.angle) / T
 
 
 @dataclass

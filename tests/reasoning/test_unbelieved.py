@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import LeafSystem
 from pydrake.systems.primitives import LinearSystem, ZeroOrderHold
 
 from vtbdrake.components.sensors import ErrorModel
@@ -14,7 +13,7 @@ from vtbdrake.optimization import Choice
 from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Quality
-from vtbdrake.state import discrete_state
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
@@ -35,25 +34,21 @@ class Encoder(SampledSensor):
         return self._port.Eval(context)
 
 
-class Odometer(LeafSystem):
+class Odometer(AddressedSystem):
     """Counts up the angles of the wheel, and drives at 1 m/s until the cart is at the goal."""
 
     def __init__(self) -> None:
         super().__init__()
         angle, goal = self.DeclareVectorInputPort("angle", 1), self.DeclareVectorInputPort("goal", 1)
-        speed, counted = self.DeclareDiscreteState(1), self.DeclareDiscreteState(2)
+        speed = self.DeclareDiscreteState(1)
+        counts = self.declare_discrete_state(place=Quantity(unit="m"), angle=Quantity(unit="rad"))
         self.DeclareStateOutputPort("speed", speed)
-        self.variables = (
-            discrete_state("place", counted, unit="m"),
-            discrete_state("angle", counted, start=1, unit="rad"),
-        )
 
         def update(context, state):
-            place, last = context.get_discrete_state(1).value()
-            (now,) = angle.Eval(context)
-            place += RADIUS * (now - last)
-            state.set_value(0, [1.0 if place < goal.Eval(context)[0] else 0.0])
-            state.set_value(1, [place, now])
+            (now,), counted = angle.Eval(context), counts.mutable(state)
+            counted.place += RADIUS * (now - counted.angle)
+            counted.angle = now
+            state.set_value(0, [1.0 if counted.place < goal.Eval(context)[0] else 0.0])
 
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, update)
 

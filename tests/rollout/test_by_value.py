@@ -12,21 +12,19 @@ ACROBOT = """
 from dataclasses import dataclass, field
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
-from pydrake.systems.framework import BasicVector, LeafSystem
 import vtbdrake as vtb
 from vtbdrake.components.sensors import ErrorModel, JointEncoders
-from vtbdrake.state import parameter
+from vtbdrake.state import AddressedSystem, Quantity
 
-class Spring(LeafSystem):
+class Spring(AddressedSystem):
     def __init__(self):
         super().__init__()
-        stiffness = self.DeclareNumericParameter(BasicVector([2.0]))
-        self.variables = (parameter("stiffness", stiffness, unit="N m/rad", bounds=(0.0, 100.0)),)    # dps.stiffness
+        self.settings = self.declare_parameters(stiffness=Quantity(2.0, "N m/rad", (0.0, 100.0)))     # dps.stiffness
         self.angles = self.DeclareVectorInputPort("joint_position", 2)
         self.DeclareVectorOutputPort("torque", 1, self.calc_torque)
 
     def calc_torque(self, context, output):
-        output.SetFromVector(-context.get_numeric_parameter(0).value() * self.angles.Eval(context)[1])
+        output.SetFromVector([-self.settings.view(context).stiffness * self.angles.Eval(context)[1]])
 
 @dataclass
 class Acrobot(vtb.Scenario):

@@ -10,14 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.common.value import Value
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import LeafSystem
 from pydrake.systems.primitives import ZeroOrderHold
 from scipy.special import ellipj, ellipk
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import Constraint, Quality, QualityError, RolloutRunner, RolloutTask
 from vtbdrake.rollout.quality import best_sample, exceeds
-from vtbdrake.state import discrete_state
+from vtbdrake.state import AddressedSystem, Quantity
 
 PERIOD = 0.1
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -198,17 +197,17 @@ def test_a_rollout_steps_like_a_simulation_with_events():
     assert result.quality[-1] == abs(testbed.read(context, SHOULDER))
 
 
-class Ticks(LeafSystem):
+class Ticks(AddressedSystem):
     """Counts unrestricted updates, whose period Drake does not tell."""
 
     def __init__(self, period):
         super().__init__()
-        self.variables = (discrete_state("ticks", self.DeclareDiscreteState(1)),)
+        self._counter = self.declare_discrete_state(ticks=Quantity())
         self.timings = ((period, 0.0),)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._count)
 
     def _count(self, context, state):
-        state.get_mutable_discrete_state(0).SetFromVector(context.get_discrete_state(0).value() + 1.0)
+        self._counter.mutable(state.get_mutable_discrete_state()).ticks += 1.0
 
 
 @dataclass

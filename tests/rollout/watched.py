@@ -7,13 +7,12 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Adder, FirstOrderLowPassFilter, Gain, ZeroOrderHold
 
 from tests.testbeds import ACROBOT, AcrobotScenario, SampledFeedback
 from vtbdrake.components.sensors import ErrorModel, SampledSensor
-from vtbdrake.state import discrete_state, parameter
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Signal
 from vtbdrake.testbed.slow_part import SlowPart
 
@@ -32,28 +31,25 @@ class Sight(SampledSensor):
         - sight
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self, body):
         errors = ErrorModel(noise=0.01, seed=7, latency=1)
         super().__init__(
             "sight", default=np.zeros(3), period=PERIOD, unit="m", noise={"noise": (3, "m")}, errors=errors
         )
         self._body = int(body)
-        self._place = int(self.DeclareNumericParameter(BasicVector(np.zeros(3))))
-        self.variables += (parameter("place", self._place, shape=(3,), unit="m"),)
+        self._settings = self.declare_parameters(place=Quantity(np.zeros(3), "m"))
         self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self.measured = 0  # counts calls: the result does not depend on it
 
     def _measure(self, context, state):
         self.measured += 1
         tip = self._poses.Eval(context)[self._body].translation()
-        place = context.get_numeric_parameter(self._place).value()
+        place = self._settings.view(context).place
         SECRET[0] = place[0]
         return tip - place
 
 
-class Memory(LeafSystem):
+class Memory(AddressedSystem):
     """Adds up what it is given, for ever.
 
     .. pydrake_system::
@@ -65,18 +61,15 @@ class Memory(LeafSystem):
         - y
     """
 
-    __slots__ = NO_DICT
-
     def __init__(self):
         super().__init__()
-        total = self.DeclareDiscreteState(1)
+        self._sum = self.declare_discrete_state(total=Quantity())
         self.DeclareVectorInputPort("u", 1)
-        self.DeclareStateOutputPort("y", total)
+        self.DeclareStateOutputPort("y", self._sum.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._add)
-        self.variables = (discrete_state("total", total),)
 
     def _add(self, context, state):
-        state.set_value(0, context.get_discrete_state(0).value() + self.EvalVectorInput(context, 0).value())
+        self._sum.mutable(state).total += self.EvalVectorInput(context, 0).value().item()
 
 
 # What a leaky feedback reads beside its ports: the last place of a sensor.

@@ -26,10 +26,9 @@ from vtbdrake.state import (
     VariableError,
     Variables,
     collect,
-    continuous_state,
-    parameter,
     snapshot,
 )
+from vtbdrake.state.declarations import CONTINUOUS, PARAMETER, Element
 
 
 @pytest.fixture
@@ -253,16 +252,9 @@ class Filter(LeafSystem):
         gain = self.DeclareNumericParameter(BasicVector([1.0, 2.0, 3.0]))
         state = self.DeclareContinuousState(2)
         self.variables = (
-            parameter("gain", gain, shape=(size,), start=1, unit="1/s", bounds=(0.0, 10.0)),
-            continuous_state("estimate", state, start=1, unit="m"),
+            Element("gain", PARAMETER, int(gain), (size,), start=1, unit="1/s", bounds=(0.0, 10.0)),
+            Element("estimate", CONTINUOUS, int(state), start=1, unit="m"),
         )
-
-
-def test_second_vector_of_continuous_state_is_rejected():
-    with pytest.raises(
-        ValueError, match=r"x: a system has one vector of continuous state, number 0, not 1: give start="
-    ):
-        continuous_state("x", 1)
 
 
 def test_declared_variables_reach_their_entries_only():
@@ -290,7 +282,7 @@ def test_a_declaration_beyond_the_group_is_refused():
 def test_a_vector_that_is_declared_as_one_number_is_refused():
     builder = DiagramBuilder()
     system = builder.AddNamedSystem("filter", Filter())
-    system.variables = (parameter("gain", 0),)
+    system.variables = (Element("gain", PARAMETER, 0),)
     with pytest.raises(ValueError, match=r"filter.gain is declared as one number, .* give shape=\(3,\)"):
         collect(builder.Build())
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import PoseRelay
-from vtbdrake.state import VariableError, discrete_state
+from vtbdrake.state import AddressedSystem, Quantity, VariableError
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.signal import SignalError
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
@@ -212,14 +212,13 @@ def test_a_command_can_come_from_a_system():
     assert "u.y" not in testbed.variables()
 
 
-class Estimator(LeafSystem):
+class Estimator(AddressedSystem):
     """A DPS that believes something."""
 
     def __init__(self):
         super().__init__()
         self.DeclareVectorInputPort("y", 2)
-        self.DeclareStateOutputPort("u", self.DeclareDiscreteState(np.array([0.4, 0.6])))
-        self.variables = (discrete_state("estimate", 0, shape=(2,)),)
+        self.DeclareStateOutputPort("u", self.declare_discrete_state(estimate=Quantity([0.4, 0.6])).index)
 
 
 def _believing(target="sim.sense.y.value", of=("dps.estimate",), by=None, **options):

@@ -8,9 +8,6 @@ from vtbdrake.state.declarations import (
     Element,
     NamedVector,
     Quantity,
-    continuous_state,
-    discrete_state,
-    parameter,
 )
 from vtbdrake.state.snapshot import Snapshot
 from vtbdrake.state.systems import collect
@@ -30,7 +27,4 @@ __all__ = [
     "VariableError",
     "Variables",
     "collect",
-    "continuous_state",
-    "discrete_state",
-    "parameter",
 ]

@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -369,42 +369,3 @@ class AddressedSystem(_LeafSystem):
     def _not_holding(self, argument: Any) -> Any:
         is_method = getattr(argument, "__self__", None) is self and hasattr(argument, "__func__")
         return weakly(self, argument.__func__) if is_method else argument
-
-
-class _Options(TypedDict, total=False):
-    shape: tuple[int, ...]
-    start: int
-    unit: str
-    bounds: tuple[ArrayLike, ArrayLike]
-
-
-def parameter(name: str, index: int, **options: Unpack[_Options]) -> Element:
-    """Name a piece of the numeric parameter group ``index``: part of a in s = [x, a].
-
-    Args:
-        name: Last part of the address.
-        index: Number of the group.
-        options: ``shape``, ``start``, ``unit`` and ``bounds``, see `Element`.
-    """
-    return Element(name, PARAMETER, int(index), **options)
-
-
-def discrete_state(name: str, index: int, **options: Unpack[_Options]) -> Element:
-    """Name a piece of the discrete state group ``index``: part of x in s = [x, a]; see `parameter`."""
-    return Element(name, DISCRETE, int(index), **options)
-
-
-def continuous_state(name: str, index: int = 0, **options: Unpack[_Options]) -> Element:
-    """Name a piece of the continuous state: part of x in s = [x, a]; see `parameter`.
-
-    Args:
-        name: Last part of the address.
-        index: What ``DeclareContinuousState`` returned: 0, as a system has one vector of continuous state.
-        options: See `parameter`; ``start`` tells where the piece begins in that vector.
-
-    Raises:
-        ValueError: The index is not 0.
-    """
-    if int(index) != 0:
-        raise ValueError(f"{name}: a system has one vector of continuous state, number 0, not {index}: give start=")
-    return Element(name, CONTINUOUS, 0, **options)

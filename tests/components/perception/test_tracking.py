@@ -9,13 +9,13 @@ import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from vtbdrake.components.perception.estimate import PoseEstimate, cross_matrix, rotation_matrix, rotation_vector
 from vtbdrake.components.perception.tracking import SPHERE, MotionModel, TargetTracker, Track, pose_of_state
-from vtbdrake.state.declarations import NO_DICT
+from vtbdrake.state import AddressedSystem
 
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.01, 0.01, 0.03]) ** 2
 COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-5
@@ -197,10 +197,8 @@ def test_deviations_are_those_of_the_predicted_covariance(inertia: list[float]) 
     assert model.deviations(track, 2.0) == pytest.approx(np.sqrt(variances[:2]), rel=0.02)
 
 
-class Source(LeafSystem):
+class Source(AddressedSystem):
     """Poses of a body that turns about z, measured every 0.2 s and told 0.15 s later; none after ``until``."""
-
-    __slots__ = NO_DICT
 
     def __init__(
         self, *, until: float = np.inf, offset: float = 0.0, flipped: float = np.inf, ahead: float = np.inf

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import (
@@ -20,8 +20,8 @@ from vtbdrake.components.world_model import (
     WorldObject,
     position_estimate,
 )
+from vtbdrake.state import AddressedSystem
 from vtbdrake.state.codecs import abstract_state
-from vtbdrake.state.declarations import NO_DICT
 
 
 def tree(identity: str, xyz: list[float], *, diameter: float = 0.3, **fields: object) -> WorldObject:
@@ -157,10 +157,9 @@ def test_codec_is_exact() -> None:
     assert len(WORLD_MODEL_CODEC.decode(WORLD_MODEL_CODEC.encode(WorldModel()))) == 0
 
 
-class Keeper(LeafSystem):
+class Keeper(AddressedSystem):
     """A DPS's environment: a world model as abstract state."""
 
-    __slots__ = NO_DICT
     codecs: ClassVar = {0: WORLD_MODEL_CODEC}
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 from pydrake.systems.primitives import ZeroOrderHold
 
 from vtbdrake.components.localization.dead_reckoning import deskewed
@@ -18,7 +18,7 @@ from vtbdrake.components.localization.planar import inverse, transform
 from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.scan import Scan
-from vtbdrake.state import discrete_state
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.scenario import ForestScenario
@@ -53,7 +53,7 @@ def pose(time: float) -> np.ndarray:
     return motion()[round(time / PERIOD * _FINE), :3]
 
 
-class Ride(LeafSystem):
+class Ride(AddressedSystem):
     """Sensors on a carrier that moves as `motion` says.
 
     .. pydrake_system::
@@ -69,12 +69,11 @@ class Ride(LeafSystem):
     def __init__(self, scenario: RidingScenario) -> None:
         super().__init__()
         self._scenario, self._trees = scenario, map_landmarks(scenario.truth()).positions
-        imu = self.DeclareDiscreteState(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
-        odometry = self.DeclareDiscreteState(1)
+        self._imu = self.declare_discrete_state(imu=Quantity([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]))
+        self._odometry = self.declare_discrete_state(odometry=Quantity())
         scan = self.DeclareAbstractState(Value(Scan.empty()))
-        for name, index in {"imu": imu, "odometry": odometry, "scan": scan}.items():
+        for name, index in {"imu": self._imu.index, "odometry": self._odometry.index, "scan": scan}.items():
             self.DeclareStateOutputPort(name, index)
-        self.variables = (discrete_state("imu", imu, shape=(6,)), discrete_state("odometry", odometry))
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._sample)
 
     def _sample(self, context: Context, state: State) -> None:
@@ -86,8 +85,8 @@ class Ride(LeafSystem):
         sample = [0.0, 0.0, rate, change[0] - rate * aside, change[1] + rate * ahead, 9.81, now[3]]
         if self._scenario.broken >= 0 and 100 <= tick < 105:
             sample[self._scenario.broken] = np.nan
-        numbers.set_value(0, sample[:6])
-        numbers.set_value(1, sample[6:])
+        self._imu.mutable(numbers).imu = sample[:6]
+        self._odometry.mutable(numbers).odometry = sample[6]
         if tick and tick % round(SCAN_PERIOD / PERIOD) == 0 and tick * PERIOD < self._scenario.dead_from:
             state.get_mutable_abstract_state(0).set_value(self._scan(tick))
 

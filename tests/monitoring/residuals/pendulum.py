@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, System
+from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
 from tests.testbeds import PENDULUM
@@ -17,14 +17,14 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.machine import Machine, MachineConfig
-from vtbdrake.state import discrete_state
+from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.1
 PAYLOAD, MASS = "sim.sys.Pendulum.arm_com.mass", 0.5
 
 
-class Rhythm(LeafSystem):
+class Rhythm(AddressedSystem):
     """A torque over time with damping; its state has the last sensor values.
 
     .. pydrake_system::
@@ -41,16 +41,15 @@ class Rhythm(LeafSystem):
         super().__init__()
         self._position = self.DeclareVectorInputPort("position", 1)
         self._velocity = self.DeclareVectorInputPort("velocity", 1)
-        torque = self.DeclareDiscreteState(BasicVector([0.0]))
-        seen = self.DeclareDiscreteState(BasicVector([0.0, 0.0]))
-        self.DeclareStateOutputPort("torque", torque)
+        self._command = self.declare_discrete_state(torque=Quantity())
+        self._sensed = self.declare_discrete_state(seen=Quantity([0.0, 0.0]))
+        self.DeclareStateOutputPort("torque", self._command.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.variables = (discrete_state("torque", torque), discrete_state("seen", seen, shape=(2,)))
 
     def _update(self, context: Context, discrete: Any) -> None:
         q, v = self._position.Eval(context), self._velocity.Eval(context)
-        discrete.set_value(0, 2.0 * np.sin(1.5 * context.get_time()) - 0.5 * v)
-        discrete.set_value(1, np.concatenate((q, v)))
+        self._command.mutable(discrete).torque = 2.0 * np.sin(1.5 * context.get_time()) - 0.5 * v.item()
+        self._sensed.mutable(discrete).seen = np.concatenate((q, v))
 
 
 @dataclass

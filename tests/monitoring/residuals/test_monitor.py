@@ -18,7 +18,7 @@ from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPen
 from vtbdrake.deployment import Deployment
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
 from vtbdrake.monitoring.residuals.alarms import CalibrationError
-from vtbdrake.state import parameter
+from vtbdrake.state import Quantity
 from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
 
 TOLERANCE = {"sense.position": 1e-4, "sense.velocity": 1e-3, "act.torque": 1e-3}
@@ -203,12 +203,11 @@ class Moody(Rhythm):
 
     def __init__(self) -> None:
         super().__init__(PERIOD)
-        mood = self.DeclareNumericParameter(BasicVector([1.0]))
+        self._settings = self.declare_parameters(mood=Quantity(1.0))
         self.DeclareVectorOutputPort("wish", 1, self._wish)
-        self.variables = (*self.variables, parameter("mood", mood))
 
     def _wish(self, context: Context, output: BasicVector) -> None:
-        if not context.get_numeric_parameter(0).value()[0]:
+        if not self._settings.view(context).mood:
             raise RuntimeError("not in the mood")
         output.SetFromVector(context.get_discrete_state(0).value())
 
