@@ -108,7 +108,7 @@ class Bridge(ABC):
 
     @property
     def foreign(self) -> int:
-        """Number of other publishers' commands heard on the own channels, or rejected there by a hub."""
+        """Return the number of other publishers' commands heard on the own channels, or rejected there by a hub."""
         return 0
 
     @property

@@ -1,11 +1,12 @@
-"""Clocks of a loop: the wall clock, and a simulated one for tests."""
+"""Clocks of a loop: the wall clock, and a simulated one for tests; a throttle by such a clock."""
 
 from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import inf, isfinite
+from typing import Any
 
 
 class Clock(ABC):
@@ -88,6 +89,27 @@ class SimulatedClock(Clock):
 
     def advance(self, seconds: float) -> None:
         """Advance the time, as work does."""
-        if not 0.0 <= seconds < float("inf"):
+        if not 0.0 <= seconds < inf:
             raise ValueError(f"time advances by a finite number of seconds from 0 on, not by {seconds}")
         self._now += seconds
+
+
+class Throttle:
+    """Calls a function at most once per period, such as one that logs what could be logged in every cycle.
+
+    Args:
+        clock: The clock of the period.
+        period: The shortest time between two calls, in seconds.
+    """
+
+    def __init__(self, clock: Clock, *, period: float = 1.0) -> None:
+        self._clock = clock
+        self._period = period
+        self._called_at = -inf
+
+    def __call__(self, function: Callable[..., object], *arguments: Any) -> None:
+        """Call ``function(*arguments)``, unless the last call was less than a period ago."""
+        now = self._clock.now()
+        if now - self._called_at >= self._period:
+            self._called_at = now
+            function(*arguments)

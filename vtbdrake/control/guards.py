@@ -151,17 +151,17 @@ class Guards:
 
     @property
     def latched(self) -> tuple[Fault, ...]:
-        """The faults that latched; empty while the DPS commands."""
+        """Return the faults that latched; empty while the DPS commands."""
         return self._latched
 
     @property
     def driven(self) -> frozenset[str]:
-        """The actuator signals that were on real in the last cycle."""
+        """Return the actuator signals that were on real in the last cycle."""
         return frozenset(self._active)
 
     @property
     def leaving(self) -> frozenset[str]:
-        """The actuator signals that have left real, and that their fallbacks still command."""
+        """Return the actuator signals that have left real, and that their fallbacks still command."""
         return frozenset(self._leaving)
 
     def start(self, name: str, value: Any) -> None:

@@ -187,7 +187,7 @@ cdef class RateLimiter:
 
     @property
     def counts(self):
-        """Effect of each limit by its name (``range`` includes stopping before its end), as `LimitCount`.
+        """Return the effect of each limit by its name (``range`` includes stopping before its end), as `LimitCount`.
 
         An entry that is changed by several limits counts for the last of rate, acceleration and range.
         """
@@ -199,7 +199,7 @@ cdef class RateLimiter:
 
     @property
     def last_sent(self):
-        """The last sent command, shape (size,); None if there is neither a start nor a command."""
+        """Return the last sent command, shape (size,); None if there is neither a start nor a command."""
         return np.array(self.state[0]) if self.has_start else None
 
     def start_from(self, value):

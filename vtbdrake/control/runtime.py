@@ -15,7 +15,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
+from vtbdrake.control.clock import Clock, SimulatedClock, Throttle, WallClock
 from vtbdrake.control.guards import MOST_UNSENT, Guards
 from vtbdrake.control.pace import PaceMonitor
 from vtbdrake.control.slow_parts import SlowParts
@@ -38,7 +38,6 @@ from vtbdrake.testbed.testbed import Positions
 
 _log = logging.getLogger(__name__)
 
-_LOG_PERIOD = 1.0  # s, for messages that could be logged in every cycle
 _MOST_POLLS = 100  # of what has waited while the loop was held up
 _KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
 _WAIT = 0.1  # s, for newer samples after a pause
@@ -161,7 +160,7 @@ class Runtime(Stepped):
         self._stop = threading.Event()
         self.uncompared: set[str] = set()
         self._foreign = bridge.foreign
-        self._logged_foreign = -inf
+        self._log_foreign = Throttle(self.clock)
         self.slow_parts = SlowParts(
             slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.note_change
         )
@@ -404,15 +403,12 @@ class Runtime(Stepped):
 
     def _note_foreign(self) -> None:
         """Count other publishers' commands while this loop commands, and log them at most once per second."""
-        foreign, now = self.bridge.foreign, self.clock.now()
-        new, self._foreign = foreign - self._foreign, foreign
+        new, self._foreign = self.bridge.foreign - self._foreign, self.bridge.foreign
         if not self.active:
             return  # This loop only listens to the one that commands.
         self.statistics.foreign += new
-        if now - self._logged_foreign >= _LOG_PERIOD:
-            self._logged_foreign = now
-            reason = self.bridge.competing_publisher or "another publisher commands the machine"
-            _log.error("ALARM: %s (heard so far: %d)", reason, self.statistics.foreign)
+        reason = self.bridge.competing_publisher or "another publisher commands the machine"
+        self._log_foreign(_log.error, "ALARM: %s (heard so far: %d)", reason, self.statistics.foreign)
 
     def leave(self, reason: str) -> None:
         """Latch the guards, and let the fallbacks command without the DPS, as the last commands of a loop that ends.
@@ -502,10 +498,9 @@ class Runtime(Stepped):
             raise ValueError(f"timeout must be a number of seconds, not {timeout}")
         report = report or partial(_log.info, "waiting: %s")
         begin = self.clock.now()
-        reported = -inf
+        throttle = Throttle(self.clock)
 
-        def taken() -> bool:
-            nonlocal reported
+        def is_on_real() -> bool:
             preparation = self.prepare("real")
             if not preparation.reasons:
                 self.perform(preparation)
@@ -513,12 +508,10 @@ class Runtime(Stepped):
             waited = self.clock.now() - begin
             if waited >= timeout:
                 raise SwitchRefusedError(f"after {waited:.1f} s: {'; '.join(preparation.reasons)}")
-            if waited >= reported + _LOG_PERIOD:
-                reported = waited
-                report("; ".join(preparation.reasons))
+            throttle(report, "; ".join(preparation.reasons))
             return False
 
-        self.run(until=taken)
+        self.run(until=is_on_real)
         if self.pace is not None:
             # At once: a machine in lock-step sends nothing new before it gets an actuator command.
             self.cycle()

@@ -6,14 +6,13 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any
 
 from pydrake.systems.framework import Context
 
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
-from vtbdrake.control.clock import Clock
+from vtbdrake.control.clock import Clock, Throttle
 from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, supervise
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import RESULT as CHANGE
@@ -25,7 +24,6 @@ _log = logging.getLogger(__name__)
 
 # Relative to a period: the end of a step is a sum of floating-point numbers, and a result may be due just then.
 _ROUNDING = 1e-6
-_LOG_PERIOD = 1.0  # s, for messages that could be logged with every sample
 
 
 @dataclass
@@ -153,7 +151,7 @@ class _Part:
         self._requested_at = 0.0
         self._ready = False
         self._last_failure = ""
-        self._logged_missed = -inf
+        self._log_missed = Throttle(clock)
         self._answers: list[tuple[str, Any]] = []
         name = f"the supervisor of the slow part {path}"
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
@@ -165,10 +163,10 @@ class _Part:
         overdue = [tick for tick in self._waiting if self._part.due(tick) <= end]
         for tick in overdue:
             self._miss(tick)
-        if overdue and self._clock.now() - self._logged_missed >= _LOG_PERIOD:
-            self._logged_missed = self._clock.now()
+        if overdue:
             reason = "" if self._ready else ": its process is not ready yet"
-            _log.warning(
+            self._log_missed(
+                _log.warning,
                 "the slow part %s has no result within its latency of %g s%s (missed so far: %d)",
                 *(self.path, self._part.latency, reason, self.statistics.missed),
             )

@@ -67,7 +67,7 @@ class Histogram:
 
     @property
     def mean(self) -> float:
-        """Mean duration in seconds; NaN if there is none."""
+        """Return the mean duration in seconds; NaN if there is none."""
         return self.total / self.count if self.count else nan
 
     def percentile(self, percent: float) -> float:
@@ -214,15 +214,15 @@ class LoopStatistics:
 
     @property
     def cycles(self) -> int:
-        """Number of recorded cycles."""
+        """Return the number of recorded cycles."""
         return self.histograms["cycle"].count
 
     @property
     def level(self) -> str:
-        """The worst so far.
+        """Return the worst level so far.
 
-        ``error`` or ``warning`` if a duration exceeded such a threshold, ``error`` if the pace was another than the
-        period, otherwise ``ok``.
+        It is ``error`` or ``warning`` if a duration exceeded such a threshold, ``error`` if the pace was another than
+        the period, otherwise ``ok``.
         """
         thresholds = self.thresholds.values()
         if self.off_pace or any(t.errors for t in thresholds):

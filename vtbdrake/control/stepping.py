@@ -176,7 +176,7 @@ class Stepped:
 
     @property
     def context(self) -> Context:
-        """The target's context. While cycles run, only their thread may touch it."""
+        """Return the target's context. While cycles run, only their thread may touch it."""
         return self._context
 
     def step(self) -> tuple[BaseException | None, dict[str, Any]]:
