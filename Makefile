@@ -15,8 +15,8 @@ STAMP := $(VENV)/.vtbdrake-installed
 ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
-# What is compiled.
-SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd')
+# What is compiled, and what lcm-gen makes modules of.
+SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
 .PHONY: help python setup demo demo-control test check answers bench clean stale
@@ -70,5 +70,5 @@ stale:
 clean:
 	rm -rf .venv .venv-* build dist *.egg-info out answers.json benchmarks/results.json
 	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache
-	find vtbdrake -name '*.so' -delete
+	find vtbdrake \( -name '*.so' -o -name 'lcmt_vtb_*.py' \) -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,7 @@
-"""What pyproject.toml cannot say: every .pyx of both packages becomes a compiled module, with numpy at hand."""
+"""What pyproject.toml cannot say: every .pyx of both packages is compiled, and lcm-gen makes modules of every .lcm."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,19 @@ _SOURCES, _DECLARATIONS = (
 
 # The part that Cython would repeat in every module: compiled once, it saves a third of the time.
 _SHARED = "vtbdrake._cyutility"
+
+
+def make_message_types(source: Path) -> None:
+    """Make the Python modules of an .lcm file beside it, by the lcm-gen of the wheel `lcm`, where they are older."""
+    program = "import sys, lcm; sys.exit(lcm.run_script('lcm-gen', sys.argv[1:]))"
+    options = ["--lazy", "--python", "--python-no-init", "--ppath", str(source.parent)]
+    made = subprocess.run([sys.executable, "-c", program, *options, str(source)])
+    if made.returncode != 0:
+        raise SystemExit(f"lcm-gen makes no modules of {source}, see above; it needs GLib (Debian's libglib2.0-0)")
+
+
+for path in sorted((_ROOT / "vtbdrake").rglob("*.lcm")):
+    make_message_types(path)
 
 setup(
     ext_modules=[

@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMPILED = sorted(
     path.relative_to(ROOT) for package in ("vtbdrake", "vtbdrake_diagrams") for path in (ROOT / package).rglob("*.pyx")
 )
+MESSAGE_TYPES = [path.relative_to(ROOT) for path in (ROOT / "vtbdrake").rglob("lcmt_vtb_*.py")]
 EXT_SUFFIX = get_config_var("EXT_SUFFIX")
 SHARED = Path("vtbdrake/_cyutility")  # Cython's own part of all modules
 
@@ -33,10 +34,10 @@ def run(*arguments: str, cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy, modules compiled in place included: a build leaves its folders where it runs."""
+    """A copy, modules compiled in place included, those of lcm-gen not: a build leaves its folders where it runs."""
     folder = tmp_path_factory.mktemp("build") / "checkout"
     for name in ("vtbdrake", "diagrams"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "lcmt_vtb_*.py"))
     (folder / "vtbdrake_diagrams").symlink_to((ROOT / "vtbdrake_diagrams").readlink())
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
@@ -45,10 +46,10 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def files(checkout: Path) -> set[str]:
-    """The files of both packages, as they are kept in the repository."""
+    """The files of both packages, as they are kept in the repository, and what lcm-gen makes in a build."""
     folders = (checkout / "vtbdrake", checkout / "vtbdrake_diagrams")
     paths = [path for folder in folders for path in folder.rglob("*") if path.is_file() and path.suffix != ".so"]
-    return {path.relative_to(checkout).as_posix() for path in paths}
+    return {path.relative_to(checkout).as_posix() for path in paths} | {path.as_posix() for path in MESSAGE_TYPES}
 
 
 @pytest.fixture(scope="module")

@@ -151,7 +151,7 @@ say "installing into $venv for Python $version with $constraints (a minute or tw
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
 pip() { "$venv/bin/python" -m pip --quiet --disable-pip-version-check "$@"; }
 # The build tools come first and in their tested versions, so that the build needs no environment of its own.
-pip install --constraint "$constraints" setuptools Cython numpy
+pip install --constraint "$constraints" setuptools Cython numpy lcm
 rm -rf build/*"-$("$venv/bin/python" -c 'import sys; print(sys.implementation.cache_tag)')"
 pip install --constraint "$constraints" --no-build-isolation --editable ".[$EXTRAS]" ||
     fail "vtbdrake does not compile, or what it depends on does not install, see above"

@@ -9,8 +9,8 @@ import struct
 
 class lcmt_vtb_log(object):
     """
-    What a recorder writes of a control loop, beside the raw messages. The Python modules beside this file are made by
-    lcm-gen --python --python-no-init --ppath . vtb_log.lcm
+    What a recorder writes of a control loop, beside the raw messages. When the package is built, lcm-gen makes the Python
+    modules beside this file; for other languages, it is run by hand.
     Times called utime are in microseconds since 1970, those called now and time in seconds.
     VTB_LOG, the first event.
     """
