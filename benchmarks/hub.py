@@ -119,7 +119,7 @@ def _own_client(url: str) -> Iterator[Callable[[], None]]:
         def turn() -> None:
             connection.publish(messages)
             select.select([connection], [], [])
-            connection.take(1)
+            connection.receive(1)
 
         yield turn
 

@@ -110,7 +110,7 @@ class Deployment:
                 or a silent machine would not be noticed.
         """
         if self.protocol is not None:
-            self.protocol.check(interface)
+            self.protocol.check_interface(interface)
         names = [signal.name for signal in interface.sense]
         if self.pace and self.pace not in names:
             raise ValueError(f"a loop is paced by a sensor signal ({', '.join(names)}), not by {self.pace!r}")

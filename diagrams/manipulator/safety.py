@@ -61,7 +61,7 @@ class FloatInPlace(Fallback):
         self._stiffness, self._damping = (np.array(gains[name][0]) for name in ("stiffness", "damping"))
         self.begin()
 
-    def check(self, signal: Signal, *, interface: Interface) -> None:
+    def check_signal(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense}
         if signal.size != JOINTS or any(sizes.get(name) != JOINTS for name in (POSITION, VELOCITY)):
             raise ValueError(

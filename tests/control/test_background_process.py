@@ -44,7 +44,7 @@ def taken(worker, count):
     while len(frames) < count:
         worker.flush()
         ready, _, _ = select.select((worker,), (), (), 0.05)
-        frames += worker.take_frames() if ready else []
+        frames += worker.pop_frames() if ready else []
         assert time.monotonic() < end, f"{len(frames)} frames of {count} came back"
     return frames
 
@@ -57,7 +57,7 @@ def test_frames_return_whole_and_in_order():
         back = []
         for frame in sent:
             assert worker.post_frame(frame[:10], frame[10:])
-            back += worker.take_frames()
+            back += worker.pop_frames()
         back += taken(worker, len(sent) - len(back))
         assert back == sent and worker.dropped == 0
     finally:
@@ -69,7 +69,7 @@ def test_close_sends_what_waits():
     for _ in range(100):
         assert worker.post_frame(bytes(100_000))
     assert worker.close() == 0
-    assert worker.take_frames() == [b"10000000"]
+    assert worker.pop_frames() == [b"10000000"]
 
 
 def test_close_receives_what_a_blocked_worker_sends():
@@ -78,7 +78,7 @@ def test_close_receives_what_a_blocked_worker_sends():
     for frame in frames:
         assert worker.post_frame(frame)
     assert worker.close() == 0
-    assert worker.take_frames() == frames
+    assert worker.pop_frames() == frames
 
 
 def test_long_frames_are_sent_in_pieces():
@@ -89,7 +89,7 @@ def test_long_frames_are_sent_in_pieces():
         waiting.append(worker.unsent)
         worker.flush()
     assert worker.close() == 0
-    assert worker.take_frames() == [b"1048576"]
+    assert worker.pop_frames() == [b"1048576"]
     assert np.diff(waiting, prepend=1 << 20).min() >= -(1 << 18)
 
 
@@ -107,7 +107,7 @@ def test_killed_worker_is_noticed_and_drops_are_counted():
     assert taken(worker, 1) == [b"hello"]
     os.kill(worker.pid, signal.SIGKILL)
     select.select((worker,), (), (), TIMEOUT)
-    assert worker.take_frames() == [] and not worker.alive
+    assert worker.pop_frames() == [] and not worker.alive
     assert not worker.post_frame(b"again") and worker.dropped == 1
     assert worker.close() == -signal.SIGKILL
 
@@ -115,7 +115,7 @@ def test_killed_worker_is_noticed_and_drops_are_counted():
 def test_end_of_the_worker_is_logged_once(caplog):
     worker = BackgroundProcess(fail, 3, name="failure")
     assert worker.wait_for_messages(TIMEOUT) == []
-    assert worker.take_frames() == worker.take_frames() == [] and not worker.alive
+    assert worker.pop_frames() == worker.pop_frames() == [] and not worker.alive
     assert caplog.text.count(f"failure (process {worker.pid}) is lost: ") == 1
     assert worker.close() == 3
 

@@ -50,7 +50,7 @@ class Loop:
         if not self.silent:
             for signal in self.received.values():
                 signal.arrived, signal.count = self.now, signal.count + 1
-        return self.guards.check(self.now, self.received, commands, **options)
+        return self.guards.judge(self.now, self.received, commands, **options)
 
     def lose(self, commands: Mapping[str, Any]) -> Verdict:
         """Run a cycle whose torques do not leave."""
@@ -195,7 +195,7 @@ def test_refused_reset_does_not_accept_level_after_jump() -> None:
 
 def test_sensor_on_sim_is_not_monitored() -> None:
     loop = Loop(TORQUE)
-    assert loop.guards.check(5.0, {}, {"torque": [0.0, 0.0]}).ok
+    assert loop.guards.judge(5.0, {}, {"torque": [0.0, 0.0]}).ok
 
 
 def test_fault_of_one_signal_activates_all_fallbacks() -> None:
@@ -433,7 +433,7 @@ def test_fallback_gets_no_sample_of_a_sensor_that_has_never_arrived(arrived: flo
 def test_fallback_gets_real_sensors_while_dps_uses_sim() -> None:
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
     sensed = {"velocity": ReceivedSignal(value=np.array([2.0, -2.0]), arrived=T, count=1)}
-    verdict = loop.guards.check(T, {}, {"torque": [nan, nan]}, others=sensed)
+    verdict = loop.guards.judge(T, {}, {"torque": [nan, nan]}, others=sensed)
     assert verdict.actuation["torque"] == pytest.approx([-0.1, 0.1])
 
 

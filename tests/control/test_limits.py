@@ -284,7 +284,7 @@ def test_abstract_signal_is_remembered_without_limits() -> None:
     with pytest.raises(ActuationError):
         one.limit(None)
     one.limit("dim")
-    one.take_back()
+    one.retract()
     assert one.last_sent == "on"
     one.release()
     assert not one.has_start
@@ -304,7 +304,7 @@ def test_bounds_agree_with_numpy(lower: list[float], entries: list[float], upper
     expected = (
         "" if finite and ((lower <= entries) & (entries <= upper)).all() else "limits" if finite else "not finite"
     )
-    assert bounds.check(np.array(entries)) == expected
+    assert bounds.violation(np.array(entries)) == expected
 
 
 @pytest.mark.parametrize(
@@ -324,13 +324,13 @@ def test_bounds_agree_with_numpy(lower: list[float], entries: list[float], upper
     ],
 )
 def test_bounds_convert_other_arrays(value: Any, problem: str) -> None:
-    assert Bounds(Signal("a", size=2, lower=-1.0, upper=1.0)).check(value) == problem
+    assert Bounds(Signal("a", size=2, lower=-1.0, upper=1.0)).violation(value) == problem
 
 
 def test_read_only_array_is_a_value() -> None:
     value = np.ones(2)
     value.flags.writeable = False
-    assert Bounds(Signal("a", size=2)).check(value) == ""
+    assert Bounds(Signal("a", size=2)).violation(value) == ""
     assert RateLimiter(signal(2), period=T).limit(value).tolist() == [1.0, 1.0]
 
 
@@ -338,12 +338,12 @@ def test_read_only_array_is_a_value() -> None:
     ("value", "problem"), [([1.0], ""), ([1.5], "limits"), ([nan], "not finite"), ([1, 1], "size")]
 )
 def test_bounds_of_a_single_entry_are_checked(value: list[float], problem: str) -> None:
-    assert Bounds(signal(1, lower=-1.0, upper=1.0)).check(value) == problem
+    assert Bounds(signal(1, lower=-1.0, upper=1.0)).violation(value) == problem
 
 
 def test_abstract_value_has_its_type() -> None:
     bounds = Bounds(Signal("picture", model_value="", idle=""))
-    assert [bounds.check(value) for value in ("cat", 1.0)] == ["", "type"]
+    assert [bounds.violation(value) for value in ("cat", 1.0)] == ["", "type"]
 
 
 def test_bounds_of_equal_signals_are_equal() -> None:
@@ -386,7 +386,7 @@ def test_command_taken_back_leaves_no_trace(commands: list[tuple[float, bool]]) 
         if leaves:
             assert other.limit([command]) == sent
         else:
-            one.take_back()
+            one.retract()
         assert one.last_sent == other.last_sent
 
 

@@ -321,7 +321,7 @@ def test_commands_once_per_period_are_limited_as_without_times() -> None:
         commands = []
         for k in range(200):
             wanted = {"velocity": np.sin(0.02 * k * np.array([1.0, 3.0]))}
-            verdict = guards.check(0.0, received, wanted, at=at + k * PERIOD)
+            verdict = guards.judge(0.0, received, wanted, at=at + k * PERIOD)
             commands.append(verdict.actuation["velocity"])
         sent.append(commands)
     assert np.array_equal(*sent)

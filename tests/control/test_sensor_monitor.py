@@ -12,7 +12,7 @@ from vtbdrake.control.fault import Fault
 from vtbdrake.control.limits import Bounds
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.sensor_monitor import SensorMonitor
-from vtbdrake.control.staleness import check_all
+from vtbdrake.control.staleness import faults_at
 from vtbdrake.testbed import Signal
 
 
@@ -25,14 +25,14 @@ def received(value: object, arrived: float = 0.0, count: int = 1) -> ReceivedSig
 
 
 def kind(monitor: SensorMonitor, now: float, signal: ReceivedSignal) -> str | None:
-    fault = monitor.check(now, signal)
+    fault = monitor.fault_at(now, signal)
     return fault and fault.kind
 
 
 @pytest.mark.parametrize("max_age", [0.05, inf])
 def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
     monitor = SensorMonitor(Signal("encoders", size=2, max_age=max_age))
-    fault = monitor.check(7.0, ReceivedSignal())
+    fault = monitor.fault_at(7.0, ReceivedSignal())
     assert (fault.kind, fault.signal, fault.time) == ("stale", "encoders", 7.0)
     assert "never arrived" in str(fault)
 
@@ -40,7 +40,7 @@ def test_signal_that_never_arrived_is_stale(max_age: float) -> None:
 def test_signal_is_stale_beyond_max_age() -> None:
     monitor, sample = SensorMonitor(signal()), received(np.zeros(2), arrived=1.0)
     assert kind(monitor, 1.0499, sample) is None
-    fault = monitor.check(1.0625, sample)
+    fault = monitor.fault_at(1.0625, sample)
     assert fault.kind == "stale" and fault.reason == "sensor signal encoders is stale: 62.5 ms old, 50 allowed"
     sample.arrived, sample.count = 1.0625, 2
     assert kind(monitor, 1.0625, sample) is None
@@ -51,7 +51,7 @@ def test_stale_signal_tells_which_messages_were_rejected() -> None:
     for _ in range(3):
         sample.reject("not finite")
     reason = "sensor signal encoders has never arrived; messages rejected so far: 3 not finite"
-    assert monitor.check(1.0, sample).reason == reason
+    assert monitor.fault_at(1.0, sample).reason == reason
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
@@ -101,7 +101,7 @@ def test_jump_is_measured_from_last_accepted_sample() -> None:
 
 def test_repeated_false_level_is_not_accepted() -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
-    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor.fault_at(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 500):
         assert kind(monitor, 0.001 * k, received(np.full(2, 0.1), 0.001 * k, k)) == "jump"
     assert monitor.value.tolist() == [0.0, 0.0]
@@ -119,14 +119,14 @@ def test_true_samples_among_false_ones_are_accepted() -> None:
 @pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
 def test_steady_level_after_jump_can_be_accepted(swing: float, accepted: bool) -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
-    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor.fault_at(0.0, received(np.zeros(2), 0.0, 1))
     for k in range(2, 100):
-        monitor.check(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
+        monitor.fault_at(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
     monitor.accept_steady()
     assert monitor.value.tolist() == [0.0, 0.0], "not yet"
     for k in range(100, 104):
         last = received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k)
-        monitor.check(0.001 * k, last)
+        monitor.fault_at(0.001 * k, last)
     monitor.accept_steady()
     assert (kind(monitor, 0.103, last) is None) == accepted
 
@@ -139,7 +139,7 @@ def test_longer_silence_allows_a_larger_change() -> None:
 
 def test_jump_is_a_fault_until_the_next_sample() -> None:
     monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.0)
-    monitor.check(0.0, received(np.zeros(2), 0.0, 1))
+    monitor.fault_at(0.0, received(np.zeros(2), 0.0, 1))
     jumped = received(np.ones(2), 0.01, 2)
     assert [kind(monitor, now, jumped) for now in (0.01, 0.011)] == ["jump", "jump"]
 
@@ -224,6 +224,6 @@ def test_value_is_examined_once() -> None:
 def test_only_a_received_signal_is_checked() -> None:
     nothing: Any = None
     with pytest.raises(TypeError, match="takes the ReceivedSignal of the signal, not None"):
-        SensorMonitor(signal()).check(0.0, nothing)
+        SensorMonitor(signal()).fault_at(0.0, nothing)
     with pytest.raises(TypeError, match="StalenessMonitor"):
-        check_all(0.0, {"a": nothing}, {"a": ReceivedSignal()})
+        faults_at(0.0, {"a": nothing}, {"a": ReceivedSignal()})

@@ -41,7 +41,7 @@ class Arm:
 
     def take(self, *messages: lcmt_iiwa_status | bytes) -> Arm:
         for message in messages:
-            self.reader.take("IIWA_STATUS", message if isinstance(message, bytes) else message.encode())
+            self.reader.receive("IIWA_STATUS", message if isinstance(message, bytes) else message.encode())
         return self
 
 
@@ -153,7 +153,7 @@ def test_messages_without_a_time_are_all_accepted(user_types: ModuleType) -> Non
     map = vector_map("POINT", user_types.point_t, {"x": "x"}, stamp="")
     reader = ChannelReader(map, [Signal("x", size=1)], {"x": received}, 0.1)
     for _ in range(3):
-        reader.take("POINT", user_types.point_t().encode())
+        reader.receive("POINT", user_types.point_t().encode())
     assert received.count == 3
     assert math.isnan(received.sent)
 
@@ -182,7 +182,7 @@ def test_failing_decoder_of_a_user_is_counted(
 ) -> None:
     received = ReceivedSignal()
     map = LcmMap(channel="POINT", type=user_types.point_t, signals=["x"], decode=decode)
-    ChannelReader(map, [Signal("x", size=1)], {"x": received}, 0.1).take("POINT", user_types.point_t().encode())
+    ChannelReader(map, [Signal("x", size=1)], {"x": received}, 0.1).receive("POINT", user_types.point_t().encode())
     assert (received.count, received.rejected) == (0, {reason: 1})
 
 
@@ -365,7 +365,7 @@ def test_own_and_earlier_refusals_are_not_foreign() -> None:
 
     def told(owner: str, refused: int, last: str) -> int:
         state = ChannelStatistics(owner=owner, refused=refused, last_refused=last)
-        foreign.take_status(STATUS_CHANNEL, HubStatistics(protected={"C": state}).to_json())
+        foreign.receive_status(STATUS_CHANNEL, HubStatistics(protected={"C": state}).to_json())
         return foreign.refused
 
     assert told("me", 7, "other") == 0  # before the first status
@@ -397,10 +397,10 @@ def test_own_messages_that_come_back_late_are_not_foreign() -> None:
     for data in (*own, own[7]):
         foreign.expect("C", data)
     for data in (own[7], *reversed(own)):
-        foreign.take("C", data)
+        foreign.receive("C", data)
     assert foreign.heard == {"C": 0}
     for data in (own[7], b"foreign"):
-        foreign.take("C", data)
+        foreign.receive("C", data)
     assert foreign.heard == {"C": 2}
 
 
@@ -408,14 +408,14 @@ def test_own_messages_that_never_come_back_are_forgotten() -> None:
     foreign = ForeignCommands(["C"], lambda: None)
     for number in range(20_000):
         foreign.expect("C", str(number).encode())
-    foreign.take("C", b"0")
+    foreign.receive("C", b"0")
     assert foreign.heard == {"C": 1}
 
 
 def test_own_message_on_another_channel_is_foreign() -> None:
     foreign = ForeignCommands(["C", "D"], lambda: None)
     foreign.expect("C", b"1")
-    foreign.take("D", b"1")
+    foreign.receive("D", b"1")
     assert foreign.heard == {"C": 0, "D": 1}
 
 
@@ -485,7 +485,7 @@ def test_commands_refused_by_the_hub_are_counted_and_logged(caplog: pytest.LogCa
 @pytest.mark.parametrize("status", [b"", b"{}", b"[]", b"\xff", b'{"protected": {"IIWA_COMMAND": 1}}'])
 def test_invalid_hub_status_is_logged_and_ignored(status: bytes, caplog: pytest.LogCaptureFixture) -> None:
     foreign = ForeignCommands(["IIWA_COMMAND"], lambda: "127.0.0.1:1")
-    foreign.take_status("VTB_HUB", status)
+    foreign.receive_status("VTB_HUB", status)
     assert foreign.blocked == frozenset()
     assert "no status" in caplog.text
 

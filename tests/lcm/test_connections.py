@@ -144,14 +144,14 @@ def test_messages_arrive_in_order_and_stamped(hub: Hub) -> None:
             assert time.monotonic() < limit
             sender.publish([("A", b"")])
             select.select([receiver], [], [], PATIENCE)
-            receiver.take(10)
+            receiver.receive(10)
         heard.clear()
         begin = time.monotonic()
         sender.publish(messages)
         while len(heard) < len(messages):
             assert time.monotonic() < limit
             select.select([receiver], [], [], PATIENCE)
-            receiver.take(10)
+            receiver.receive(10)
         assert heard == messages
         assert begin < receiver.arrived < time.monotonic()
 

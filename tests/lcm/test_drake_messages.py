@@ -63,7 +63,7 @@ def take(map: LcmMap, signals: list[Signal], *messages: bytes) -> dict[str, Rece
     received = {signal.name: ReceivedSignal() for signal in signals}
     reader = ChannelReader(map, signals, received, 0.1)
     for message in messages:
-        reader.take(CHANNEL, message)
+        reader.receive(CHANNEL, message)
     return received
 
 
@@ -333,6 +333,6 @@ def test_broken_pictures_are_only_counted(kind: str) -> None:
         for _ in range(chance.randrange(1, 6)):
             at = chance.randrange(8, len(data))
             data[at : at + chance.choice((1, 4))] = chance.choice((b"\xff", b"\x7f\xff\xff\xff", b"\0", b"\0\0\0\0"))
-        reader.take(CHANNEL, bytes(data))
+        reader.receive(CHANNEL, bytes(data))
     assert received.count + sum(received.rejected.values()) == 5_000
     assert "decode" not in received.rejected

@@ -117,7 +117,7 @@ def fuzzed() -> tuple[dict[str, ReceivedSignal], Oracle, list[int]]:
     reader = ChannelReader(iiwa_status(SENSE), interface().sense, signals, 0.0)
     oracle, memory = Oracle(), []
     for number, data in enumerate(stream(1, MESSAGES)):
-        reader.take("IIWA_STATUS", data)
+        reader.receive("IIWA_STATUS", data)
         oracle.add(data)
         value = signals["position"].value
         assert value is None or np.abs(value).max() <= LIMIT

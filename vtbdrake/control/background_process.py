@@ -205,11 +205,11 @@ class BackgroundProcess:
             _log.error("%s (process %d) is lost: %s", self._child.name, self.pid, reason)
         self._lost = True
 
-    def take(self) -> list[Any]:
+    def pop_messages(self) -> list[Any]:
         """Return the messages that the worker has sent since the last call, in order, without waiting."""
-        return list(map(unpack, self.take_frames()))
+        return list(map(unpack, self.pop_frames()))
 
-    def take_frames(self) -> list[bytes]:
+    def pop_frames(self) -> list[bytes]:
         """Return the frames that the worker has sent since the last call, in order, without waiting."""
         self._receive()
         frames, self._received = self._received, []
@@ -239,7 +239,7 @@ class BackgroundProcess:
     def wait_for_messages(self, timeout: float) -> list[Any]:
         """Return the messages that the worker has sent, waiting for the first; none if it has ended or is late."""
         self._wait(lambda: bool(self._received), timeout)
-        return self.take()
+        return self.pop_messages()
 
     def _wait(self, condition: Callable[[], bool], timeout: float) -> bool:
         end = time.monotonic() + timeout
@@ -265,7 +265,7 @@ class BackgroundProcess:
     def close(self, timeout: float = 10.0) -> int:
         """Send what waits, let the worker finish, and return its exit code (negative: ended by that signal).
 
-        After ``timeout`` seconds it is killed. `take` still returns what it has sent.
+        After ``timeout`` seconds it is killed. `pop_messages` still returns what it has sent.
         """
         end = time.monotonic() + timeout
         self.drain(timeout)
@@ -280,7 +280,7 @@ class BackgroundProcess:
         return self._child.close(max(0.0, end - time.monotonic()))
 
     def kill(self) -> None:
-        """End the worker at once; `take` still returns the data that it has sent."""
+        """End the worker at once; `pop_messages` still returns the data that it has sent."""
         self._closing = True
         self._child.kill()
         self._receive()

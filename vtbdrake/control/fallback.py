@@ -43,7 +43,7 @@ class Fallback(ABC):
 
     otherwise: Fallback | None = None
 
-    def check(self, signal: Signal, *, interface: Interface) -> None:  # noqa: B027 - most can command anything
+    def check_signal(self, signal: Signal, *, interface: Interface) -> None:  # noqa: B027 - most can command anything
         """Check that this fallback can command a signal.
 
         Raises:
@@ -84,7 +84,7 @@ class Zero(Fallback):
     as commands go on: take `Silence` or `CarryWeight`.
     """
 
-    def check(self, signal: Signal, *, interface: Interface) -> None:
+    def check_signal(self, signal: Signal, *, interface: Interface) -> None:
         if not signal.is_vector:
             raise ValueError(f"the actuator signal {signal.name} is abstract, it has no zero: take another fallback")
 
@@ -124,7 +124,7 @@ class Brake(Fallback):
             raise ValueError(f"the gains of a brake are not negative, unlike {self.gain.tolist()}")
         self.entries = entries
 
-    def check(self, signal: Signal, *, interface: Interface) -> None:
+    def check_signal(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense if sensor.size is not None}
         if self.velocity not in sizes:
             raise ValueError(f"the brake of {signal.name} needs a vector sensor signal, not {self.velocity!r}")
@@ -199,7 +199,7 @@ class CarryWeight(Fallback):
         self._size, self._gravity_compensation = size, gravity_compensation(plant)
         self._to_actuators = np.linalg.inv(actuation)
 
-    def check(self, signal: Signal, *, interface: Interface) -> None:
+    def check_signal(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense if sensor.size is not None}
         found = len(range(sizes.get(self.position, 0))[self.entries])
         if not found == self._size == signal.size:
@@ -209,7 +209,7 @@ class CarryWeight(Fallback):
                 f"{self.position!r}"
             )
         if self.brake is not None:
-            self.brake.check(signal, interface=interface)
+            self.brake.check_signal(signal, interface=interface)
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
         last = known.get(self.position)
@@ -271,7 +271,7 @@ def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[F
     while link is not None and link not in found:
         if not isinstance(link, Fallback):
             raise ValueError(f"the fallback of {signal.name} is a Fallback, Zero() say, not {link!r}")
-        link.check(signal, interface=interface)
+        link.check_signal(signal, interface=interface)
         found.append(link)
         link = link.otherwise
     return found

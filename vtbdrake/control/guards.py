@@ -16,7 +16,7 @@ from vtbdrake.control.fault import Fault, FaultKind
 from vtbdrake.control.limits import ActuationError, PassThrough, RateLimiter
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.sensor_monitor import SensorMonitor
-from vtbdrake.control.staleness import check_all
+from vtbdrake.control.staleness import faults_at
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import Interface, Signal
 
@@ -39,14 +39,14 @@ class Verdict(NamedTuple):
 class Guards:
     """Limits the commands of a DPS, monitors its sensor signals, and replaces it by fallbacks after a fault.
 
-    In every cycle, `check` limits the commands of the actuator signals that are on real, unless there is a fault: a
+    In every cycle, `judge` limits the commands of the actuator signals that are on real, unless there is a fault: a
     sensor signal that is stale or implausible; a DPS that raised; a command that is missing, not finite or of a wrong
     size; too many missed deadlines in a row; messages that pace the loop at another pace than its period; a machine
     that must not be commanded. A fault *latches* in the same cycle: from then on the fallbacks command all signals that
     are on real, until `reset`. While nothing is on real, faults are reported, but nothing latches.
 
     A signal that leaves real is not left alone with its last command: its fallback commands it for ``leave_time``, or
-    until the machine is released (see `check`).
+    until the machine is released (see `judge`).
 
     A signal with a limit of its rate or acceleration needs `start` before it is commanded. A signal that has neither a
     start nor a sent command is not sent at all: there is nothing to hold.
@@ -184,10 +184,10 @@ class Guards:
 
     def sensor_faults(self, name: str, now: float, received: ReceivedSignal) -> list[str]:
         """Return the reasons why a sensor signal cannot be relied on at the time ``now``."""
-        fault = self.monitors[name].check(now, received)
+        fault = self.monitors[name].fault_at(now, received)
         return [fault.reason] if fault else []
 
-    def check(
+    def judge(
         self,
         now: float,
         received: Mapping[str, ReceivedSignal],
@@ -243,7 +243,7 @@ class Guards:
                     wanted.append((name, limiter, limiter.checked(actuation[name])))
                 except ActuationError as problem:
                     causes.append(Fault(now, name, problem.kind, f"the actuator command {name} {problem}"))
-        sensor_faults = check_all(now, self.monitors, received)
+        sensor_faults = faults_at(now, self.monitors, received)
         if causes or sensor_faults or self._faults:
             self._record(causes, sensor_faults)
             if self._faults and self._active and not self._latched:
@@ -269,7 +269,7 @@ class Guards:
         if not names and not self._unsent and not self._silent and not self._departing:
             return
         for name in names:
-            self.limiters[name].take_back()
+            self.limiters[name].retract()
         self._held_back = frozenset(names)
         commanded = frozenset((*self._active, *self._leaving))
         left = commanded - self._held_back - self._silent
@@ -279,7 +279,7 @@ class Guards:
     def latch(self, reason: str, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> Verdict:
         """Latch for a reason from outside, whether or not anything is on real; return the verdict of a cycle.
 
-        ``at`` is as in `check`.
+        ``at`` is as in `judge`.
         """
         self._depart_anew(now, received, _NONE)
         told = Fault(now, None, FaultKind.TOLD, reason)
@@ -293,12 +293,12 @@ class Guards:
     ) -> tuple[str, ...]:
         """Release the latch, unless a cause persists.
 
-        Causes in the DPS and the loop persist as of the last `check`, those in the sensor signals as of now. A sensor
+        Causes in the DPS and the loop persist as of the last `judge`, those in the sensor signals as of now. A sensor
         signal that has jumped is accepted where it is, if it has been steady there.
 
         Args:
-            now: As in `check`.
-            received: As in `check`.
+            now: As in `judge`.
+            received: As in `judge`.
             against: Further reasons not to release.
 
         Returns:
@@ -306,7 +306,7 @@ class Guards:
         """
         lasting = [
             fault
-            for fault in check_all(now, self.monitors, received)
+            for fault in faults_at(now, self.monitors, received)
             if not (fault.kind == FaultKind.JUMP and fault.signal is not None and self.monitors[fault.signal].steady)
         ]
         reasons = (*(fault.reason for fault in (*self._causes, *lasting)), *against)
@@ -379,7 +379,7 @@ class Guards:
             if not free or sensor is None or not limiter.needs_start or name in self._withheld:
                 continue
             measured = received.get(sensor) or others.get(sensor)
-            if measured is not None and self.monitors[sensor].check(now, measured) is None:
+            if measured is not None and self.monitors[sensor].fault_at(now, measured) is None:
                 limiter.start_from(measured.value)
             else:
                 limiter.release()
@@ -404,7 +404,7 @@ class Guards:
     def fall_back(self, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> dict[str, Any]:
         """Return the commands of the fallbacks, within the limits, for all signals that are on real or leave it.
 
-        The arguments are those of `check`, which does the same while a fault is latched.
+        The arguments are those of `judge`, which does the same while a fault is latched.
         """
         names = (*self._active, *self._leaving)
         commands = self._fallback_commands(names, now, received, at)
@@ -418,7 +418,7 @@ class Guards:
         """Return the commands of the fallbacks of some signals, within the limits."""
         dt = self.period if self._last is None else now - self._last
         sensed = {
-            name: signal.value for name, signal in received.items() if self.monitors[name].check(now, signal) is None
+            name: signal.value for name, signal in received.items() if self.monitors[name].fault_at(now, signal) is None
         }
         known = {
             name: Sample(monitor.value, now - monitor.arrived)

@@ -55,7 +55,7 @@ cdef class Bounds:
     cdef tuple _key(self):
         return (self.type,) if self.size < 0 else (list(self.lower), list(self.upper))
 
-    def check(self, value):
+    def violation(self, value):
         """Return why ``value`` is not one of this signal: ``type``, ``size``, ``limits``, ``not finite`` or ``""``."""
         cdef double* entries
         cdef Py_ssize_t i
@@ -224,7 +224,7 @@ cdef class RateLimiter:
         """Forget the last actuator command: from now on another controller commands."""
         self.has_start = False
 
-    def take_back(self):
+    def retract(self):
         """Treat the last command as never sent. Call it at most once after each `send`."""
         self.state[...] = self.state_before
         self.at = self.at_before
@@ -360,7 +360,7 @@ class PassThrough:
         """Forget the last actuator command."""
         self.last_sent = None
 
-    def take_back(self):
+    def retract(self):
         """Treat the last command as never sent."""
         self.last_sent = self._sent_before
 

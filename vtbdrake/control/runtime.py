@@ -283,9 +283,9 @@ class Runtime(Stepped):
         elif lateness > self.period or self.statistics.run:
             self._read_backlog()
         now = self._read_at = self.clock.now()
-        pace = self._check_pace()
+        pace = self._note_pace()
         self._serve()
-        self.take_commands()
+        self.apply_commands()
         self.feed()
         self.slow_parts.receive()
         active = self.active
@@ -293,7 +293,7 @@ class Runtime(Stepped):
         error, actuation = self.step()
         stepped = self.clock.now()
         discontinuous = self._compare_first(actuation) if self.uncompared else None
-        verdict = self.guards.check(
+        verdict = self.guards.judge(
             stepped,  # After the step: a long one makes the samples, and with them the commands, stale.
             self.watched,
             actuation,
@@ -314,7 +314,7 @@ class Runtime(Stepped):
         if self.bridge.foreign != self._foreign:
             self._note_foreign()
         self.statistics.record(lateness=lateness, step=stepped - fed, cycle=self.clock.now() - begin)
-        changes, new = self.take_record()
+        changes, new = self.pop_record()
         done = Cycle(self.cycles, self.time, now, changes, new, actuation, verdict)
         self.cycles += 1
         for watcher in self._watchers[:]:
@@ -380,7 +380,7 @@ class Runtime(Stepped):
             worked = 0.0
         return int((lateness + worked) / self.period)
 
-    def _check_pace(self) -> str | None:
+    def _note_pace(self) -> str | None:
         """Note the message that has begun this cycle; return how the pace differs from the period, or None."""
         if self.pace is None or self._pace_monitor is None:
             return None

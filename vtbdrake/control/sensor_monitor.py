@@ -47,7 +47,7 @@ class LatencyMonitor:
 
 
 class SensorMonitor(StalenessMonitor):
-    """Checks that one sensor signal is fresh and plausible; `check` returns the fault, if there is one.
+    """Checks that one sensor signal is fresh and plausible; `fault_at` returns the fault, if there is one.
 
     A signal that has never arrived is stale, for any maximum age. A vector is plausible if it has the right size
     and all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
@@ -127,7 +127,7 @@ class SensorMonitor(StalenessMonitor):
             self._rejected = None
 
     def _implausible(self, now: float, received: ReceivedSignal) -> Fault | None:
-        problem = "" if self._bounds is None else self._bounds.check(received.value)
+        problem = "" if self._bounds is None else self._bounds.violation(received.value)
         if not problem:
             return None
         name, value = self.signal.name, received.value

@@ -157,7 +157,7 @@ class _Part:
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
 
     def receive(self, end: float) -> None:
-        answers, self._answers = self._answers + self._supervisor.take(), []
+        answers, self._answers = self._answers + self._supervisor.pop_messages(), []
         for answer in answers:
             self._handle(*answer)
         overdue = [tick for tick in self._waiting if self._part.due(tick) <= end]

@@ -54,7 +54,7 @@ def _forward(loop: FrameConnection, worker: BackgroundProcess, patience: float) 
             worker.post_frame(loop.receive_frame())
             deadline = time.monotonic() + patience
         worker.flush()
-        for answer in worker.take_frames():
+        for answer in worker.pop_frames():
             loop.send_frame(answer)
             deadline = inf
         if not worker.alive:

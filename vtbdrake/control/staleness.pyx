@@ -32,10 +32,10 @@ cdef class StalenessMonitor:
         self.max_age = max_age
         self.arrived = -INFINITY
 
-    cpdef check(self, double now, ReceivedSignal received):
+    cpdef fault_at(self, double now, ReceivedSignal received):
         """Return the fault of the signal at the time ``now``, in seconds; None if it has none."""
         if received is None:
-            raise TypeError("check() takes the ReceivedSignal of the signal, not None")
+            raise TypeError("fault_at() takes the ReceivedSignal of the signal, not None")
         if now - received.arrived > self.max_age or not received.count:
             return self.stale(now, received)
         if received.count != self.count:
@@ -56,8 +56,8 @@ cdef class StalenessMonitor:
         self.fault = None
 
 
-def check_all(double now, dict monitors, received):
-    """Return all faults that `StalenessMonitor.check` finds in received signals at the time ``now``.
+def faults_at(double now, dict monitors, received):
+    """Return all faults that `StalenessMonitor.fault_at` finds in received signals at the time ``now``.
 
     Args:
         now: Present time, in seconds.
@@ -66,7 +66,7 @@ def check_all(double now, dict monitors, received):
     """
     faults = []
     for name, signal in received.items():
-        fault = (<StalenessMonitor?>monitors[name]).check(now, signal)
+        fault = (<StalenessMonitor?>monitors[name]).fault_at(now, signal)
         if fault is not None:
             faults.append(fault)
     return faults

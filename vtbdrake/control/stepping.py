@@ -220,7 +220,7 @@ class Stepped:
                 self._ports.feed(name, received.value)
                 self._fed[name] = received.value
 
-    def take_commands(self) -> None:
+    def apply_commands(self) -> None:
         """Write the commands u that the bridge has received.
 
         One that cannot be written is counted as rejected. Of each reason to reject one, the first case is logged.
@@ -273,7 +273,7 @@ class Stepped:
         port = self.target.dps.GetOutputPort(name)
         return port.Eval(self.target.dps.GetMyContextFromRoot(self._context))
 
-    def take_record(self) -> tuple[tuple[Change, ...], dict[str, Any]]:
+    def pop_record(self) -> tuple[tuple[Change, ...], dict[str, Any]]:
         """Return the changes and fed values since the last call."""
         changes, fed = tuple(self._changes), self._fed
         self._changes.clear()

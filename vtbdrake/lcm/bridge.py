@@ -127,10 +127,10 @@ class LcmBridge(Bridge):
         self.foreign_messages: Mapping[str, int] = self._foreign.heard
         handlers: dict[str, Handler] = {reader.channel: self._tapped(reader) for reader in self._readers}
         if self._watch:
-            handlers |= {map.channel: self._foreign.take for map in act}
+            handlers |= {map.channel: self._foreign.receive for map in act}
         if url.startswith(_HUB):
-            handlers[STATUS_CHANNEL] = self._foreign.take_status
-            handlers[MARK_CHANNEL] = self._take_mark
+            handlers[STATUS_CHANNEL] = self._foreign.receive_status
+            handlers[MARK_CHANNEL] = self._receive_mark
         self._paused: tuple[float, frozenset[str]] | None = None  # since when, and the signals; until the mark is back
         self._mark = b""
         self._mark_sent: int | None = None  # on which connection
@@ -168,7 +168,7 @@ class LcmBridge(Bridge):
         self.link.close()
 
     def poll(self, timeout: float = 0.0) -> int:
-        count = self.link.take(timeout, self._burst)
+        count = self.link.receive(timeout, self._burst)
         if self._paused is not None:
             self._date_back(*self._paused)
             if self._mark_sent != self.link.reconnections:
@@ -189,7 +189,7 @@ class LcmBridge(Bridge):
         sent = self.link.publish((MARK_CHANNEL, self._mark))
         self._mark_sent = self.link.reconnections if sent else None
 
-    def _take_mark(self, _: str, data: bytes) -> None:
+    def _receive_mark(self, _: str, data: bytes) -> None:
         if self._paused is not None and data == self._mark:
             self._date_back(*self._paused)
             self._paused = None
@@ -243,12 +243,12 @@ class LcmBridge(Bridge):
             self.link.publish(*[(KEEP_PREFIX + channel, b"") for channel in channels])
 
     def _tapped(self, reader: ChannelReader) -> Handler:
-        def take(channel: str, data: bytes) -> None:
+        def receive(channel: str, data: bytes) -> None:
             if self.tap is not None:
                 self.tap(channel, data)
-            reader.take(channel, data)
+            reader.receive(channel, data)
 
-        return take
+        return receive
 
     def _expect_gap(self) -> None:
         for reader in self._readers:
@@ -291,7 +291,7 @@ class ChannelReader:
         """Accept the next message however far ahead it is: after a loss of the bus, messages are missing."""
         self._ahead = inf
 
-    def take(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Handle one message."""
         now = time.monotonic()
         try:
@@ -308,7 +308,7 @@ class ChannelReader:
             return
         accepted = False
         for name, received, bounds in self._signals:
-            if reason := bounds.check(values[name]) if name in values else "missing":
+            if reason := bounds.violation(values[name]) if name in values else "missing":
                 received.reject(reason)
             else:
                 received.accept(values[name], now, sent)
@@ -380,7 +380,7 @@ class ChannelWriter:
         for name, bounds in self._bounds.items():
             if name in actuation:
                 values[name] = actuation[name]
-                if reason := bounds.check(values[name]):
+                if reason := bounds.violation(values[name]):
                     faults[name] = reason
         if not values:
             return None
@@ -435,7 +435,7 @@ class ForeignCommands:
         if len(own) > self._MEMORY:
             del own[next(iter(own))]
 
-    def take(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         """Handle a message that came on an actuator channel."""
         own = self._own[channel]
         if (left := own.pop(data, 0)) > 0:
@@ -445,7 +445,7 @@ class ForeignCommands:
         self.heard[channel] += 1
         self._heard_at[channel] = time.monotonic()
 
-    def take_status(self, _: str, data: bytes) -> None:
+    def receive_status(self, _: str, data: bytes) -> None:
         """Handle a message of the hub's status channel."""
         try:
             status = HubStatistics.from_json(data).protected

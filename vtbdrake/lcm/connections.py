@@ -55,7 +55,7 @@ class Connection(ABC):
         name: The client's name at the hub; None without a hub.
         arrived: When the last received message arrived at this computer, by `time.monotonic`; None unless the kernel
             stamps messages.
-        pending: Whether the rest of what was published waits to be sent; `take` sends it.
+        pending: Whether the rest of what was published waits to be sent; `receive` sends it.
     """
 
     name: str | None = None
@@ -67,7 +67,7 @@ class Connection(ABC):
         """Return the file descriptor that becomes readable when messages arrive."""
 
     @abstractmethod
-    def take(self, limit: int) -> int:
+    def receive(self, limit: int) -> int:
         """Pass up to ``limit`` messages that have arrived to their handlers, and return how many.
 
         Raises:
@@ -103,7 +103,7 @@ class LibraryConnection(Connection):
     def fileno(self) -> int:
         return int(self._lcm.fileno())
 
-    def take(self, limit: int) -> int:
+    def receive(self, limit: int) -> int:
         count = 0
         while count < limit and self._lcm.handle_timeout(0):
             count += 1
@@ -179,7 +179,7 @@ class TcpqConnection(Connection):
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def take(self, limit: int) -> int:
+    def receive(self, limit: int) -> int:
         if self.pending:
             with contextlib.suppress(BlockingIOError):
                 self._send(self._unsent)
@@ -364,7 +364,7 @@ class LcmLink:
             raise BridgeError(f"the bridge to {self.url} is not open: call open() first")
         return self._current(timeout)
 
-    def take(self, timeout: float, limit: int) -> int:
+    def receive(self, timeout: float, limit: int) -> int:
         """Pass messages to their handlers, and return how many.
 
         Args:
@@ -376,11 +376,11 @@ class LcmLink:
         if connection is None:
             return 0
         try:
-            count = connection.take(limit)
+            count = connection.receive(limit)
             timeout = end - time.monotonic()
             while not count and timeout > 0:
                 select.select((connection,), (connection,) if connection.pending else (), (), timeout)
-                count = connection.take(limit)
+                count = connection.receive(limit)
                 timeout = end - time.monotonic()
             return count
         except OSError:

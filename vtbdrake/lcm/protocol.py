@@ -45,7 +45,7 @@ class Protocol:
     reported: Mapping[str, str] = field(default_factory=dict)
     periods: Mapping[str, float] = field(default_factory=dict)
 
-    def check(self, interface: Interface) -> None:
+    def check_interface(self, interface: Interface) -> None:
         """Check that the maps carry the signals of ``interface``.
 
         Raises:
@@ -86,7 +86,7 @@ def protocol_of(scenario: Scenario) -> Protocol:
             "Deployment(protocol=Protocol(...))"
         )
     try:
-        protocol.check(scenario.interface())
+        protocol.check_interface(scenario.interface())
     except ValueError as error:
         raise ProtocolError(f"the protocol of {name} does not fit its signals: {error}") from error
     return protocol

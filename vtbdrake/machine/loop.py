@@ -179,9 +179,9 @@ class MachineLoop:
         """Take messages until the deadline; return the time then."""
         if isinstance(self._clock, WallClock):
             while (left := deadline - self._clock.now()) > 0.0 and not self._stop.is_set():
-                self._link.take(left, _BURST)
+                self._link.receive(left, _BURST)
         woke = self._clock.wait_until(deadline)
-        self._link.take(0.0, _BURST)
+        self._link.receive(0.0, _BURST)
         return woke
 
     def _behind(self, begin: float, now: float) -> tuple[float, int]:
@@ -199,7 +199,7 @@ class MachineLoop:
         repeat = time.monotonic() + _REPEAT
         while not self._arrived >= channels and not self._stop.is_set():
             # One at a time: messages that are ahead of their cycle stay in the connection.
-            self._link.take(_SLICE, 1)
+            self._link.receive(_SLICE, 1)
             self._answer_by_control()
             # A controller that joins the bus after the state was sent would wait for it, and the machine for a command.
             self._alone |= self._link.reconnections > self._reconnections

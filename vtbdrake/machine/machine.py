@@ -235,7 +235,7 @@ class Machine:
             RuntimeError: The simulation failed.
         """
         for packet in self._lines[ACT].arrivals(self.cycle):
-            self._readers[packet.channel].take(packet.channel, packet.data)
+            self._readers[packet.channel].receive(packet.channel, packet.data)
         for name, received in self._received.items():
             if received.count > self._counts[name]:
                 self._counts[name] = received.count

@@ -227,7 +227,7 @@ class Recorder:
         self._events.append(self._message_event(FAULT, lcmt_vtb_fault(), **fields))
 
     def _take_losses(self) -> None:
-        for data in self._worker.take_frames():
+        for data in self._worker.pop_frames():
             lost, _, reason = data.decode().partition(" ")
             self._unwritten = int(lost)
             self._warn(reason)

@@ -146,7 +146,7 @@ class GuardedArm:
         now = self.cycles * T
         for name, value in self.heard({name: self.measured(name) for name in self.received}).items():
             self.received[name].accept(np.array(value), now, now)
-        verdict = self.guards.check(now, self.received, {"joint_torque": gravity(self.pose)}, **options)
+        verdict = self.guards.judge(now, self.received, {"joint_torque": gravity(self.pose)}, **options)
         self.guards.note_unsent(())
         if "joint_torque" in verdict.actuation:
             WORLD.actuate(self.context, "joint_torque", verdict.actuation["joint_torque"])

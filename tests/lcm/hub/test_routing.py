@@ -351,10 +351,10 @@ class TestLease:
         channel = ProtectedChannel("C", lease=1.0)
         assert channel.publish(owner, 0.0)
         assert channel.publish(owner, 0.9)
-        assert not channel.take(other, 1.9)
+        assert not channel.take_over(other, 1.9)
         assert not channel.statistics(1.9).lease_over
         assert channel.statistics(1.91).lease_over
-        assert channel.take(other, 1.91)
+        assert channel.take_over(other, 1.91)
         assert not channel.publish(owner, 1.92)
 
     def test_owner_keeps_the_channel_without_publications(self, connections) -> None:
@@ -363,8 +363,8 @@ class TestLease:
         channel.keep(owner, 0.0)
         channel.keep(other, 0.9)
         channel.keep(owner, 0.9)
-        assert not channel.take(other, 1.9)
-        assert channel.take(other, 1.91)
+        assert not channel.take_over(other, 1.9)
+        assert channel.take_over(other, 1.91)
         channel.keep(owner, 5.0)
         assert channel.owner is other
 
@@ -374,12 +374,12 @@ class TestLease:
         channel.extend(5.0)
         assert channel.publish(owner, 0.0)
         channel.extend(5.0)
-        assert not channel.take(other, 6.0)
-        assert channel.take(other, 6.1)
+        assert not channel.take_over(other, 6.0)
+        assert channel.take_over(other, 6.1)
 
     def test_request_begins_a_lease(self, connections) -> None:
         first, second = connections
         channel = ProtectedChannel("C", lease=1.0)
-        assert channel.take(first, 0.0)
-        assert not channel.take(second, 1.0)
-        assert channel.take(second, 1.1)
+        assert channel.take_over(first, 0.0)
+        assert not channel.take_over(second, 1.0)
+        assert channel.take_over(second, 1.1)

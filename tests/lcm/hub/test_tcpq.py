@@ -159,7 +159,7 @@ class Own:
         while not condition():
             sending = [self.connection] if self.connection.pending else []
             assert any(select.select([self.connection], sending, [], TIMEOUT)), "timeout"
-            self.connection.take(100)
+            self.connection.receive(100)
 
     def sync(self) -> None:
         """Wait until hub and client have handled all messages that they had sent to each other."""
@@ -176,7 +176,7 @@ class Own:
 
 def relayed(own: Own, client: Client) -> bool:
     """Let both clients receive; return whether the second one has received anything."""
-    own.connection.take(1)
+    own.connection.receive(1)
     client.bus.handle_timeout(1)
     return bool(client.received)
 
@@ -277,7 +277,7 @@ def test_waiting_link_sends_its_rest(hub) -> None:
         with socket.socket(fileno=os.dup(link.sources[0].fileno())) as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         assert link.publish(("A", data))
-        assert (link.take(TIMEOUT, 1), received) == (1, [("A", data)])
+        assert (link.receive(TIMEOUT, 1), received) == (1, [("A", data)])
 
 
 def test_client_killed_within_a_message_is_removed(hub) -> None:
@@ -309,11 +309,11 @@ def test_restarted_hub_is_found() -> None:
         for losses in range(3):
             with Hub(port=port) as hub:
                 if losses:
-                    wait_until(lambda: bool(link.take(0.1, 1)) or link.connected)
+                    wait_until(lambda: bool(link.receive(0.1, 1)) or link.connected)
                 else:
                     link.open()
                 os.kill(hub.pid, 9)
-            wait_until(lambda: not link.connected or bool(link.take(0.1, 100)))
+            wait_until(lambda: not link.connected or bool(link.receive(0.1, 100)))
             assert link.losses == losses + 1
         assert link.reconnections == 2
 

@@ -51,7 +51,7 @@ class Ear(Bridge):
         count = len(self.heard)
         while self.heard:
             channel, data = self.heard.popleft()
-            self._readers[channel].take(channel, data)
+            self._readers[channel].receive(channel, data)
         return count
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:

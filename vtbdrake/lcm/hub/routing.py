@@ -91,7 +91,7 @@ class ProtectedChannel:
         elif self.owner is None and self._lease_over(now):
             self._set_owner(client, now)
 
-    def take(self, client: ClientConnection, now: float) -> bool:
+    def take_over(self, client: ClientConnection, now: float) -> bool:
         """Decide about a request to take over the channel; return whether the client is the owner now."""
         if self.owner is not None and client is not self.owner:
             if not self._lease_over(now):
@@ -264,7 +264,7 @@ class Router:
             _log.warning(
                 "publication by %s on %s rejected; protected channels: %s", client.name, channel, [*self._protected]
             )
-        if protected is None or not protected.take(client, now):
+        if protected is None or not protected.take_over(client, now):
             self.totals.refused += 1
 
     def _keep(self, client: ClientConnection, channel: str, now: float) -> None:

@@ -111,7 +111,7 @@ class LiveClient:
                 # A service that has just started has missed it; others know it by its id.
                 self._link.publish((channel, data))
                 sent = now
-            self._link.take(_SLICE, _BURST)
+            self._link.receive(_SLICE, _BURST)
         answer = self._answer
         if "error" in answer:
             raise LiveError(str(answer["error"]))
@@ -203,7 +203,7 @@ def _samples(
             if now >= renewed + lease / 3:
                 link.publish((WATCH, data))
                 renewed = now
-            link.take(_SLICE, _BURST)
+            link.receive(_SLICE, _BURST)
             while received:
                 message = received.popleft()
                 last = time.monotonic()

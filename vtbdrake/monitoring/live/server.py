@@ -112,7 +112,7 @@ class LiveServer:
             while True:
                 sources: list[Any] = [self._loop, *self._link.sources]
                 select.select(sources, (), (), _TICK)
-                while self._link.take(0.0, _BURST) == _BURST:
+                while self._link.receive(0.0, _BURST) == _BURST:
                     pass
                 self._take_messages()
                 self._end_leases()

@@ -86,7 +86,7 @@ class LiveService:
 
     def __call__(self, cycle: Cycle) -> None:
         """Take one request and read the values that are due; the runtime calls it in every cycle."""
-        self._requests += self._worker.take_frames()
+        self._requests += self._worker.pop_frames()
         if self._requests:
             self._begin(*unpack(self._requests.popleft()))
         busy = bool(self._readings) and self._read(cycle)

@@ -184,7 +184,7 @@ class ResidualMonitor:
         self._begin_block()
 
     def _take_reports(self, worker: BackgroundProcess) -> None:
-        for report in worker.take():
+        for report in worker.pop_messages():
             self._take_report(report)
 
     def _take_report(self, report: ResidualReport) -> None:
