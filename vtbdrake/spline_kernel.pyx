@@ -21,17 +21,17 @@ cdef Place place(pieces, Py_ssize_t n, double step, double t, int derivative):
     """Return the piece that holds at ``t``, and (1, s, s^2, s^3) or its derivative at the time s since its beginning."""
     cdef Py_ssize_t count = pieces.shape[0], i = max(min(<Py_ssize_t>(t / step + _ROUNDING), count - 1), 0)
     cdef double s = max(t - i * step, 0.0)
-    cdef Place found
-    found.piece = numbers(pieces, 4 * n * count) + 4 * n * i
+    cdef Place result
+    result.piece = numbers(pieces, 4 * n * count) + 4 * n * i
     if derivative == 0:
-        found.powers[:] = [1.0, s, s * s, s * s * s]
+        result.powers[:] = [1.0, s, s * s, s * s * s]
     elif derivative == 1:
-        found.powers[:] = [0.0, 1.0, 2.0 * s, 3.0 * s * s]
+        result.powers[:] = [0.0, 1.0, 2.0 * s, 3.0 * s * s]
     elif derivative == 2:
-        found.powers[:] = [0.0, 0.0, 2.0, 6.0 * s]
+        result.powers[:] = [0.0, 0.0, 2.0, 6.0 * s]
     else:
-        found.powers[:] = [0.0, 0.0, 0.0, 6.0]
-    return found
+        result.powers[:] = [0.0, 0.0, 0.0, 6.0]
+    return result
 
 
 cdef inline double weight(const Place* at, Py_ssize_t n, Py_ssize_t k) noexcept:
@@ -43,11 +43,11 @@ cdef inline double weight(const Place* at, Py_ssize_t n, Py_ssize_t k) noexcept:
 def weights_at(pieces, double step, double t, int derivative):
     cdef Py_ssize_t n = pieces.shape[2], k
     cdef Place at = place(pieces, n, step, t, derivative)
-    found = np.empty(n)
-    cdef double* to = writable(found, n)
+    weights = np.empty(n)
+    cdef double* to = writable(weights, n)
     for k in range(n):
         to[k] = weight(&at, n, k)
-    return found
+    return weights
 
 
 def value_at(pieces, double step, double t, knots, out):

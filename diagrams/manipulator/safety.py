@@ -75,9 +75,9 @@ class FloatInPlace(Fallback):
         self._velocity = np.zeros(JOINTS)
 
     def command(
-        self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float
+        self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float
     ) -> NDArray[np.float64] | NoCommand:
-        last = known.get(POSITION)
+        last = samples.get(POSITION)
         if last is None or (POSITION not in sensed and last.age > CARRY):
             self.begin()
             return NO_COMMAND

@@ -38,18 +38,18 @@ cdef class PoseFilter:
         cdef const double* angles = imu + 6
         cdef const double* standing = angles + 3 * LEG_COUNT
         cdef double* x = writable(pose, 6)
-        cdef double* known = writable(memory, 1 + 3 * LEG_COUNT)
-        cdef double* stood = known + 1
+        cdef double* attitude_known = writable(memory, 1 + 3 * LEG_COUNT)
+        cdef double* stood = attitude_known + 1
         cdef double* last = stood + LEG_COUNT
         cdef double tau = time_constant, trust = 1.0
         cdef double feet[3 * LEG_COUNT]
         cdef double dx = 0.0, dy = 0.0, drop = 0.0
         cdef Py_ssize_t still = 0, down = 0, k
         if imu[3] or imu[4] or imu[5]:
-            if known[0] and tau > 0.0:
+            if attitude_known[0] and tau > 0.0:
                 trust = 1.0 - exp(-self._period / tau)
             follow(x, imu, self._period, trust)
-            known[0] = 1.0
+            attitude_known[0] = 1.0
         self._legs.feet(angles, feet)
         turn_to_world(x, feet)
         for k in range(LEG_COUNT):

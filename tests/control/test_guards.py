@@ -433,7 +433,7 @@ def test_fallback_gets_no_sample_of_a_sensor_that_has_never_arrived(arrived: flo
 def test_fallback_gets_real_sensors_while_dps_uses_sim() -> None:
     loop = Loop(TORQUE, fallback={"torque": Brake("velocity", gain=0.05)})
     sensed = {"velocity": ReceivedSignal(value=np.array([2.0, -2.0]), arrived=T, count=1)}
-    verdict = loop.guards.judge(T, {}, {"torque": [nan, nan]}, others=sensed)
+    verdict = loop.guards.judge(T, {}, {"torque": [nan, nan]}, all_sensed=sensed)
     assert verdict.actuation["torque"] == pytest.approx([-0.1, 0.1])
 
 

@@ -135,13 +135,15 @@ def reported_signals(interface: Interface, reported: Mapping[str, str]) -> dict[
     """
     actuators = {signal.name: signal for signal in interface.act}
     taken = {signal.name for signal in interface.sense}
-    found = {}
+    carriers = {}
     for name, carrier in reported.items():
         if name not in actuators:
-            known = ", ".join(actuators) or "none"
-            raise ValueError(f"the machine cannot report {name!r}, which is no actuator signal; there are: {known}")
+            raise ValueError(
+                f"the machine cannot report {name!r}, which is no actuator signal; there are: "
+                f"{', '.join(actuators) or 'none'}"
+            )
         if carrier in taken:
             raise ValueError(f"the reported command of {name} needs a name of its own: {carrier!r} is taken")
         taken.add(carrier)
-        found[name] = replace(actuators[name], name=carrier, lower=-inf, upper=inf, rate=inf, acceleration=inf)
-    return found
+        carriers[name] = replace(actuators[name], name=carrier, lower=-inf, upper=inf, rate=inf, acceleration=inf)
+    return carriers

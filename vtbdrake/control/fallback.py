@@ -54,14 +54,14 @@ class Fallback(ABC):
         """Forget earlier faults; called before the first command after a fault."""
 
     @abstractmethod
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
         """Return the command to be sent, shape (size,), or `NO_COMMAND`.
 
         Args:
             last_sent: The last sent command, shape (size,).
             sensed: Values of the sensor signals that are fresh and plausible at present. Usually the signal that caused
                 the fault is missing.
-            known: The newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
+            samples: The newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
                 accepted are missing.
             dt: Time since the cycle before, in seconds.
         """
@@ -73,7 +73,7 @@ class Hold(Fallback):
     Only for positions: a torque or a force that is held accelerates, and a velocity that is held goes on.
     """
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
         return last_sent
 
 
@@ -88,14 +88,14 @@ class Zero(Fallback):
         if not signal.is_vector:
             raise ValueError(f"the actuator signal {signal.name} is abstract, it has no zero: take another fallback")
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
         return np.zeros(len(last_sent))
 
 
 class Silence(Fallback):
     """Sends nothing, so that the machine's own time-out brakes it. Only for machines that have one."""
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
         return NO_COMMAND
 
 
@@ -135,7 +135,7 @@ class Brake(Fallback):
                 f"{self.velocity} and gains of shape {self.gain.shape}: they must agree"
             )
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
         return -self.gain * sensed[self.velocity][self.entries]
 
 
@@ -201,23 +201,23 @@ class CarryWeight(Fallback):
 
     def check_signal(self, signal: Signal, *, interface: Interface) -> None:
         sizes = {sensor.name: sensor.size for sensor in interface.sense if sensor.size is not None}
-        found = len(range(sizes.get(self.position, 0))[self.entries])
-        if not found == self._size == signal.size:
+        position_count = len(range(sizes.get(self.position, 0))[self.entries])
+        if not position_count == self._size == signal.size:
             raise ValueError(
-                f"the weight of a plant with {self._size} positions is carried by as many torques and "
-                f"measured positions, not by the {signal.size} entries of {signal.name} with {found} entries of "
+                f"the weight of a plant with {self._size} positions is carried by as many torques and measured "
+                f"positions, not by the {signal.size} entries of {signal.name} with {position_count} entries of "
                 f"{self.position!r}"
             )
         if self.brake is not None:
             self.brake.check_signal(signal, interface=interface)
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
-        last = known.get(self.position)
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
+        last = samples.get(self.position)
         if last is None or (self.position not in sensed and last.age > self.longest):
             return NO_COMMAND
         torques = self._to_actuators @ self._gravity_compensation(last.value[self.entries])
         if self.brake is not None and self.brake.velocity in sensed:
-            torques += self.brake.command(last_sent, sensed, known, dt)
+            torques += self.brake.command(last_sent, sensed, samples, dt)
         return torques
 
 
@@ -235,8 +235,8 @@ class FallbackController(Fallback):
         self.function = function
         self.otherwise = otherwise
 
-    def command(self, last_sent: Any, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float) -> Any:
-        return self.function(last_sent, sensed, known, dt)
+    def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
+        return self.function(last_sent, sensed, samples, dt)
 
 
 _BY_UNIT: dict[str, type[Fallback]] = {
@@ -266,12 +266,12 @@ def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[F
     Raises:
         ValueError: One of them is no fallback, or cannot command ``signal``.
     """
-    found: list[Fallback] = []
+    links: list[Fallback] = []
     link: Fallback | None = fallback
-    while link is not None and link not in found:
+    while link is not None and link not in links:
         if not isinstance(link, Fallback):
             raise ValueError(f"the fallback of {signal.name} is a Fallback, Zero() say, not {link!r}")
         link.check_signal(signal, interface=interface)
-        found.append(link)
+        links.append(link)
         link = link.otherwise
-    return found
+    return links

@@ -200,7 +200,7 @@ class Guards:
         pace: str | None = None,
         at: float = nan,
         released: bool = False,
-        others: Mapping[str, ReceivedSignal] = _NONE,
+        all_sensed: Mapping[str, ReceivedSignal] = _NONE,
     ) -> Verdict:
         """Judge one cycle. The returned commands count as sent, unless `note_unsent` is called before the next cycle.
 
@@ -218,7 +218,7 @@ class Guards:
                 the time since the last one, at most for a period. NaN: every command counts for a period.
             released: Whether the machine does without commands, or another one commands it: signals that have left
                 real are not commanded any more.
-            others: Sensor signals that are not on real; fallbacks may use them.
+            all_sensed: The sensor signals that are not on real, too; fallbacks may use them.
         """
         if self._unconfirmed:
             self.note_unsent(())
@@ -226,8 +226,8 @@ class Guards:
         self._activate(tuple(active if active is not None else self._active if error else actuation))
         self._end_leaving(released)
         causes = self._general_faults(now, error, missed, blocked, pace)
-        causes += self._depart_anew(now, received, others)
-        wanted = []
+        causes += self._depart_anew(now, received, all_sensed)
+        checked_commands = []
         if error is None:
             for name in self._active:
                 if name in self._withheld:
@@ -240,7 +240,7 @@ class Guards:
                         raise ActuationError(
                             FaultKind.NOT_STARTED, "is limited in rate or acceleration, but has no start"
                         )
-                    wanted.append((name, limiter, limiter.checked(actuation[name])))
+                    checked_commands.append((name, limiter, limiter.checked(actuation[name])))
                 except ActuationError as problem:
                     causes.append(Fault(now, name, problem.kind, f"the actuator command {name} {problem}"))
         sensor_faults = faults_at(now, self.monitors, received)
@@ -251,10 +251,10 @@ class Guards:
             if not self._active:
                 self._accept_steady()
         if self._latched:
-            return Verdict(self.fall_back(now, {**others, **received}, at=at), False, self._faults)
-        commands = {name: limiter.send(values, at) for name, limiter, values in wanted}
+            return Verdict(self.fall_back(now, {**all_sensed, **received}, at=at), False, self._faults)
+        commands = {name: limiter.send(values, at) for name, limiter, values in checked_commands}
         if self._leaving:
-            commands |= self._fallback_commands(self._leaving, now, {**others, **received}, at)
+            commands |= self._fallback_commands(self._leaving, now, {**all_sensed, **received}, at)
         self._last = now
         self._silent = frozenset(self._leaving) - frozenset(commands)
         return Verdict(commands, True, self._faults)
@@ -282,11 +282,11 @@ class Guards:
         ``at`` is as in `judge`.
         """
         self._depart_anew(now, received, _NONE)
-        told = Fault(now, None, FaultKind.TOLD, reason)
-        self.log.append(told)
+        fault = Fault(now, None, FaultKind.TOLD, reason)
+        self.log.append(fault)
         if not self._latched:
-            self._latch((told,))
-        return Verdict(self.fall_back(now, received, at=at), False, (*self._faults, told))
+            self._latch((fault,))
+        return Verdict(self.fall_back(now, received, at=at), False, (*self._faults, fault))
 
     def reset(
         self, now: float, received: Mapping[str, ReceivedSignal], against: Collection[str] = ()
@@ -355,7 +355,7 @@ class Guards:
         return faults
 
     def _depart_anew(
-        self, now: float, received: Mapping[str, ReceivedSignal], others: Mapping[str, ReceivedSignal]
+        self, now: float, received: Mapping[str, ReceivedSignal], all_sensed: Mapping[str, ReceivedSignal]
     ) -> list[Fault]:
         """Restart the limiters from the measured values where the machine may have moved; return the faults."""
         pause = 0.0 if self._last is None else now - self._last
@@ -378,7 +378,7 @@ class Guards:
             free = count > self._most_unsent or name in self._departing
             if not free or sensor is None or not limiter.needs_start or name in self._withheld:
                 continue
-            measured = received.get(sensor) or others.get(sensor)
+            measured = received.get(sensor) or all_sensed.get(sensor)
             if measured is not None and self.monitors[sensor].fault_at(now, measured) is None:
                 limiter.start_from(measured.value)
             else:
@@ -391,9 +391,9 @@ class Guards:
 
     def _record(self, causes: list[Fault], sensor_faults: list[Fault]) -> None:
         """Log the faults that the cycle before did not have."""
-        known = {(fault.signal, fault.kind) for fault in self._faults}
+        previous = {(fault.signal, fault.kind) for fault in self._faults}
         self._faults, self._causes = (*causes, *sensor_faults), tuple(causes)
-        self.log.extend(fault for fault in self._faults if (fault.signal, fault.kind) not in known)
+        self.log.extend(fault for fault in self._faults if (fault.signal, fault.kind) not in previous)
 
     def _latch(self, faults: tuple[Fault, ...]) -> None:
         self._latched = faults
@@ -420,20 +420,20 @@ class Guards:
         sensed = {
             name: signal.value for name, signal in received.items() if self.monitors[name].fault_at(now, signal) is None
         }
-        known = {
+        samples = {
             name: Sample(monitor.value, now - monitor.arrived)
             for name, monitor in self.monitors.items()
             if monitor.arrived > -inf
         }
         actuation = {
-            name: self._fallback_command(name, now, sensed, known, dt, at)
+            name: self._fallback_command(name, now, sensed, samples, dt, at)
             for name in names
             if self.limiters[name].has_start
         }
         return {name: command for name, command in actuation.items() if command is not NO_COMMAND}
 
     def _fallback_command(
-        self, name: str, now: float, sensed: Mapping[str, Any], known: Mapping[str, Sample], dt: float, at: float
+        self, name: str, now: float, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float, at: float
     ) -> Any:
         limiter: Any = self.limiters[name]
         last_sent = limiter.last_sent
@@ -442,7 +442,7 @@ class Guards:
                 if fallback not in self._begun:
                     self._begun.add(fallback)
                     fallback.begin()
-                command = fallback.command(last_sent, sensed, known, dt)
+                command = fallback.command(last_sent, sensed, samples, dt)
                 return command if command is NO_COMMAND else limiter.limit(command, at)
             except FAILURES as error:
                 if fallback not in self._failed:
@@ -452,7 +452,7 @@ class Guards:
         return limiter.limit(last_sent, at)
 
 
-def _reject_unknown(what: str, given: Iterable[str], signals: Iterable[Signal]) -> None:
+def _reject_unknown(option: str, by_signal: Iterable[str], signals: Iterable[Signal]) -> None:
     names = [signal.name for signal in signals]
-    if unknown := sorted(set(given) - set(names)):
-        raise ValueError(f"{what} is given for {', '.join(unknown)}, but the signals are {', '.join(names)}")
+    if unknown := sorted(set(by_signal) - set(names)):
+        raise ValueError(f"{option} is given for {', '.join(unknown)}, but the signals are {', '.join(names)}")

@@ -9,7 +9,7 @@ from libc.stdint cimport int64_t
 
 cimport numpy as cnp
 
-from vtbdrake.control.array_entries cimport entries_of
+from vtbdrake.state.arrays cimport entries_of
 from vtbdrake.control.fault import FaultKind
 
 cnp.import_array()

@@ -215,8 +215,8 @@ def _last_error() -> OSError:
 
 
 def _locked_kilobytes() -> int:
-    found = re.search(r"^VmLck:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
-    return int(found[1]) if found else 0
+    match = re.search(r"^VmLck:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
+    return int(match[1]) if match else 0
 
 
 @contextmanager

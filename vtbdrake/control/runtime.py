@@ -304,7 +304,7 @@ class Runtime(Stepped):
             pace=pace,
             at=self._time_of_commands(due, stepped),
             released=bool(self.guards.leaving) and self._released,
-            others=self.bridge.sensed,
+            all_sensed=self.bridge.sensed,
         )
         unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
         self.guards.note_unsent(unsent)
@@ -333,8 +333,8 @@ class Runtime(Stepped):
             if not np.isfinite(command).all():
                 continue  # This is a fault of its own.
             self.uncompared.remove(name)
-            if found := discontinuity(self, name, command):
-                reasons += found
+            if differences := discontinuity(self, name, command):
+                reasons += differences
                 self.guards.withhold(name)
         return "; ".join(reasons) or None
 
@@ -552,9 +552,9 @@ class Runtime(Stepped):
 
 
 def _check_fit(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:
-    for what, its in (("guards", guards.period), ("statistics", statistics.period)):
+    for part, its in (("guards", guards.period), ("statistics", statistics.period)):
         if its != period:
-            raise ValueError(f"the {what} of this loop are made for a period of {its} s, not for {period} s")
+            raise ValueError(f"the {part} of this loop are made for a period of {its} s, not for {period} s")
     sides = (("actuator", guards.limiters, interface.act), ("sensor", guards.monitors, interface.sense))
     for side, guarded, signals in sides:
         names = [signal.name for signal in signals]

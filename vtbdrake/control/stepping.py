@@ -83,7 +83,11 @@ def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:
     Otherwise pydrake makes and discards a wrapper (1 us) whenever a system in Python reads its parameters.
     """
     contexts = [system.GetMyContextFromRoot(context) for _, system in leaves(diagram)]
-    return [own.get_numeric_parameter(i) for own in contexts for i in range(own.num_numeric_parameter_groups())]
+    return [
+        leaf_context.get_numeric_parameter(i)
+        for leaf_context in contexts
+        for i in range(leaf_context.num_numeric_parameter_groups())
+    ]
 
 
 class RealPorts:
@@ -171,7 +175,7 @@ class Stepped:
         self._sensed = dict.fromkeys(bridge.sensed, 0)
         self._commands = dict.fromkeys(bridge.commands, 0)
         # For each command, the reasons to reject it that have been logged.
-        self._told: dict[str, frozenset[str]] = dict.fromkeys(bridge.commands, frozenset())
+        self._logged_rejections: dict[str, frozenset[str]] = dict.fromkeys(bridge.commands, frozenset())
         self.read_switches()
 
     @property
@@ -233,12 +237,12 @@ class Stepped:
                     self.write({address: np.reshape(received.value, self.target.variables()[address].shape)})
                 except ValueError:
                     received.reject("refused")
-            if len(received.rejected) > len(self._told[name]):
-                new = ", ".join(received.rejected.keys() - self._told[name])
+            if len(received.rejected) > len(self._logged_rejections[name]):
+                new = ", ".join(received.rejected.keys() - self._logged_rejections[name])
                 _log.warning(
                     "a message with the command %s was rejected (%s); more like it are only counted", name, new
                 )
-                self._told[name] = frozenset(received.rejected)
+                self._logged_rejections[name] = frozenset(received.rejected)
 
     def read(self, address: str) -> Any:
         """Return the present value of a variable or a port of the target, for example ``real.sense.<signal>``.

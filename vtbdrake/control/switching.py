@@ -132,27 +132,27 @@ def checked_continuity(
 
 def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
     """Return the reasons why commands of actuator signals would not continue the measured values."""
-    found = []
+    reasons = []
     for name in names:
         if name not in runtime.continuity:
             if runtime.guards.limiters[name].needs_start:
-                found.append(
+                reasons.append(
                     f"the actuator command {name} is limited in rate or acceleration and needs a measurement to depart "
                     f"from: give continuity={{{name!r}: (sensor signal, largest difference)}}"
                 )
             continue
         sensor, _ = runtime.continuity[name]
         if runtime.bridge.sensed[sensor].value is None:
-            found.append(f"the actuator command {name} departs from {sensor}, which has never been measured")
+            reasons.append(f"the actuator command {name} departs from {sensor}, which has never been measured")
             continue
         try:
             command = runtime.actuator_command(name)
         except FAILURES as error:
-            found.append(f"the actuator command {name} cannot be computed: {error_text(error)}")
+            reasons.append(f"the actuator command {name} cannot be computed: {error_text(error)}")
             continue
         if command is not None:  # A DPS that has not started has no command; its first one is compared in its cycle.
-            found += discontinuity(runtime, name, command)
-    return found
+            reasons += discontinuity(runtime, name, command)
+    return reasons
 
 
 def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:

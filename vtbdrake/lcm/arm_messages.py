@@ -257,9 +257,9 @@ class OnTopOfGravityMap(LcmMap):
 
     def _sizes(self, signals: Sequence[Signal]) -> tuple[int, list[Signal]]:
         """Return the number of joints, and the signals of ``whole``; raise ValueError if the gravity does not fit."""
-        known = {signal.name: signal for signal in signals}
-        (size, *others) = {known[name].size for name in self.on_top}
-        if others or size is None:
+        by_name = {signal.name: signal for signal in signals}
+        (size, *other_sizes) = {by_name[name].size for name in self.on_top}
+        if other_sizes or size is None:
             raise ValueError(f"signals {', '.join(self.on_top)} on channel {self.channel} are vectors of one size")
         try:
             shape = np.shape(self.gravity(np.zeros(size)))
@@ -267,7 +267,7 @@ class OnTopOfGravityMap(LcmMap):
             raise ValueError(f"the gravity of channel {self.channel} cannot take {size} positions: {error}") from error
         if shape != (size,):
             raise ValueError(f"the gravity of channel {self.channel} has the shape {shape}, not ({size},)")
-        return size, [known.get(name) or Signal(name, size=size) for name in self.whole.signals]
+        return size, [by_name.get(name) or Signal(name, size=size) for name in self.whole.signals]
 
 
 def _arm_status(

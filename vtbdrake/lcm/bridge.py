@@ -156,10 +156,10 @@ class LcmBridge(Bridge):
 
     @property
     def competing_publisher(self) -> str | None:
-        found = self._foreign.recent(FOREIGN_TIMEOUT)
-        if not found:
+        channels = self._foreign.recent(FOREIGN_TIMEOUT)
+        if not channels:
             return None
-        return f"another client publishes commands on {', '.join(sorted(found))}: only one may command a machine"
+        return f"another client publishes commands on {', '.join(sorted(channels))}: only one may command a machine"
 
     def open(self) -> None:
         self.link.open()
@@ -179,8 +179,8 @@ class LcmBridge(Bridge):
         """Date values back until all that has waited at the hub is read; on other buses nothing is done."""
         if not self.url.startswith(_HUB):
             return False
-        before, others = self._paused or (since, frozenset())
-        self._paused = min(before, since), others.union(signals)
+        earlier, earlier_signals = self._paused or (since, frozenset())
+        self._paused = min(earlier, since), earlier_signals.union(signals)
         self._send_mark()
         return True
 
@@ -423,24 +423,24 @@ class ForeignCommands:
         self._name = name
         self._protected: frozenset[str] = frozenset()
         # By channel and message, how often it was sent and has not come back; the oldest first.
-        self._own: dict[str, dict[bytes, int]] = {channel: {} for channel in channels}
+        self._expected: dict[str, dict[bytes, int]] = {channel: {} for channel in channels}
         self._heard_at: dict[str, float] = {}
         self._refused_at: dict[str, float] = {}
         self._refusals: dict[str, int] = {}  # of the hub so far, by channel
 
     def expect(self, channel: str, data: bytes) -> None:
         """Remember a message that is about to be sent."""
-        own = self._own[channel]
-        own[data] = own.pop(data, 0) + 1
-        if len(own) > self._MEMORY:
-            del own[next(iter(own))]
+        expected = self._expected[channel]
+        expected[data] = expected.pop(data, 0) + 1
+        if len(expected) > self._MEMORY:
+            del expected[next(iter(expected))]
 
     def receive(self, channel: str, data: bytes) -> None:
         """Handle a message that came on an actuator channel."""
-        own = self._own[channel]
-        if (left := own.pop(data, 0)) > 0:
+        expected = self._expected[channel]
+        if (left := expected.pop(data, 0)) > 0:
             if left > 1:
-                own[data] = left - 1
+                expected[data] = left - 1
             return
         self.heard[channel] += 1
         self._heard_at[channel] = time.monotonic()
@@ -479,8 +479,8 @@ class ForeignCommands:
 
 
 def _signals(signals: Sequence[Signal], map: LcmMap) -> list[Signal]:
-    known = {signal.name: signal for signal in signals}
-    return [known[name] for name in map.signals]
+    by_name = {signal.name: signal for signal in signals}
+    return [by_name[name] for name in map.signals]
 
 
 def _check_maps(
@@ -508,7 +508,7 @@ def _check_maps(
                         f"{', '.join(carriers) or 'none'}"
                     )
                 carriers[name].append(map.channel)
-        for name, found in carriers.items():
-            if len(found) > 1 or (not found and kind != "command"):
-                several = f"several: {', '.join(found)}" if found else "none"
+        for name, carrying in carriers.items():
+            if len(carrying) > 1 or (not carrying and kind != "command"):
+                several = f"several: {', '.join(carrying)}" if carrying else "none"
                 raise ValueError(f"{kind} signal {name} needs a map to one LCM channel, it has {several}")

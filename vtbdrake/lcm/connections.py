@@ -246,7 +246,7 @@ class _Search:
     def __init__(self, connect: Callable[[], Connection]) -> None:
         self._connect = connect
         self._cancelled = threading.Event()
-        self._found: SimpleQueue[Connection] = SimpleQueue()
+        self._result: SimpleQueue[Connection] = SimpleQueue()
         threading.Thread(target=self._run, name="vtbdrake-lcm-search", daemon=True).start()
 
     def _run(self) -> None:
@@ -255,7 +255,7 @@ class _Search:
         pause = FIRST_PAUSE
         while not self._cancelled.is_set():
             try:
-                self._found.put(self._connect())
+                self._result.put(self._connect())
                 break
             except OSError:
                 self._cancelled.wait(pause)
@@ -266,15 +266,15 @@ class _Search:
     def result(self, timeout: float = 0.0) -> Connection | None:
         """Return the connection, once; wait for it."""
         try:
-            return self._found.get(timeout=timeout) if timeout > 0 else self._found.get_nowait()
+            return self._result.get(timeout=timeout) if timeout > 0 else self._result.get_nowait()
         except Empty:
             return None
 
     def cancel(self) -> None:
         """End the search, and close the connection that it has found."""
         self._cancelled.set()
-        if (found := self.result()) is not None:
-            found.close()
+        if (connection := self.result()) is not None:
+            connection.close()
 
 
 class LcmLink:
@@ -353,8 +353,8 @@ class LcmLink:
         return [] if connection is None else [connection]
 
     def _current(self, timeout: float = 0.0) -> Connection | None:
-        if self._search is not None and (found := self._search.result(timeout)) is not None:
-            self._connection, self._search = found, None
+        if self._search is not None and (connection := self._search.result(timeout)) is not None:
+            self._connection, self._search = connection, None
             self.reconnections += 1
             self._reconnected()
         return self._connection

@@ -64,8 +64,8 @@ class ImageMap(LcmMap):
 
         def decode_images(data: bytes) -> tuple[float, Mapping[str, Any]]:
             message = decode(self.type, data)
-            found = {image.header.frame_name: image for image in message.images} if array else {}
-            images = {name: found.get(frame) if array else message for name, frame in self.frames.items()}
+            by_frame = {image.header.frame_name: image for image in message.images} if array else {}
+            images = {name: by_frame.get(frame) if array else message for name, frame in self.frames.items()}
             values = {name: _to_image(image, models[name]) for name, image in images.items() if image is not None}
             return message.header.utime * 1e-6, values
 

@@ -189,7 +189,7 @@ def _check_type(channel: str, message_type: Any) -> None:
 
 
 def _fields(message_type: Any, prefix: str = "") -> tuple[Field, ...]:
-    found = []
+    fields = []
     for name, typename, dimensions in zip(
         message_type.__slots__, message_type.__typenames__, message_type.__dimensions__, strict=True
     ):
@@ -198,18 +198,18 @@ def _fields(message_type: Any, prefix: str = "") -> tuple[Field, ...]:
         if typename not in _CODES:
             package, _, own_name = typename.rpartition(".")
             members = _fields(getattr(import_module(package or own_name), own_name), f"{prefix}{name}.")
-        found.append(Field(prefix + name, typename, sizes, members))
-    return tuple(found)
+        fields.append(Field(prefix + name, typename, sizes, members))
+    return tuple(fields)
 
 
 def _by_path(fields: Sequence[Field]) -> dict[str, Field]:
     """Return all fields that occur exactly once in every message."""
-    found = {}
+    by_path = {}
     for field in fields:
-        found[field.path] = field
+        by_path[field.path] = field
         if not field.dimensions:
-            found |= _by_path(field.members)
-    return found
+            by_path |= _by_path(field.members)
+    return by_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,52 +330,54 @@ def vector_map(
         known_fields = _fields(message_type)
     except RecursionError:
         raise ValueError(f"{message_type.__name__} contains itself: write an LcmMap for it") from None
-    known = _by_path(known_fields)
-    found: dict[str, list[Field]] = {}
-    for name, given in fields.items():
-        paths = [given] if isinstance(given, str) else given
-        found[name] = [_number_field(message_type, known, path) for path in paths]
-        if len(paths) > 1 and any(field.length for field in found[name]):
+    fields_by_path = _by_path(known_fields)
+    parts: dict[str, list[Field]] = {}
+    for name, spec in fields.items():
+        paths = [spec] if isinstance(spec, str) else spec
+        parts[name] = [_number_field(message_type, fields_by_path, path) for path in paths]
+        if len(paths) > 1 and any(field.length for field in parts[name]):
             raise ValueError(
                 f"signal {name} on channel {channel} cannot be spread over {', '.join(paths)}: an array of variable "
                 "length carries a signal alone"
             )
-    if stamp and _number_field(message_type, known, stamp).dimensions:
+    if stamp and _number_field(message_type, fields_by_path, stamp).dimensions:
         raise ValueError(f"field {stamp} of {message_type.__name__} is no time; give stamp='' if there is none")
     scale = dict(scale or {})
     for name, factor in scale.items():
-        if name not in found or not (isfinite(factor) and factor != 0.0):
+        if name not in parts or not (isfinite(factor) and factor != 0.0):
             raise ValueError(
-                f"scale maps signals of channel {channel} ({', '.join(found)}) to finite factors other than zero, not "
+                f"scale maps signals of channel {channel} ({', '.join(parts)}) to finite factors other than zero, not "
                 f"{name!r} to {factor!r}"
             )
     return VectorMap(
         channel=channel,
         type=message_type,
-        signals=tuple(found),
-        parts=found,
+        signals=tuple(parts),
+        parts=parts,
         fields=known_fields,
         stamp=stamp,
         scale=scale,
-        constants=_constants(message_type, known, constants or {}),
+        constants=_constants(message_type, fields_by_path, constants or {}),
     )
 
 
-def _constants(message_type: Any, known: Mapping[str, Field], constants: Mapping[str, float]) -> dict[str, float]:
+def _constants(
+    message_type: Any, fields_by_path: Mapping[str, Field], constants: Mapping[str, float]
+) -> dict[str, float]:
     numbers: dict[str, float] = {}
     for path, number in constants.items():
-        field = _number_field(message_type, known, path)
+        field = _number_field(message_type, fields_by_path, path)
         if field.dimensions or (field.typename not in ("float", "double") and number != int(number)):
             raise ValueError(f"field {path} of {message_type.__name__}, a {field.typename}, cannot hold {number!r}")
         numbers[path] = number if field.typename in ("float", "double") else int(number)
     return numbers
 
 
-def _number_field(message_type: Any, known: Mapping[str, Field], path: str) -> Field:
-    if path not in known:
+def _number_field(message_type: Any, fields_by_path: Mapping[str, Field], path: str) -> Field:
+    if path not in fields_by_path:
         fields = ", ".join(message_type.__slots__)
         raise ValueError(f"{message_type.__name__} has no field {path!r}; it has {fields}")
-    field = known[path]
+    field = fields_by_path[path]
     if field.typename not in _NUMBERS or (field.length and len(field.dimensions) > 1):
         shape = "".join(f"[{dimension}]" for dimension in field.dimensions)
         raise ValueError(

@@ -10,7 +10,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.control.array_entries cimport entries_of
+from vtbdrake.state.arrays cimport entries_of
 from vtbdrake.lcm.byte_order cimport (
     get_double,
     get_float,

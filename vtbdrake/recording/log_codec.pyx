@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t, int64_t, uint32_t, uint64_t
 from libc.string cimport memcpy, memset
 
 from vtbdrake.lcm.byte_order cimport get_uint32, get_uint64, put_double, put_uint32, put_uint64
-from vtbdrake.control.array_entries cimport entries_of
+from vtbdrake.state.arrays cimport entries_of
 from vtbdrake.lcm.maps import LONGEST_CHANNEL_NAME
 from vtbdrake.recording.log_format import (
     COMMANDED,
@@ -216,7 +216,7 @@ def find_events(content not None):
     cdef const Header* header
     cdef int64_t[4] place
     cdef bint whole, good
-    cdef array found
+    cdef array places_of_channel
     cdef dict places = {}
     cdef int64_t more = 0, latest = 0
     damages, sync = [], SYNC.to_bytes(4, "big")
@@ -249,10 +249,10 @@ def find_events(content not None):
             if len(places) >= MAX_CHANNELS:
                 raise LogError(f"the file is not a log: it has events on more than {MAX_CHANNELS} channels")
             entry = places[channel] = array("q")
-        found = entry
+        places_of_channel = entry
         place[0], place[1] = <int64_t>get_uint64(&header.number), <int64_t>get_uint64(&header.utime)
         place[2], place[3] = begin, end
-        extend_buffer(found, <char*>place, 4)
+        extend_buffer(places_of_channel, <char*>place, 4)
         at = end
     if more:
         damages.append((latest, f"the last of {more} more"))
@@ -295,7 +295,7 @@ def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None)
         begin, end = places[i, 2], places[i, 3]
         if not 0 <= begin <= end <= view.shape[0]:
             raise IndexError(f"bytes {begin} to {end} are outside the file, which has {view.shape[0]}")
-        what = "a cycle of another length"
+        kind = "a cycle of another length"
         if end - begin == size:
             length = <int32_t>get_uint32(data + begin + size_at)
             number = <int64_t>get_uint64(data + begin + number_at)
@@ -303,14 +303,14 @@ def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None)
             if not size < length <= end or crc != <uint32_t>crc32(
                 PyMemoryView_FromMemory(<char*>data + end - length, length - 4, PyBUF_READ)
             ):
-                what = f"the checksum of cycle {number} is wrong"
+                kind = f"the checksum of cycle {number} is wrong"
             elif number <= newest:
-                what = f"cycle {number} follows cycle {newest}"
+                kind = f"cycle {number} follows cycle {newest}"
             else:
                 newest = number
                 memcpy(&record[n, 0], data + begin, size)
                 frame[n, 0], frame[n, 1] = end - length, end
                 n += 1
                 continue
-        damages.append((begin, what))
+        damages.append((begin, kind))
     return records[:n].reshape(-1).view(dtype), frames[:n], damages

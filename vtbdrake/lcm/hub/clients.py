@@ -59,7 +59,7 @@ class ClientConnection:
     @property
     def memory(self) -> int:
         """Return how many bytes the hub keeps for the client: its backlog and its incomplete message."""
-        return self.queued + self.reader.held
+        return self.queued + self.reader.buffered
 
     def acknowledge(self) -> None:
         """Acknowledge the received data at once.

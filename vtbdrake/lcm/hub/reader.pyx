@@ -67,7 +67,7 @@ cdef class TcpqReader(Stream):
         return self.large is not None or self.end > self.begin
 
     @property
-    def held(self):
+    def buffered(self):
         """Return the number of bytes in the buffer."""
         return self.end - self.begin + (self.filled if self.large is not None else 0)
 

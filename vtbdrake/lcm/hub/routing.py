@@ -130,14 +130,14 @@ class ProtectedChannel:
                 _log.warning("%s: its owner is %s, previously %s", self.name, client.name, self.owner.name)
         self.owner, self._statistics.owner, self._renewed = client, client.name, now
 
-    def _reject(self, client: ClientConnection, what: str) -> None:
+    def _reject(self, client: ClientConnection, request: str) -> None:
         statistics = self._statistics
         statistics.refused += 1
         statistics.last_refused = client.name
         _log.warning(
             "%s: %s by %s rejected; its owner is %s%s (%d rejected so far)",
             self.name,
-            what,
+            request,
             client.name,
             statistics.owner,
             "" if self.owner else ", disconnected, with a lease that has not expired",

@@ -319,8 +319,8 @@ class HubServer:
                 raise TcpqError("user", f"{name} may not connect; start the hub with --user or --all-users")
             if user not in self._own_users:
                 per_user, all_others = max(1, config.max_clients // 4), max(1, 3 * config.max_clients // 4)
-                others = [client.user for client in clients if client.user not in self._own_users]
-                if len(others) >= all_others or (user is not None and others.count(user) >= per_user):
+                other_users = [client.user for client in clients if client.user not in self._own_users]
+                if len(other_users) >= all_others or (user is not None and other_users.count(user) >= per_user):
                     limits = f"{per_user} clients per user, {all_others} together"
                     raise TcpqError("quota", f"limit for users other than the hub's own reached: {limits}")
         else:
@@ -444,7 +444,7 @@ class HubServer:
             return
         self._checked_at = now
         for client in list(self._clients.values()):
-            received = client.reader.held
+            received = client.reader.buffered
             if now - client.progressed_at > patience and client.queued:
                 self._disconnect(client, "stalled", f"no reading for {patience:g} s, backlog of {client.queued} bytes")
             elif now - client.progressed_at > patience and not client.reader.greeted:
