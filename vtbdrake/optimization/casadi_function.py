@@ -104,8 +104,7 @@ class ProblemFunction(casadi.Callback):
         """Return the gradient at ``x``, shape (n,)."""
         point = self._point(x)
         if self._gradients is not None:
-            sign = -1.0 if self._problem.objectives[0].minimize else 1.0
-            return sign * np.array(self._gradients.at(point))
+            return self._problem.objectives[0].sign * np.array(self._gradients.at(point))
         pairs = [self._neighbours(point, i) for i in range(len(point))]
         values = np.array(self._values([neighbour for pair in pairs for neighbour in pair])).reshape(-1, 2)
         widths = np.array([above[i] - below[i] for i, (below, above) in enumerate(pairs)])

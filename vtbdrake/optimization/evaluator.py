@@ -65,7 +65,7 @@ class Evaluator:
         self._budget = budget
         self._round = round_size
         self._conditions = range(len(problem.conditions))
-        self._signs = np.array([-1.0 if quality.minimize else 1.0 for quality in problem.objectives])
+        self._signs = np.array([quality.sign for quality in problem.objectives])
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
         # Independent of the known ones, of which a resumed study has more.
         self._needed: set[RolloutKey] = set()
@@ -211,7 +211,7 @@ class Gradients:
     def at(self, point: Point) -> tuple[float, ...]:
         """Return the gradient of the value that a solver maximizes, shape (n,)."""
         problem = self._problem
-        sign = -1.0 if problem.objectives[0].minimize else 1.0
+        sign = problem.objectives[0].sign
         values, slopes = [], []
         for condition, runner in enumerate(self._runners):
             parameters = split(problem.values(point, condition=condition))[1]

@@ -106,7 +106,7 @@ class StudyRun:
         self._limit = inf if rollouts is None else rollouts
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         if target is not None:
-            self._target = -target if self._problem.objectives[0].minimize else target
+            self._target = self._problem.objectives[0].sign * target
         shown = self._progress and watched()
         name = f"study ({self._solver.name})"
         if self._progress and not shown:

@@ -233,14 +233,14 @@ class DecisionRun:
         tried = [point for point in self._proposed if point in begun]
         candidates = tuple(self._candidate(number, point) for number, point in enumerate(tried))
         eligible = [candidate for candidate in candidates if candidate.status == ELIGIBLE]
-        sign = 1.0 if problem.objectives[0].minimize else -1.0
-        ranked = sorted(eligible, key=lambda candidate: (sign * candidate.quality, candidate.number))
+        sign = problem.objectives[0].sign
+        ranked = sorted(eligible, key=lambda candidate: (-sign * candidate.quality, candidate.number))
         best = ranked[0] if ranked else None
         improvement = margin = nan
         if best is not None and candidates[0].status == ELIGIBLE:
-            improvement = sign * (candidates[0].quality - best.quality) + 0.0
+            improvement = sign * (best.quality - candidates[0].quality) + 0.0
         if len(ranked) > 1:
-            margin = sign * (ranked[1].quality - ranked[0].quality) + 0.0
+            margin = sign * (ranked[0].quality - ranked[1].quality) + 0.0
         elapsed = time.monotonic() - self._requested_at
         results = [self._results[point, sample] for point, sample in self._keys() if (point, sample) in self._results]
         budget = self._budget

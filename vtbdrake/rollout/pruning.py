@@ -99,7 +99,7 @@ class Prospect:
             if isinstance(measure, Constraint) and measure.reading == "worst"
         ]
         self._horizon = horizon
-        self._sign = -1.0 if quality.minimize else 1.0
+        self._sign = quality.sign
         self._to_beat = -inf if isnan(to_beat) else self._sign * to_beat
         self._best, self._worst, self._integral = -inf, inf, 0.0
         self._last: tuple[float, float] | None = None

@@ -153,6 +153,11 @@ class Quality(Measure):
         if self.minimize and self.upper != inf:
             raise QualityError("the best that a cost can be is 0; upper belongs to a quality that is maximized")
 
+    @property
+    def sign(self) -> float:
+        """Return 1, or -1 for a cost: larger is better for ``sign`` times the value in the user's terms."""
+        return -1.0 if self.minimize else 1.0
+
     def _refuse_invalid(self, sample: float, where: Callable[[], str]) -> None:
         if not isfinite(sample) or sample < 0.0:
             remedy = (

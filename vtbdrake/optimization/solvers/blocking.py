@@ -11,6 +11,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
+from vtbdrake.failures import error_text
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver
 
 _log = logging.getLogger(__name__)
@@ -134,7 +135,7 @@ class BlockingSolver(Solver):
         if isinstance(request, list):
             return request
         if isinstance(request, BaseException):
-            self._end(False, f"{type(request).__name__}: {request}")
+            self._end(False, error_text(request))
             raise request
         self._end(*request)
         return []
