@@ -107,29 +107,29 @@ class Localizer:
         getattr(self.detect, "prepare", lambda: None)()
 
     def __call__(
-        self, *, request: Array, history: Array, memory: UnitState, **seen: Any
+        self, *, request: Array, history: Array, memory: UnitState, **inputs: Any
     ) -> tuple[dict[str, Any], UnitState]:
         """Return the outputs of the slow part, and the memory of the unit.
 
         ``seen`` holds the samples of the signals and their times, such as ``scan`` and ``scan_time``. Samples of
         different times do not fit together: then nothing is detected, nor before `SETTLED`.
         """
-        times = [float(seen[f"{name}_time"][0]) for name in self.signals]
+        times = [float(inputs[f"{name}_time"][0]) for name in self.signals]
         taken, sees = times[0], min(times) == max(times) >= SETTLED
         with _blas().limit(limits=1, user_api="blas"):
-            samples = [seen[name] for name in self.signals]
+            samples = [inputs[name] for name in self.signals]
             landmarks = self.detect(*samples, history, taken) if sees else Landmarks.empty()
-            found, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
+            answer, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
         outputs = {
-            "pose": found.pose,
-            "covariance": found.covariance.ravel(),
-            "status": [found.status],
-            "time": [found.time],
-            "odometry": found.X_OH,
+            "pose": answer.pose,
+            "covariance": answer.covariance.ravel(),
+            "status": [answer.status],
+            "time": [answer.time],
+            "odometry": answer.X_OH,
             "detected": [len(landmarks)],
-            "matched": [found.matched],
-            "nis": [found.nis],
-            "range_bias": [found.range_bias],
+            "matched": [answer.matched],
+            "nis": [answer.nis],
+            "range_bias": [answer.range_bias],
             "landmarks": shown(landmarks),
         }
         return outputs, memory

@@ -191,15 +191,15 @@ class CarrierScenario(Scenario):
         """
         if not self.map_file:
             return self.surveyed_map(MAPS[self.map])
-        found = load_geojson(self.map_file, deviation=MAPS[self.map].position)
-        places, area = found.positions()[:, :2], np.array([self.length, self.width])
+        mapped = load_geojson(self.map_file, deviation=MAPS[self.map].position)
+        places, area = mapped.positions()[:, :2], np.array([self.length, self.width])
         if len(places) and not ((places >= 0.0) & (places <= area)).all(axis=1).any():
             x, y = places.mean(axis=0).tolist()
             raise GeoJsonError(
                 f"{self.map_file}: no object lies in the area from (0, 0) to ({self.length:g}, {self.width:g}) m, "
                 f"their mean is ({x:.0f}, {y:.0f}) m: local_frame of the file must be where the origin of the area is"
             )
-        return found
+        return mapped
 
     def check_perception(self) -> None:
         """Check the configuration of the sensor that detects landmarks.

@@ -75,8 +75,8 @@ class RockField:
     def diameters(self, uniform: Array) -> Array:
         """Return the diameters (m), (n,), at which the distribution of rocks has the probabilities ``uniform`` (n,)."""
         diameters, number = self._cumulative()
-        found: Array = np.interp(uniform * number[-1], number, diameters)
-        return found
+        interpolated: Array = np.interp(uniform * number[-1], number, diameters)
+        return interpolated
 
     def routes(self) -> tuple[Route, ...]:
         """Return the routes along the tracks; none without tracks."""
@@ -117,8 +117,8 @@ class RockField:
         truth = tuple(self.rocks())
         places, widths = surveyed(
             np.random.default_rng([self.seed, _MAP, seed]),
-            np.array([one.p_WoOo_W[:2] for one in truth]).reshape(-1, 2),
-            np.array([one.number("width", unit="m") for one in truth]),
+            np.array([rock.p_WoOo_W[:2] for rock in truth]).reshape(-1, 2),
+            np.array([rock.number("width", unit="m") for rock in truth]),
             errors=errors,
             area=(self.length, self.width),
             false_diameters=self.diameters,
@@ -163,8 +163,8 @@ class RockField:
 
 def rock_surface(rocks: WorldModel, ground: Ground) -> Surface:
     """Return all rocks as one surface, with their middles on the ground."""
-    sizes = np.array([[one.number(name, unit="m") for name in ("length", "width", "height")] for one in rocks])
-    rotations = np.array([one.X_WO.rotation().matrix() for one in rocks]).reshape(-1, 3, 3)
+    sizes = np.array([[rock.number(name, unit="m") for name in ("length", "width", "height")] for rock in rocks])
+    rotations = np.array([rock.X_WO.rotation().matrix() for rock in rocks]).reshape(-1, 3, 3)
     p = rocks.positions()
     centres = np.column_stack([p[:, :2], ground.height(p[:, 0], p[:, 1])])
     return copies(unit_sphere(2), rotations * 0.5 * sizes.reshape(-1, 1, 3), centres)

@@ -135,12 +135,12 @@ class MarkerPose:
     ) -> dict[str, Any]:
         """Return the estimate of X_IT, and the count of the target's markers in the image."""
         taken = float(time[0])
-        found = detect_markers(image, self.detector).on(self.board)
+        detections = detect_markers(image, self.detector).on(self.board)
         X_IC = pose_at(history, taken) @ self.X_BC
         tracked = TrackedTarget(target, status, float(history[0]) + self.period)
         prediction = X_IC.inverse() @ tracked.at(taken) if tracked.valid else None
-        X_CT = pose_from_markers(found, self.board, self.intrinsics, time=taken, prediction=prediction)
-        return {"estimate": X_CT.seen_from(X_IC), "count": np.array([len(found.ids)], dtype=float)}
+        X_CT = pose_from_markers(detections, self.board, self.intrinsics, time=taken, prediction=prediction)
+        return {"estimate": X_CT.seen_from(X_IC), "count": np.array([len(detections.ids)], dtype=float)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +190,8 @@ class ScanPose:
         fired = taken + (scan.times if self.deskew else np.zeros_like(scan.times))
         points = in_inertial_frame(p_BQ, fired, history)
         if tracked.valid:
-            found = self._follow(points, scan.times, eye, tracked, time=taken)
-            return found, found
+            estimate = self._follow(points, scan.times, eye, tracked, time=taken)
+            return estimate, estimate
         is_recent = memory.valid and taken - memory.time < _RECENT
         skewed = self._best(points, eye, taken, [memory.X] if is_recent else self._guesses(points, eye))
         if not (self.deskew and skewed.valid):
@@ -225,12 +225,12 @@ class ScanPose:
     def _best(self, points: Array, eye: Array, time: float, starts: Sequence[RigidTransform]) -> PoseEstimate:
         """Return the best of the estimates that begin at ``starts``."""
         settings = self.registration
-        found = [
+        estimates = [
             register_points(points, self.faces, start, eye=eye, time=time, registration=settings) for start in starts
         ]
         limit = 4.0 * settings.range_noise
-        scores = [misfit(points, self.faces, e.X, eye=eye, limit=limit) if e.valid else np.inf for e in found]
-        return found[int(np.argmin(scores))]
+        scores = [misfit(points, self.faces, e.X, eye=eye, limit=limit) if e.valid else np.inf for e in estimates]
+        return estimates[int(np.argmin(scores))]
 
     def _guesses(self, points: Array, eye: Array) -> list[RigidTransform]:
         """Return poses behind the nearest points, in attitudes about the one to begin with."""

@@ -320,7 +320,7 @@ class Supervisor(AddressedSystem):
             TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p.largest_speed,
             TIMEOUT: since > p.time_limit,
         }
-        return next((reason for reason, found in checks.items() if found), 0.0)
+        return next((reason for reason, is_present in checks.items() if is_present), 0.0)
 
     def _unreachable(self, relative: Relative, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""

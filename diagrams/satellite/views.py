@@ -42,15 +42,15 @@ def looking(eye: ArrayLike, at: ArrayLike) -> RigidTransform:
 def pictures(testbed: VirtualTestbed, context: Context) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the scene from `VIEWPOINT`, and what the docking camera sees now, as arrays (h, w, 3)."""
     camera = testbed.diagram.GetSubsystemByName(CAMERA)
-    own = camera.GetMyContextFromRoot(context)
+    camera_context = camera.GetMyContextFromRoot(context)
     mounted = np.array(testbed.read(context, f"{CAMERA}.pose"))
-    seen = np.array(camera.render(own).data[..., :3])
+    image = np.array(camera.render(camera_context).data[..., :3])
     testbed.write(context, {f"{CAMERA}.pose": pose_to_array(looking(VIEWPOINT, MIDDLE))})
     try:
-        scene = np.array(camera.render(own).data[..., :3])
+        scene = np.array(camera.render(camera_context).data[..., :3])
     finally:
         testbed.write(context, {f"{CAMERA}.pose": mounted})
-    return scene, seen
+    return scene, image
 
 
 def film_strip(testbed: VirtualTestbed, times: Sequence[float]) -> Figure:

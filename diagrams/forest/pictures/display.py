@@ -87,10 +87,10 @@ class DriverDisplay:
 
     def show(self, values: Mapping[str, ArrayLike]) -> None:
         """Show the present values of the unit, by the addresses of `WATCHED`."""
-        known = {address: np.asarray(values[address], dtype=float) for address in WATCHED}
-        status = int(known[STATUS])
-        pose = np.append(known[POSITION], known[HEADING])
-        covariance = known[COVARIANCE][:2, :2]
+        values_by_address = {address: np.asarray(values[address], dtype=float) for address in WATCHED}
+        status = int(values_by_address[STATUS])
+        pose = np.append(values_by_address[POSITION], values_by_address[HEADING])
+        covariance = values_by_address[COVARIANCE][:2, :2]
         has_pose = bool(np.isfinite(pose).all())
         for path in ("carrier", "ellipse"):
             self._meshcat.SetProperty(f"display/{path}", "visible", has_pose)
@@ -99,16 +99,16 @@ class DriverDisplay:
             X_WH = RigidTransform(RotationMatrix.MakeZRotation(pose[2]), self._place)
             self._meshcat.SetTransform("display/carrier", X_WH @ RigidTransform([0.0, 0.0, _ROOF / 2.0]))
             self._meshcat.SetTransform("display/ellipse", ellipse(pose[:2], covariance))
-        self._show_landmarks(known[FOUND_AT], known[LANDMARKS].reshape(-1, 3))
+        self._show_landmarks(values_by_address[FOUND_AT], values_by_address[LANDMARKS].reshape(-1, 3))
         self._show_status(status, covariance)
         self._meshcat.SetTransform("display", RigidTransform(-self._place))
 
     def _show_landmarks(self, X_WH: Array, landmarks: Array) -> None:
         """Draw landmarks, rows of [x, y (m, in H), diameter (m)], where they were seen from the pose X_WH."""
-        seen = landmarks[np.isfinite(landmarks).all(axis=1)]
+        detections = landmarks[np.isfinite(landmarks).all(axis=1)]
         if not np.isfinite(X_WH).all():
-            seen = seen[:0]
-        for k, (place, diameter) in enumerate(zip(transform(X_WH, seen[:, :2]), seen[:, 2], strict=True)):
+            detections = detections[:0]
+        for k, (place, diameter) in enumerate(zip(transform(X_WH, detections[:, :2]), detections[:, 2], strict=True)):
             path = f"display/landmarks/{k}"
             if k >= self._landmarks:
                 self._meshcat.SetObject(path, Cylinder(1.0, _TRUNK_HEIGHT), _TRUNK)
@@ -116,10 +116,10 @@ class DriverDisplay:
             scaled = np.diag([diameter / 2.0, diameter / 2.0, 1.0, 1.0])
             scaled[:3, 3] = [*place, _TRUNK_HEIGHT / 2.0]
             self._meshcat.SetTransform(path, scaled)
-        low, high = sorted((len(seen), self._shown))
+        low, high = sorted((len(detections), self._shown))
         for k in range(low, high):
-            self._meshcat.SetProperty(f"display/landmarks/{k}", "visible", len(seen) > self._shown)
-        self._shown = len(seen)
+            self._meshcat.SetProperty(f"display/landmarks/{k}", "visible", len(detections) > self._shown)
+        self._shown = len(detections)
 
     def _show_status(self, status: int, covariance: Array) -> None:
         text = status_text(status, covariance)

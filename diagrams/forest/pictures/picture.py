@@ -115,9 +115,9 @@ def draw_surroundings(axes: Axes, scenario: ForestScenario, drive: DriveRecord) 
 
 def draw_errors(axes: Axes, drive: DriveRecord) -> None:
     """Draw the errors of the estimated positions, with the first and the last ellipse that should hold them."""
-    found = np.flatnonzero(np.isfinite(drive.positions).all(axis=1))
+    localized = np.flatnonzero(np.isfinite(drive.positions).all(axis=1))
     errors = drive.positions - drive.truth[:, :2]
-    for k, style, label in ((found[0], ":", "first ellipse"), (found[-1], "-", "last ellipse")):
+    for k, style, label in ((localized[0], ":", "first ellipse"), (localized[-1], "-", "last ellipse")):
         variances, directions = np.linalg.eigh(drive.covariances[k])
         minor, major = 2.0 * DEVIATIONS * np.sqrt(variances)
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))

@@ -95,26 +95,26 @@ def localization(full: bool) -> Answer:
     drives = Drives(length=500.0 if full else 25.0)
     seeds = range(SEED, SEED + (20 if full else 4))
     tracks = list(drives.through(seeds))
-    found = scores(tracks)
-    driven = {seed: one[BOUNDED].drive for seed, one in zip(seeds, tracks, strict=True)}
+    scores_by_map = scores(tracks)
+    driven = {seed: by_map[BOUNDED].drive for seed, by_map in zip(seeds, tracks, strict=True)}
     least = least_error_along(driven, MAPS[BOUNDED])
-    ratio = found[BOUNDED].position / best_error_along(driven, BOUNDED, scenario=drives.scenario)
+    ratio = scores_by_map[BOUNDED].position / best_error_along(driven, BOUNDED, scenario=drives.scenario)
     machine = over_lcm(ForestScenario(seed=1, length=60.0, width=60.0))
-    accurate = found["accurate"]
+    accurate = scores_by_map["accurate"]
     return Answer(
         id="C2",
         question="How well does a localization unit, developed in a virtual forest, know where it is among the trees?",
-        answer=", ".join(f"{name} map {one.position:.3f} m" for name, one in found.items()),
+        answer=", ".join(f"{name} map {score.position:.3f} m" for name, score in scores_by_map.items()),
         unit="(RMS)",
         interval=None,
         paper="done on a harvester; no figures",
         holds=machine.agrees
-        and all(GOALS[name].is_met(one) for name, one in found.items() if name != BOUNDED)
+        and all(GOALS[name].is_met(score) for name, score in scores_by_map.items() if name != BOUNDED)
         and ratio <= LARGEST_RATIO
-        and found[BOUNDED].independent_nees <= found[BOUNDED].bounds[1]
-        and all(one.localized >= LEAST_LOCALIZED and not one.wrong for one in found.values()),
+        and scores_by_map[BOUNDED].independent_nees <= scores_by_map[BOUNDED].bounds[1]
+        and all(score.localized >= LEAST_LOCALIZED and not score.wrong for score in scores_by_map.values()),
         note=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess. "
-        + "; ".join(_summary(name, one) for name, one in found.items())
+        + "; ".join(_summary(name, score) for name, score in scores_by_map.items())
         + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
         f"trees within {REACH:g} m of these drives errs by {least:.2f} m (RMS); on these very maps the unit's error is "
         f"{ratio:.2f} times that of this estimate (at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
@@ -122,11 +122,11 @@ def localization(full: bool) -> Answer:
     )
 
 
-def _summary(name: str, one: Score) -> str:
+def _summary(name: str, score: Score) -> str:
     unreachable = " (judged by the best estimate, below)" if name == BOUNDED else ""
-    goal = ("reached" if GOALS[name].is_met(one) else "NOT reached") + unreachable
+    goal = ("reached" if GOALS[name].is_met(score) else "NOT reached") + unreachable
     return (
-        f"{name}: {one.position:.3f} m (goal {GOALS[name].position:g} m), {np.degrees(one.heading):.2f} deg, NEES "
-        f"{one.independent_nees:.1f} in [{one.bounds[0]:.1f}, {one.bounds[1]:.1f}], a pose in {one.localized:.0%}, "
-        f"{one.wrong} wrong claims, goal {goal}"
+        f"{name}: {score.position:.3f} m (goal {GOALS[name].position:g} m), {np.degrees(score.heading):.2f} deg, NEES "
+        f"{score.independent_nees:.1f} in [{score.bounds[0]:.1f}, {score.bounds[1]:.1f}], a pose in "
+        f"{score.localized:.0%}, {score.wrong} wrong claims, goal {goal}"
     )

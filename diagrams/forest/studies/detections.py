@@ -86,29 +86,29 @@ class Wood:
     def of(cls, stand: Stand, *, false: float, rng: np.random.Generator) -> Wood:
         """Return the trees of a stand, and among them as many false trunks as make up the share ``false`` of all."""
         trees = stand.trees()
-        others = round(len(trees) * false / (1.0 - false))
-        places = np.vstack([trees.positions()[:, :2], rng.random((others, 2)) * [stand.length, stand.width]])
-        true = [one.number("trunk_diameter", unit="m") for one in trees]
-        diameters = np.concatenate([true, stand.diameters(rng.random(others))])
+        false_count = round(len(trees) * false / (1.0 - false))
+        places = np.vstack([trees.positions()[:, :2], rng.random((false_count, 2)) * [stand.length, stand.width]])
+        true = [tree.number("trunk_diameter", unit="m") for tree in trees]
+        diameters = np.concatenate([true, stand.diameters(rng.random(false_count))])
         n = len(places)
         return cls(Landmarks(places, np.zeros((n, 2, 2)), diameters, np.zeros(n)), np.arange(n) < len(trees))
 
     def detected(self, X_WH: ArrayLike, detector: Detector, rng: np.random.Generator) -> tuple[Landmarks, Array]:
         """Return the detections from a pose (3,), as landmarks in H, and the indices of their trunks."""
-        found = visible(self.trunks, np.asarray(X_WH)[:2], reach=detector.reach)
-        found = found[rng.random(len(found)) >= detector.missed]
-        places = transform(inverse(X_WH), self.trunks.positions[found])
+        indices = visible(self.trunks, np.asarray(X_WH)[:2], reach=detector.reach)
+        indices = indices[rng.random(len(indices)) >= detector.missed]
+        places = transform(inverse(X_WH), self.trunks.positions[indices])
         bearings = np.arctan2(places[:, 1], places[:, 0])
         R_HRay = rotations(bearings)
         deviations = np.array([detector.along, detector.across])
-        errors_Ray = rng.normal(size=(len(found), 2)) * deviations + [detector.range_bias, 0.0]
-        seen = Landmarks(
+        errors_Ray = rng.normal(size=(len(indices), 2)) * deviations + [detector.range_bias, 0.0]
+        detections = Landmarks(
             places + np.einsum("nij,nj->ni", R_HRay, errors_Ray),
             R_HRay @ np.diag(deviations**2) @ R_HRay.transpose(0, 2, 1),
-            np.maximum(self.trunks.diameters[found] + detector.diameter * rng.normal(size=len(found)), 0.01),
-            np.full(len(found), detector.diameter),
+            np.maximum(self.trunks.diameters[indices] + detector.diameter * rng.normal(size=len(indices)), 0.01),
+            np.full(len(indices), detector.diameter),
         )
-        return seen, found
+        return detections, indices
 
 
 def visible(trunks: Landmarks, place: ArrayLike, *, reach: float) -> Array:
@@ -181,15 +181,15 @@ def gathered(
     reckoned = dead_reckoned(poses, odometry, rng)
     steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     since = steps.sum() - np.concatenate([[0.0], np.cumsum(steps)])
-    seen: dict[int, list[tuple[Array, Array, float, float]]] = {}
+    sightings_by_trunk: dict[int, list[tuple[Array, Array, float, float]]] = {}
     for X_WH, X_OH, travelled in zip(poses, reckoned, since, strict=True):
         landmarks, trunks = wood.detected(X_WH, detector, rng)
         local = landmarks.seen_from(compose(inverse(reckoned[-1]), X_OH))
         for row, trunk in enumerate(trunks):
             sighting = (local.positions[row], local.covariances[row], local.diameters[row], float(travelled))
-            seen.setdefault(int(trunk), []).append(sighting)
-    parts = [_merged(sightings, detector, odometry) for sightings in seen.values()]
-    return Landmarks.joined(parts), np.array(list(seen), dtype=int)
+            sightings_by_trunk.setdefault(int(trunk), []).append(sighting)
+    parts = [_merged(sightings, detector, odometry) for sightings in sightings_by_trunk.values()]
+    return Landmarks.joined(parts), np.array(list(sightings_by_trunk), dtype=int)
 
 
 def _merged(sightings: list[tuple[Array, Array, float, float]], detector: Detector, odometry: Odometry) -> Landmarks:

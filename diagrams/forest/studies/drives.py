@@ -144,8 +144,10 @@ class Track:
         """Which of the claimed poses are `INDEPENDENT` m apart, the last one among them, shape (m,)."""
         left = (self.drive.travelled[-1] - self.drive.travelled)[self.is_localized]
         marks = np.floor(left / INDEPENDENT)
-        chosen: NDArray[np.bool_] = np.append(marks[:-1] != marks[1:], True) if len(marks) else np.zeros(0, dtype=bool)
-        return chosen
+        is_independent: NDArray[np.bool_] = (
+            np.append(marks[:-1] != marks[1:], True) if len(marks) else np.zeros(0, dtype=bool)
+        )
+        return is_independent
 
     @property
     def first_fix(self) -> tuple[float, float]:
@@ -169,9 +171,9 @@ def localize(drive: Drive, unit: LocalizationUnit) -> Track:
         answers.append(answer)
     return Track(
         drive,
-        np.array([one.pose for one in answers]),
-        np.array([one.covariance for one in answers]),
-        np.array([one.status for one in answers]),
+        np.array([answer.pose for answer in answers]),
+        np.array([answer.covariance for answer in answers]),
+        np.array([answer.status for answer in answers]),
     )
 
 
@@ -238,8 +240,8 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         taken, past = float(time(context)), history(context)
         _, *tilt, x_O, y_O, heading = carrier_pose_at(past, taken)
         rows.append((taken, np.array([x, y, yaw]), np.array([x_O, y_O, heading]), tilt - np.array([roll, pitch])))
-        seen = [sample(context) for sample in samples]
-        landmarks.append(detect(*seen, past, taken) if taken >= SETTLED else Landmarks.empty())
+        inputs = [sample(context) for sample in samples]
+        landmarks.append(detect(*inputs, past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:
             travelled += float(np.hypot(*(rows[-1][1] - rows[-2][1])[:2]))
     times, truths, reckoned, tilts = (np.array(column) for column in zip(*rows, strict=True))
@@ -375,7 +377,9 @@ def best_error_along(drives: Mapping[int, Drive], name: str, *, scenario: Callab
     for seed, drive in drives.items():
         survey = scenario(seed).surveyed_map
         # Without errors of the positions, the same survey has the same entries in the same order.
-        mapped, places = (survey(one).positions()[:, :2] for one in (errors, replace(errors, position=0.0)))
+        mapped, places = (
+            survey(survey_errors).positions()[:, :2] for survey_errors in (errors, replace(errors, position=0.0))
+        )
         # A wrong entry is displaced from nothing.
         is_true = (mapped != places).any(axis=1)
         near = is_true & (cKDTree(drive.truth[:, :2]).query(places)[0] < REACH)
@@ -403,13 +407,13 @@ class Goal:
     heading: float = np.inf
     is_consistent: bool = False
 
-    def is_met(self, found: Score) -> bool:
+    def is_met(self, score: Score) -> bool:
         """Return whether a score meets the goal, without a wrong claim."""
         return (
-            found.position <= self.position
-            and not found.heading > self.heading
-            and (found.is_consistent or not self.is_consistent)
-            and not found.wrong
+            score.position <= self.position
+            and not score.heading > self.heading
+            and (score.is_consistent or not self.is_consistent)
+            and not score.wrong
         )
 
 
@@ -423,22 +427,22 @@ GOALS = {
 HEADER = ("map", "RMSE m", "deg", "NEES", "of places", "95 %", "first fix s", "localized", "lost", "wrong", "goal")
 
 
-def row(name: str, found: Score) -> tuple[str, ...]:
+def row(name: str, score: Score) -> tuple[str, ...]:
     """Return the row of the table of one map."""
-    low, high = found.bounds
-    median, longest = found.first_fix
+    low, high = score.bounds
+    median, longest = score.first_fix
     return (
         name,
-        f"{found.position:.3f}",
-        f"{np.degrees(found.heading):.2f}",
-        f"{found.nees:.1f}",
-        f"{found.independent_nees:.2f}",
+        f"{score.position:.3f}",
+        f"{np.degrees(score.heading):.2f}",
+        f"{score.nees:.1f}",
+        f"{score.independent_nees:.2f}",
         f"{low:.2f} to {high:.2f}",
         f"{median:.1f} to {longest:.1f}",
-        f"{found.localized:.1%}",
-        str(found.losses),
-        str(found.wrong),
-        "yes" if GOALS[name].is_met(found) else "NO",
+        f"{score.localized:.1%}",
+        str(score.losses),
+        str(score.wrong),
+        "yes" if GOALS[name].is_met(score) else "NO",
     )
 
 
@@ -513,7 +517,7 @@ class Drives:
             else:
                 drive = recorded_drive(scenario, length=self.length)
             surveys = {name: replace(scenario, map=name) for name in GOALS}
-            return {name: localize(drive, one.unit(one.global_map())) for name, one in surveys.items()}
+            return {name: localize(drive, survey.unit(survey.global_map())) for name, survey in surveys.items()}
 
     def through(self, seeds: Sequence[int], *, workers: int = 2) -> Iterator[dict[str, Track]]:
         """Drive through the forests of some seeds in processes, and yield the tracks by map in the order of seeds."""
@@ -521,9 +525,9 @@ class Drives:
             yield from pool.map(self, seeds)
 
 
-def scores(found: Sequence[Mapping[str, Track]]) -> dict[str, Score]:
+def scores(tracks_of_drives: Sequence[Mapping[str, Track]]) -> dict[str, Score]:
     """Return the scores by map of the tracks by map, one per forest."""
-    return {name: score([tracks[name] for tracks in found], deviation=MAPS[name].position) for name in GOALS}
+    return {name: score([tracks[name] for tracks in tracks_of_drives], deviation=MAPS[name].position) for name in GOALS}
 
 
 def _source_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -552,16 +556,16 @@ def main(forests: int, seed: int, bias: float, full: bool, source: str, workers:
     if source == "stereo" and bias:
         raise click.UsageError("--bias is one of the scanner's ranges: leave it out with --stereo")
     drives = Drives(500.0 if full else 50.0, bias, source)
-    found, seeds = [], range(seed, seed + forests)
+    tracks_of_drives, seeds = [], range(seed, seed + forests)
     for tracks in drives.through(seeds, workers=workers):
-        found.append(tracks)
-        errors = ", ".join(f"{name} {score([one], deviation=0.0).position:.3f} m" for name, one in tracks.items())
-        print(f"drive {len(found)}: {errors}", flush=True)
-    results = scores(found)
-    print(table(HEADER, [row(name, one) for name, one in results.items()]))
+        tracks_of_drives.append(tracks)
+        errors = ", ".join(f"{name} {score([track], deviation=0.0).position:.3f} m" for name, track in tracks.items())
+        print(f"drive {len(tracks_of_drives)}: {errors}", flush=True)
+    results = scores(tracks_of_drives)
+    print(table(HEADER, [row(name, score_of_map) for name, score_of_map in results.items()]))
     path = next(iter(results.values())).path
-    print(f"{len(found)} drives, {path:.0f} m of path, range bias {bias:g} m")
-    driven = {seed: one["poor"].drive for seed, one in zip(seeds, found, strict=True)}
+    print(f"{len(tracks_of_drives)} drives, {path:.0f} m of path, range bias {bias:g} m")
+    driven = {seed: tracks["poor"].drive for seed, tracks in zip(seeds, tracks_of_drives, strict=True)}
     tilts = 1e3 * np.concatenate([drive.tilts for drive in driven.values()])
     if len(tilts):
         late = np.concatenate([drive.times for drive in driven.values()]) > LATE

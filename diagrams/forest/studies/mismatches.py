@@ -79,11 +79,13 @@ def simulated_pairs(seed: int) -> Iterator[Pair]:
     kind = str(rng.choice(KINDS))
     density = 1000.0 if kind == "plantation" else float(rng.uniform(*DENSITIES))
     side = float(rng.uniform(*EXTENTS))
-    own, other = (Stand(seed=seed + shift, density=density, kind=kind, length=side, width=side) for shift in (0, 10**6))
+    mapped, other = (
+        Stand(seed=seed + shift, density=density, kind=kind, length=side, width=side) for shift in (0, 10**6)
+    )
     name = str(rng.choice(["accurate", "remote", "poor"]))
     detector = Detector(false=rng.uniform(0.2, 0.4))
-    wood = Wood.of(own, false=detector.false, rng=rng)
-    whole = mirrored(map_landmarks(own.map(MAPS[name])))
+    wood = Wood.of(mapped, false=detector.false, rng=rng)
+    whole = mirrored(map_landmarks(mapped.map(MAPS[name])))
     maps = {"other": _prepared(map_landmarks(other.map(MAPS[name])), name), "mirrored": _prepared(whole, name)}
     for k in range(PER_BATCH):
         pose = np.array([*rng.uniform(0.1 * side, 0.9 * side, 2), rng.uniform(-np.pi, np.pi)])
@@ -152,15 +154,15 @@ def pairs(count: int, *, seed: int = SEED, recordings: bool = True) -> Iterator[
                 return
 
 
-def row(kind: str, found: list[Pair]) -> tuple[str, ...]:
+def row(kind: str, pairs: list[Pair]) -> tuple[str, ...]:
     """Return the row of the table of one kind of pairs."""
-    alone = [pair for pair in found if 2.0 * pair.fix.margin >= pair.fix.log_likelihood]
+    alone = [pair for pair in pairs if 2.0 * pair.fix.margin >= pair.fix.log_likelihood]
     nearest = max(alone, key=lambda pair: pair.fix.log_likelihood - pair.required, default=None)
     return (
         kind,
-        str(len(found)),
-        str(sum(pair.fix.is_sure for pair in found)),
-        f"{max(pair.fix.log_likelihood for pair in found):.1f}",
+        str(len(pairs)),
+        str(sum(pair.fix.is_sure for pair in pairs)),
+        f"{max(pair.fix.log_likelihood for pair in pairs):.1f}",
         f"{nearest.fix.log_likelihood:.1f} of {nearest.required:.1f}" if nearest else "",
     )
 
@@ -179,8 +181,8 @@ def main(count: int, seed: int) -> None:
     results: dict[str, list[Pair]] = {}
     for pair in pairs(count, seed=seed, recordings=has_recordings):
         results.setdefault(pair.kind, []).append(pair)
-    print(table(HEADER, [row(kind, found) for kind, found in results.items()]))
-    every = [pair for found in results.values() for pair in found]
+    print(table(HEADER, [row(kind, pairs_of_kind) for kind, pairs_of_kind in results.items()]))
+    every = [pair for pairs_of_kind in results.values() for pair in pairs_of_kind]
     print(f"{sum(pair.fix.is_sure for pair in every)} of {len(every)} pairs were wrong and sure")
 
 

@@ -75,8 +75,8 @@ class MappedStand(Stand):
     map_seed: int = 0
 
     def trees(self) -> WorldModel:
-        own = {item.name: getattr(self, item.name) for item in fields(Stand)}
-        return Stand(**own).map(MAPS[self.errors], seed=self.map_seed)
+        fields_of_stand = {item.name: getattr(self, item.name) for item in fields(Stand)}
+        return Stand(**fields_of_stand).map(MAPS[self.errors], seed=self.map_seed)
 
 
 @dataclass
@@ -100,15 +100,17 @@ class RouteScenario(ForestScenario):
 
     def mental(self) -> RouteScenario:
         """Return the scenario that the carrier simulates when it reasons."""
-        own = {item.name: getattr(self, item.name) for item in fields(self)}
-        return RouteScenario(**{**own, "is_imagined": True, "undergrowth": 0.0, "branches": 0.0, "lean": 0.0})
+        values_by_name = {item.name: getattr(self, item.name) for item in fields(self)}
+        return RouteScenario(
+            **{**values_by_name, "is_imagined": True, "undergrowth": 0.0, "branches": 0.0, "lean": 0.0}
+        )
 
     def stand(self) -> Stand:
         true = super().stand()
         if not self.is_imagined:
             return true
-        own = {item.name: getattr(true, item.name) for item in fields(Stand)}
-        return MappedStand(**own, errors=self.map, map_seed=self.map_seed)
+        fields_of_stand = {item.name: getattr(true, item.name) for item in fields(Stand)}
+        return MappedStand(**fields_of_stand, errors=self.map, map_seed=self.map_seed)
 
     def surveyed_map(self, errors: MapErrors) -> WorldModel:
         return super().stand().map(errors, seed=self.map_seed)
@@ -157,18 +159,18 @@ class RouteAnswer:
     @property
     def errors(self) -> Array:
         """The error of each route in m, root mean square over the other surveys, shape (n,)."""
-        found: Array = np.sqrt(np.square(self.by_map[1:]).mean(axis=0))
-        return found
+        root_mean_squares: Array = np.sqrt(np.square(self.by_map[1:]).mean(axis=0))
+        return root_mean_squares
 
     @property
-    def chosen(self) -> int:
+    def choice(self) -> int:
         """The number of the route that was chosen; that of the route in use if the decision sets none."""
         return round(float(self.decision.values.get(ROUTE, self.in_use)))
 
     @property
     def rank(self) -> int:
         """The number of routes with a smaller error than the chosen one."""
-        return int((self.errors < self.errors[self.chosen]).sum())
+        return int((self.errors < self.errors[self.choice]).sum())
 
 
 def route_scenario(seed: int) -> RouteScenario:
@@ -221,10 +223,16 @@ def summary(answers: dict[int, RouteAnswer]) -> str:
     """Return the gains of the choices in the forests of these seeds, as text: a table, gains and standard errors."""
     heads = ("forest", "expected m", "chosen m", "in use m", "all m", "best m", "better routes")
     rows = np.array([
-        [one.expected[one.chosen], one.errors[one.chosen], one.errors[one.in_use], one.errors.mean(), one.errors.min()]
-        for one in answers.values()
+        [
+            answer.expected[answer.choice],
+            answer.errors[answer.choice],
+            answer.errors[answer.in_use],
+            answer.errors.mean(),
+            answer.errors.min(),
+        ]
+        for answer in answers.values()
     ])  # fmt: skip
-    ranks = [one.rank for one in answers.values()]
+    ranks = [answer.rank for answer in answers.values()]
     names, counts = [*map(str, answers), "mean"], [*map(str, ranks), f"{np.mean(ranks):.1f}"]
     lines = [
         (name, *(f"{value:.3f}" for value in row), rank)
@@ -233,9 +241,9 @@ def summary(answers: dict[int, RouteAnswer]) -> str:
     text = [table(heads, lines)]
     for name, column in (("the route in use", 2), ("the mean of all routes", 3)):
         text.append(f"gain over {name}: {_mean(rows[:, column] - rows[:, 1])}")
-    own = np.array([one.by_map[0, one.in_use] - one.by_map[0, one.chosen] for one in answers.values()])
-    text.append(f"gain over the route in use with the map in use: {_mean(own)}")
-    promised = np.mean([one.expected[one.in_use] - one.expected[one.chosen] for one in answers.values()])
+    gains = np.array([answer.by_map[0, answer.in_use] - answer.by_map[0, answer.choice] for answer in answers.values()])
+    text.append(f"gain over the route in use with the map in use: {_mean(gains)}")
+    promised = np.mean([answer.expected[answer.in_use] - answer.expected[answer.choice] for answer in answers.values()])
     text.append(f"expected gain over the route in use: {promised:.3f} m")
     return "\n".join(text)
 
@@ -252,17 +260,17 @@ def main(forests: int, first: int) -> None:
     """Decide in some forests, and print the expected and the true errors."""
     answers = {}
     for seed in range(first, first + forests):
-        found = decide_and_drive(seed)
-        if found is None:
+        answer = decide_and_drive(seed)
+        if answer is None:
             print(f"forest {seed}: the carrier is not localized after {FOUND:g} s\n", flush=True)
             continue
-        answers[seed] = found
+        answers[seed] = answer
         rows = [
-            (f"{number}{' (chosen)' if number == found.chosen else ''}", f"{expected:.3f}", f"{error:.3f}")
-            for number, (expected, error) in enumerate(zip(found.expected, found.errors, strict=True))
+            (f"{number}{' (chosen)' if number == answer.choice else ''}", f"{expected:.3f}", f"{error:.3f}")
+            for number, (expected, error) in enumerate(zip(answer.expected, answer.errors, strict=True))
         ]
         print(table(("route", "expected m", "error m"), rows))
-        print(f"forest {seed}: {found.rank} routes would have been better\n", flush=True)
+        print(f"forest {seed}: {answer.rank} routes would have been better\n", flush=True)
     if answers:
         print(summary(answers))
 

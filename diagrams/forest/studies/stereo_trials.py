@@ -57,10 +57,10 @@ class StereoTrials:
     seconds: float
 
 
-def errors(found: Landmarks, trees: Landmarks, eye: Array, camera: StereoCamera) -> Array:
+def errors(detections: Landmarks, trees: Landmarks, eye: Array, camera: StereoCamera) -> Array:
     """Return the rows of `StereoTrials` of one view, (n, 5); all landmarks are in one frame, as is the eye (2,)."""
-    wrong = found.positions[:, np.newaxis] - trees.positions
-    squares = np.einsum("nmi,nij,nmj->nm", wrong, np.linalg.inv(found.covariances), wrong)
+    wrong = detections.positions[:, np.newaxis] - trees.positions
+    squares = np.einsum("nmi,nij,nmj->nm", wrong, np.linalg.inv(detections.covariances), wrong)
     nearest = squares.argmin(axis=1)
     wrong = np.take_along_axis(wrong, nearest[:, np.newaxis, np.newaxis], axis=1)[:, 0]
     sight = trees.positions[nearest] - eye
@@ -68,7 +68,7 @@ def errors(found: Landmarks, trees: Landmarks, eye: Array, camera: StereoCamera)
     along = np.sum(wrong * sight, axis=1) / distance
     across = (sight[:, 0] * wrong[:, 1] - sight[:, 1] * wrong[:, 0]) / distance
     pixels = camera.focal_length / distance
-    width = (found.diameters - trees.diameters[nearest]) * pixels
+    width = (detections.diameters - trees.diameters[nearest]) * pixels
     return np.column_stack(
         [distance, -along * pixels * camera.baseline / distance, across * pixels, width, squares.min(axis=1)]
     )
@@ -92,17 +92,17 @@ def run(*, forests: int = 4, views: int = 12, seed: int = SEED) -> StereoTrials:
             images = []
             for name in IMAGES:
                 eye = testbed.diagram.GetSubsystemByName(f"sim.sense.{name.replace('image', 'camera')}")
-                seen = eye.render(eye.GetMyContextFromRoot(context)).data[..., :3]
-                noisy = seen + scenario.stereo.noise * rng.normal(size=seen.shape)
+                image = eye.render(eye.GetMyContextFromRoot(context)).data[..., :3]
+                noisy = image + scenario.stereo.noise * rng.normal(size=image.shape)
                 images.append(np.clip(np.rint(noisy), 0.0, 255.0).astype(np.uint8))
             tilt = RollPitchYaw(X_WB.rotation())
             R_HB = RotationMatrix(RollPitchYaw(tilt.roll_angle(), tilt.pitch_angle(), 0.0))
             X_HC = RigidTransform(R_HB, np.zeros(3)) @ scenario.X_BL @ scenario.stereo.poses()[IMAGES[0]]
             begin = time.process_time()
-            found = detect_stereo_trunks(matcher.disparity(*images), camera, detector, X_HC=X_HC)
+            detections = detect_stereo_trunks(matcher.disparity(*images), camera, detector, X_HC=X_HC)
             seconds += time.process_time() - begin
             local = trees.seen_from(inverse([*X_WB.translation()[:2], tilt.yaw_angle()]))
-            rows.append(errors(found, local, X_HC.translation()[:2], camera))
+            rows.append(errors(detections, local, X_HC.translation()[:2], camera))
     return StereoTrials(*np.vstack(rows).T, seconds=seconds / (forests * views))
 
 

@@ -170,31 +170,31 @@ def _drive(case: Case, stand: Stand, rng: np.random.Generator) -> Array:
             return np.array([compose(pose, [0.0, 0.0, np.pi]) for pose in back[::-1]])
 
 
-def trials(chosen: Sequence[Case], *, count: int, seed: int = SEED) -> Iterator[tuple[Case, list[Trial]]]:
+def trials(cases_to_try: Sequence[Case], *, count: int, seed: int = SEED) -> Iterator[tuple[Case, list[Trial]]]:
     """Run ``count`` trials of each case, and yield them; no two cases share a stand."""
-    for number, case in enumerate(chosen):
+    for number, case in enumerate(cases_to_try):
         first = seed + number * count
         yield case, [run(case, seed=first + k) for k in range(count)]
 
 
-def row(case: Case, found: Sequence[Trial]) -> tuple[str, ...]:
+def row(case: Case, trials_of_case: Sequence[Trial]) -> tuple[str, ...]:
     """Return the row of the table of one case."""
-    right = [one for one in found if one.is_right]
-    wrong = sum(one.is_sure and not one.is_right for one in found)
+    right = [trial for trial in trials_of_case if trial.is_right]
+    wrong = sum(trial.is_sure and not trial.is_right for trial in trials_of_case)
     return (
         case.stand,
         f"{case.density:g}",
         case.map,
         case.place,
         f"{case.way:g}",
-        str(len(found)),
-        f"{len(right) / len(found):.1%}",
+        str(len(trials_of_case)),
+        f"{len(right) / len(trials_of_case):.1%}",
         str(wrong),
-        f"{sum(not one.is_sure for one in found) / len(found):.1%}",
-        _rms([one.position for one in right], "{:.3f}"),
-        _rms([float(np.degrees(one.heading)) for one in right], "{:.2f}"),
-        f"{np.mean([one.nees for one in right]):.1f}" if right else "",
-        f"{1e3 * np.median([one.seconds for one in found]):.0f}",
+        f"{sum(not trial.is_sure for trial in trials_of_case) / len(trials_of_case):.1%}",
+        _rms([trial.position for trial in right], "{:.3f}"),
+        _rms([float(np.degrees(trial.heading)) for trial in right], "{:.2f}"),
+        f"{np.mean([trial.nees for trial in right]):.1f}" if right else "",
+        f"{1e3 * np.median([trial.seconds for trial in trials_of_case]):.0f}",
     )
 
 
@@ -210,16 +210,16 @@ def _rms(values: Sequence[float], form: str) -> str:
 
 def verdicts(results: Sequence[tuple[Case, Sequence[Trial]]]) -> list[tuple[str, float, float, bool]]:
     """Return, for each goal, (what, value, goal, whether it is met)."""
-    found = []
+    rows = []
     for name, goal in GOALS.items():
-        judged_ = [one for case, trials_ in results if case.is_judged and case.map == name for one in trials_]
+        judged_ = [trial for case, trials_ in results if case.is_judged and case.map == name for trial in trials_]
         if judged_:
-            share = float(np.mean([one.is_right for one in judged_]))
-            found.append((f"right and sure, {name} map", share, goal, share >= goal))
-    every = [one for _, trials_ in results for one in trials_]
-    wrong = float(np.mean([one.is_sure and not one.is_right for one in every]))
-    found.append((f"wrong and sure, of {len(every)}", wrong, LARGEST_WRONG, wrong < LARGEST_WRONG))
-    return found
+            share = float(np.mean([trial.is_right for trial in judged_]))
+            rows.append((f"right and sure, {name} map", share, goal, share >= goal))
+    every = [trial for _, trials_ in results for trial in trials_]
+    wrong = float(np.mean([trial.is_sure and not trial.is_right for trial in every]))
+    rows.append((f"wrong and sure, of {len(every)}", wrong, LARGEST_WRONG, wrong < LARGEST_WRONG))
+    return rows
 
 
 @click.command(context_settings={"show_default": True})
@@ -228,13 +228,13 @@ def verdicts(results: Sequence[tuple[Case, Sequence[Trial]]]) -> list[tuple[str,
 def main(count: int, seed: int) -> None:
     """Run the trials, and print their table and whether the goals are met."""
     results, rows = [], []
-    for case, found in trials(cases(), count=count, seed=seed):
-        results.append((case, found))
-        rows.append(row(case, found))
+    for case, trials_of_case in trials(cases(), count=count, seed=seed):
+        results.append((case, trials_of_case))
+        rows.append(row(case, trials_of_case))
         print("  ".join(rows[-1]), flush=True)
     print(table(HEADER, rows))
-    for what, value, goal, holds in verdicts(results):
-        print(f"{what}: {value:.2%} (goal {goal:.1%}): {'yes' if holds else 'NO'}")
+    for criterion, value, goal, holds in verdicts(results):
+        print(f"{criterion}: {value:.2%} (goal {goal:.1%}): {'yes' if holds else 'NO'}")
 
 
 if __name__ == "__main__":

@@ -88,8 +88,8 @@ def distances(routes: Sequence[Route], places: ArrayLike) -> Array:
     p = np.asarray(places, dtype=float).reshape(-1, 2)
     if not routes:
         return np.full(len(p), np.inf)
-    found: Array = cKDTree(np.concatenate([route.points for route in routes])).query(p)[0]
-    return found
+    nearest: Array = cKDTree(np.concatenate([route.points for route in routes])).query(p)[0]
+    return nearest
 
 
 def strip_roads(length: float, width: float, *, spacing: float = 28.0, seed: int = 0) -> tuple[Route, ...]:

@@ -201,8 +201,8 @@ class Stand:
         truth = tuple(self.trees())
         places, diameters = surveyed(
             rng,
-            np.array([one.p_WoOo_W[:2] for one in truth]).reshape(-1, 2),
-            np.array([one.number("trunk_diameter", unit="m") for one in truth]),
+            np.array([tree.p_WoOo_W[:2] for tree in truth]).reshape(-1, 2),
+            np.array([tree.number("trunk_diameter", unit="m") for tree in truth]),
             errors=errors,
             area=(self.length, self.width),
             false_diameters=self.diameters,
@@ -296,15 +296,15 @@ def surveyed(
         area: The extents in x and y in m, from 0 on, in which wrong entries are placed.
         false_diameters: Returns diameters of wrong entries in m for numbers that are uniform in [0, 1).
     """
-    kept = rng.permutation(len(places))[: len(places) - round(errors.missing * len(places))]
-    false = round(len(kept) * errors.wrong / (1.0 - errors.wrong))
-    found = places[kept] + errors.position * _field(rng, places[kept], errors.correlation)
-    found = np.vstack([found, rng.random((false, 2)) * area])
-    sizes = np.concatenate([diameters[kept], false_diameters(rng.random(false))])
+    surveyed_rows = rng.permutation(len(places))[: len(places) - round(errors.missing * len(places))]
+    false = round(len(surveyed_rows) * errors.wrong / (1.0 - errors.wrong))
+    positions = places[surveyed_rows] + errors.position * _field(rng, places[surveyed_rows], errors.correlation)
+    positions = np.vstack([positions, rng.random((false, 2)) * area])
+    sizes = np.concatenate([diameters[surveyed_rows], false_diameters(rng.random(false))])
     # An error of several deviations must not make a diameter negative.
     measured = sizes * np.maximum(1.0 + errors.diameter * rng.normal(size=len(sizes)), 0.1)
-    order = rng.permutation(len(found))
-    return found[order], measured[order]
+    order = rng.permutation(len(positions))
+    return positions[order], measured[order]
 
 
 def tree_height(diameter: float) -> float:

@@ -155,11 +155,11 @@ def undergrowth(
 
 def _sizes(trees: WorldModel) -> tuple[Array, Array]:
     """Return diameters and heights in m, (n,) each."""
-    sizes = [(one.number("trunk_diameter", unit="m"), one.number("height", unit="m")) for one in trees]
-    for one, (_, height) in zip(trees, sizes, strict=True):
+    sizes = [(tree.number("trunk_diameter", unit="m"), tree.number("height", unit="m")) for tree in trees]
+    for tree, (_, height) in zip(trees, sizes, strict=True):
         if height <= 2.0 * BREAST_HEIGHT:
             raise ValueError(
-                f"the tree {one.identity} of {height:g} m is too low: trees are above {2 * BREAST_HEIGHT} m"
+                f"the tree {tree.identity} of {height:g} m is too low: trees are above {2 * BREAST_HEIGHT} m"
             )
     diameters, heights = np.array(sizes).reshape(-1, 2).T
     return diameters, heights

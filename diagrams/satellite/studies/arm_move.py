@@ -150,10 +150,10 @@ class MoveSpace:
         """
         symbols = [casadi.SX.sym(f"q_{k}", ARM_JOINTS) for k in range(count)]
         value = function(*symbols)
-        own = [casadi.densify(casadi.jacobian(value, symbol)).T for symbol in symbols]
+        slopes = [casadi.densify(casadi.jacobian(value, symbol)).T for symbol in symbols]
         matrices = [self.spline.matrix(times, k) for k in range(count)]
         parts = (
-            casadi.Function("own_slope", symbols, own, {"cse": True})
+            casadi.Function("own_slope", symbols, slopes, {"cse": True})
             .map(len(times))
             .call([knots @ casadi.DM(matrix.T) for matrix in matrices])
         )
@@ -290,14 +290,14 @@ class Move:
         servicer, motion = self.space.servicer, self.motion(knots)
         lowest, highest = self.space.spline.extremes(knots)
         rates = np.max(np.abs(self.space.spline.extremes(knots, 1)), axis=0)
-        found = {
+        excesses = {
             "position": max(np.max(servicer.lower - lowest), np.max(highest - servicer.upper)),
             "rate": np.max(rates / servicer.speeds) - 1.0,
             "torque": np.max(np.abs(motion.torque) / np.array(servicer.torques)) - 1.0,
             "deviation": motion.angle.max() / self.largest - 1.0,
             "clearance": CLEARANCE - self.space.clearance(knots),
         }
-        return {name: float(value) for name, value in found.items() if not value <= 1e-9}
+        return {name: float(value) for name, value in excesses.items() if not value <= 1e-9}
 
     def touched(self, knots: Array) -> list[str]:
         """Return the limits that a plan, shape (n, 7), uses to 99 %, by the names of `excess`, and ``reach``.

@@ -153,8 +153,8 @@ def _by_casadi(move: Move, start: Array, best: _Best) -> str:
     solver = casadi.nlpsol("arm_plan", "ipopt", {"x": z, "p": ends, "f": _SCALE * cost, "g": g}, options)
     lower, upper = move.search_range
     least, most = move.bounds
-    found = solver(x0=start, p=move.ends, lbx=lower, ubx=upper, lbg=least, ubg=most)
-    best.look(found["x"].full().ravel(), float(found["f"]) / _SCALE, found["g"].full().ravel())
+    solution = solver(x0=start, p=move.ends, lbx=lower, ubx=upper, lbg=least, ubg=most)
+    best.look(solution["x"].full().ravel(), float(solution["f"]) / _SCALE, solution["g"].full().ravel())
     return str(solver.stats()["return_status"])
 
 
@@ -198,23 +198,23 @@ _DRAKE: dict[str, tuple[type[SolverInterface], dict[str, float]]] = {
 
 def _by_drake(solver: SolverInterface, options: dict[str, float], move: Move, start: Array, best: _Best) -> str:
     slopes = move.space.functions[1]
-    known: dict[bytes, tuple[float, Array, Array, Array]] = {}
+    evaluations: dict[bytes, tuple[float, Array, Array, Array]] = {}
 
     def at(z: Array) -> tuple[float, Array, Array, Array]:
         key = z.tobytes()
-        if key not in known:
-            known.clear()
+        if key not in evaluations:
+            evaluations.clear()
             cost, gradient, g, jacobian = (value.full() for value in slopes(z, move.ends))
             best.look(z, float(cost[0, 0]), g.ravel())
-            known[key] = _SCALE * float(cost[0, 0]), _SCALE * gradient.ravel(), g.ravel(), jacobian
-        return known[key]
+            evaluations[key] = _SCALE * float(cost[0, 0]), _SCALE * gradient.ravel(), g.ravel(), jacobian
+        return evaluations[key]
 
     def with_slopes(x: NDArray[Any], value: Callable[[Array], tuple[Array, Array]]) -> NDArray[Any]:
         if x.dtype != object:
             return value(np.array(x, dtype=float))[0]
         z, dz = ExtractValue(x).ravel(), ExtractGradient(x)
-        found, slope = value(z)
-        return InitializeAutoDiff(found, slope @ dz).ravel()
+        results, slope = value(z)
+        return InitializeAutoDiff(results, slope @ dz).ravel()
 
     def cost(x: NDArray[Any]) -> Any:
         return with_slopes(x, lambda z: (np.array([at(z)[0]]), at(z)[1][None]))[0]
@@ -225,10 +225,10 @@ def _by_drake(solver: SolverInterface, options: dict[str, float], move: Move, st
     least, most = move.bounds
     program.AddCost(cost, vars=z)
     program.AddConstraint(lambda x: with_slopes(x, lambda z: at(z)[2:]), lb=least, ub=most, vars=z)
-    chosen = SolverOptions()
+    solver_options = SolverOptions()
     for key, value in options.items():
-        chosen.SetOption(solver.solver_id(), key, value)
-    return str(solver.Solve(program, start, chosen).get_solution_result().name)
+        solver_options.SetOption(solver.solver_id(), key, value)
+    return str(solver.Solve(program, start, solver_options).get_solution_result().name)
 
 
 class MomentumDescent(Solver):

@@ -138,7 +138,7 @@ def captures(
         yield index, judge(result)
 
 
-def report(found: Sequence[Capture]) -> str:
+def report(captures: Sequence[Capture]) -> str:
     """Return the table of captures, the failures by reason, and the rate of success."""
     header = ("tumble deg/s", "end", "s", "off mm", "creep mm", "base deg", "failure")
     rows = [
@@ -151,12 +151,12 @@ def report(found: Sequence[Capture]) -> str:
             f"{np.degrees(c.base_angle):.1f}",
             c.failure,
         )
-        for c in found
+        for c in captures
     ]
-    failures = Counter(c.failure for c in found if c.failure)
-    caught = len(found) - failures.total()
+    failures = Counter(c.failure for c in captures if c.failure)
+    caught = len(captures) - failures.total()
     reasons = "".join(f"\n{count} x {reason}" for reason, count in failures.most_common())
-    return f"{table(header, rows)}\n{caught} of {len(found)} captured{reasons}"
+    return f"{table(header, rows)}\n{caught} of {len(captures)} captured{reasons}"
 
 
 def fixture_in_gripper(record: Mapping[str, Any], k: int) -> RigidTransform:
@@ -184,12 +184,12 @@ def _gripper() -> Kernel:
 def main(count: int, perception: str, wheels: bool, workers: int, seed: int) -> None:
     """Run the campaign, and print its table."""
     scenario = SatelliteScenario(perception=perception, wheels=wheels)
-    found: dict[int, Capture] = {}
+    captures_by_index: dict[int, Capture] = {}
     with ProcessExecutor(workers) as executor:
         for index, capture in captures(scenario, executor, count=count, seed=seed):
-            found[index] = capture
-            print(f"{len(found)} of {count}: {capture.failure or 'captured'}", flush=True)
-    print(report([found[index] for index in sorted(found)]))
+            captures_by_index[index] = capture
+            print(f"{len(captures_by_index)} of {count}: {capture.failure or 'captured'}", flush=True)
+    print(report([captures_by_index[index] for index in sorted(captures_by_index)]))
 
 
 if __name__ == "__main__":

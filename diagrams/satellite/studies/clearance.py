@@ -128,21 +128,21 @@ class ArmClearance:
         model = MomentumModel(plant, plant.CreateDefaultContext(), joints=joints)
         q = casadi.SX.sym("q", ARM_JOINTS)
         shoulder, elbow = (model.point(plant.GetFrameByName(name), q) for name in ("link_2", "link_4"))
-        found: dict[str, list[tuple[str, Expression]]] = {group: [] for group in self.groups}
+        clearances: dict[str, list[tuple[str, Expression]]] = {group: [] for group in self.groups}
         for sphere, frame in zip(spheres, centers, strict=True):
             p = model.point(frame, q)
             outer = LINK_NAMES.index(sphere.link) if sphere.link in LINK_NAMES else ARM_JOINTS
             group = self.groups[0 if outer < 3 else 1 if outer < 5 else 2]
             for name, distance in _from_base(s, p).items():
-                found[group].append((f"{sphere.link} and {name}", distance - sphere.radius))
+                clearances[group].append((f"{sphere.link} and {name}", distance - sphere.radius))
             if outer >= 5:
                 for name, distance in _from_inner_arm(s, p, shoulder, elbow).items():
-                    found["hand and arm"].append((f"{sphere.link} and {name}", distance - sphere.radius))
-        found["wrist"].append(("link_7 and link_5", _wrist(s, q[5])))
-        pairs = [pair for group in self.groups for pair in found[group]]
+                    clearances["hand and arm"].append((f"{sphere.link} and {name}", distance - sphere.radius))
+        clearances["wrist"].append(("link_7 and link_5", _wrist(s, q[5])))
+        pairs = [pair for group in self.groups for pair in clearances[group]]
         self.names = tuple(name for name, _ in pairs)
         self.distances = _function("distances", q, [distance for _, distance in pairs])
-        self.soft = _function("soft", q, [_soft_minimum([d for _, d in found[group]]) for group in self.groups])
+        self.soft = _function("soft", q, [_soft_minimum([d for _, d in clearances[group]]) for group in self.groups])
         upper, fore, hand = sum(s.lengths[1:3]), sum(s.lengths[3:5]), sum(s.lengths[5:])
         side, ahead = (np.max(np.abs([c.center[axis] for c in spheres if c.link == "hand"])) for axis in (0, 2))
         hand += hypot(side, ahead)
@@ -258,17 +258,17 @@ class DrakeClearance:
         manager.Apply(declaration)
         self._plant, self._diagram = plant, builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._own = plant.GetMyMutableContextFromRoot(self._context)
+        self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
         self._places = [plant.GetJointByName(name, instance).position_start() for name in ARM_JOINT_NAMES]
         fingers = [plant.GetJointByName(name, instance).position_start() for name in FINGER_JOINT_NAMES]
-        self._q = plant.GetPositions(self._own)
+        self._q = plant.GetPositions(self._plant_context)
         self._q[fingers] = s.opening
 
     def nearest(self, q: ArrayLike) -> tuple[float, str]:
         """Return the least distance in m at one pose, shape (7,), and what it is between."""
         self._q[self._places] = q
-        self._plant.SetPositions(self._own, self._q)
-        query: QueryObject = self._plant.get_geometry_query_input_port().Eval(self._own)
+        self._plant.SetPositions(self._plant_context, self._q)
+        query: QueryObject = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
         pairs = query.ComputeSignedDistancePairwiseClosestPoints(max_distance=0.5)
         if not pairs:
             return 0.5, "nothing within 0.5 m"

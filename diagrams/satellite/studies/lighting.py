@@ -160,8 +160,8 @@ class LightingScenario(SatelliteScenario):
 
     def make_dps(self) -> Diagram:
         detector = replace(self.evaluation.detector, threshold=self.threshold)
-        chosen = replace(self, evaluation=replace(self.evaluation, detector=detector))
-        return super(LightingScenario, chosen).make_dps()
+        scenario = replace(self, evaluation=replace(self.evaluation, detector=detector))
+        return super(LightingScenario, scenario).make_dps()
 
 
 def time_to_grip(mode: float, time: float) -> float:
@@ -171,8 +171,8 @@ def time_to_grip(mode: float, time: float) -> float:
 
 def condition(light: str, seed: int) -> dict[str, Any]:
     """Return a light, and what makes the capture start as that of a scenario with this seed does."""
-    own = LightingScenario()
-    start = random_start(seed, tumble=np.radians(own.tumble_deg), distance=own.distance)
+    scenario = LightingScenario()
+    start = random_start(seed, tumble=np.radians(scenario.tumble_deg), distance=scenario.distance)
     return {
         **LIGHTS[light],
         "sim.sys.target.body.pose": pose_to_array(start.X_WT),
@@ -300,19 +300,19 @@ def compare(choice: Settings, *, seeds: Sequence[int], executor: Executor) -> Li
 
 
 def find_settings(
-    candidates: Sequence[Settings], *, seeds: Sequence[int], others: Sequence[int], executor: Executor
+    candidates: Sequence[Settings], *, seeds: Sequence[int], check_seeds: Sequence[int], executor: Executor
 ) -> LightingAnswer:
     """Choose among candidates on some starts, and compare the choice with the default on others.
 
     Args:
         candidates: The candidates.
         seeds: Start poses for the choice.
-        others: Start poses for the comparison.
+        check_seeds: Start poses for the comparison.
         executor: Runs the rollouts.
     """
     tried = capture_all(candidates, seeds=seeds, executor=executor)
-    found = compare(candidates[tried.robust], seeds=others, executor=executor)
-    return replace(found, candidates=tuple(candidates), tried=tried)
+    comparison = compare(candidates[tried.robust], seeds=check_seeds, executor=executor)
+    return replace(comparison, candidates=tuple(candidates), tried=tried)
 
 
 def plot_answer(answer: LightingAnswer) -> Figure:
@@ -349,11 +349,11 @@ def answer_lighting(*, full: bool = False, starts: int = len(CHECKED_ON)) -> Lig
         full: Whether to choose among `CANDIDATES` from all starts of `CHOSEN_ON` first, instead of taking `CHOICE`.
         starts: From how many starts of `CHECKED_ON` the choice is compared with the default.
     """
-    others = CHECKED_ON[:starts]
+    check_seeds = CHECKED_ON[:starts]
     with ProcessExecutor(2) as executor:
         if not full:
-            return compare(CHOICE, seeds=others, executor=executor)
-        return find_settings(CANDIDATES, seeds=CHOSEN_ON, others=others, executor=executor)
+            return compare(CHOICE, seeds=check_seeds, executor=executor)
+        return find_settings(CANDIDATES, seeds=CHOSEN_ON, check_seeds=check_seeds, executor=executor)
 
 
 def _table(captures: Captures, number: int) -> str:
@@ -374,7 +374,7 @@ def lighting(full: bool) -> Answer:
     default, robust = answer.checked.by_light.max(axis=1).tolist()
     count = answer.checked.times.shape[2]
     off = [f"{1e3 * np.nanmax(errors):.0f} mm" for errors in answer.checked.error_by_light]
-    chosen = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
+    best_by_light = "; ".join(f"{light}: {settings}" for light, settings in answer.best.items())
     return Answer(
         id="O3",
         question="Which controller parameters are best under different lighting?",
@@ -387,7 +387,11 @@ def lighting(full: bool) -> Answer:
         note=f"Compared with the default from {count} start poses, other than those of the choice; without success "
         f"{FAILURE:g} s; {1e3 * ACCURACY:g} mm allowed. By default: {_table(answer.checked, 0)}. With the choice: "
         f"{_table(answer.checked, 1)}. "
-        + (f"Best for each light: {chosen}" if chosen else "Chosen beforehand on other starts, FULL=1 chooses anew."),
+        + (
+            f"Best for each light: {best_by_light}"
+            if best_by_light
+            else "Chosen beforehand on other starts, FULL=1 chooses anew."
+        ),
     )
 
 

@@ -132,8 +132,8 @@ def scenario() -> SatelliteScenario:
 
 def capture(seed: int) -> dict[str, Any]:
     """Return what makes the capture start as that of a scenario with this seed does."""
-    own = scenario()
-    return random_start(seed, tumble=np.radians(own.tumble_deg), distance=own.distance).values()
+    defaults = scenario()
+    return random_start(seed, tumble=np.radians(defaults.tumble_deg), distance=defaults.distance).values()
 
 
 def mount_problem(
@@ -154,12 +154,12 @@ def mount_problem(
         fixed: Values of other entries of the pose, by address.
         recorded: Whether candidates are judged along recorded motions.
     """
-    own = scenario()
+    capture_scenario = scenario()
     upper = float(len(Target().tags))
     # The count that f reads is of an image that is at most a period of the camera old.
-    memory = 1.0 / own.camera_fps + 0.02
+    memory = 1.0 / capture_scenario.camera_fps + 0.02
     return vtb.Problem(
-        scenario=own,
+        scenario=capture_scenario,
         parameters=list(parameters),
         quality=vtb.Quality(markers_seen, of=COUNT, reading=reading, upper=upper),
         horizon=HORIZON,
@@ -260,10 +260,10 @@ def find_mount(*, seeds: Sequence[int], candidates: int, grid: int, executor: Ex
     problem = mount_problem(seeds=seeds)
     with problem.study() as study:
         study.run(rollouts=candidates * len(seeds), racing=False, executor=executor, progress=False)
-        found = pose(0.0, 0.0)
-        found[[1, 2, 3, 5]] = study.best.point
-    poses = {"found": found, **BY_HAND, **AFTERWARDS}
-    turns = {PARAMETERS[2].address: float(found[3]), PARAMETERS[3].address: float(found[5])}
+        best_pose = pose(0.0, 0.0)
+        best_pose[[1, 2, 3, 5]] = study.best.point
+    poses = {"found": best_pose, **BY_HAND, **AFTERWARDS}
+    turns = {PARAMETERS[2].address: float(best_pose[3]), PARAMETERS[3].address: float(best_pose[5])}
     around = mount_problem(PARAMETERS[:2], seeds=seeds, fixed=turns)
     landscape = around.sweep(grid, executor=executor, progress=False)
     every = problem.sweep(values=[entries(value) for value in poses.values()], executor=executor, progress=False)
@@ -310,11 +310,11 @@ def plot_answer(answer: MountAnswer, *, times: Sequence[float] = (2.0, 6.0, 10.0
     finish(time_axes)
     grid = below.subplots(len(placements), len(times))
     images = views([placement.pose for placement in placements])
-    for row, placement, seen in zip(grid, placements, images, strict=True):
+    for row, placement, images_of_placement in zip(grid, placements, images, strict=True):
         first = placement.rollouts[0]
         for axes, t in zip(row, times, strict=True):
             index = int(np.argmin(np.abs(first.times - t)))
-            axes.imshow(seen[index])
+            axes.imshow(images_of_placement[index])
             axes.set(xticks=[], yticks=[])
             axes.set_xlabel(f"{first.times[index]:g} s: {first.quality[index]:g}", fontsize="x-small", labelpad=1)
         row[0].set_ylabel(placement.name.replace(" of ", "\nof ").replace(" corner", "\ncorner"), fontsize="x-small")
@@ -361,22 +361,22 @@ def mount(full: bool) -> Answer:
 
     The short version averages over the first `FEW` captures, the long one over all of `SEEDS`, with a finer grid.
     """
-    found = answer_mount(full=full)
-    others, afterwards = (
+    result = answer_mount(full=full)
+    by_hand, afterwards = (
         "; ".join(f"{p.name} {p.mean:.2f} (largest {p.most:.1f})" for p in placements)
-        for placements in (found.by_hand, found.afterwards)
+        for placements in (result.by_hand, result.afterwards)
     )
     return Answer(
         id="O1",
         question="Where should the docking camera sit to see the most markers during the capture?",
-        answer=f"{_place(found.best)}: {found.best.mean:.2f} markers in the mean",
+        answer=f"{_place(result.best)}: {result.best.mean:.2f} markers in the mean",
         unit="",
         interval=None,
         paper="none given",
-        holds=found.holds,
-        note=f"By hand: {others}. Thought of afterwards: {afterwards}. Largest of the one found {found.best.most:.1f}. "
-        f"Best of the grid over the position: {found.best_on_grid:.2f}. Mean of {len(found.best.rollouts)} captures; "
-        f"differences under {TELLING} mean nothing.",
+        holds=result.holds,
+        note=f"By hand: {by_hand}. Thought of afterwards: {afterwards}. Largest of the one found "
+        f"{result.best.most:.1f}. Best of the grid over the position: {result.best_on_grid:.2f}. Mean of "
+        f"{len(result.best.rollouts)} captures; differences under {TELLING} mean nothing.",
     )
 
 
@@ -393,12 +393,12 @@ def _place(placement: Placement) -> str:
 @click.option("--figure", default="mount.png", help="File of the picture.", show_default=True)
 def main(full: bool, figure: str) -> None:
     """Answer O1, and draw the answer."""
-    found = answer_mount(full=full)
+    result = answer_mount(full=full)
     click.echo(f"{'placement':38} {'mean':>5} {'largest':>7}")
-    for placement in (found.best, *found.by_hand, *found.afterwards):
+    for placement in (result.best, *result.by_hand, *result.afterwards):
         click.echo(f"{placement.name:38} {placement.mean:5.2f} {placement.most:7.1f}")
-    click.echo(f"found {_place(found.best)}; best of the grid: {found.best_on_grid:.2f}; holds: {found.holds}")
-    plot_answer(found).savefig(figure, dpi=110)
+    click.echo(f"found {_place(result.best)}; best of the grid: {result.best_on_grid:.2f}; holds: {result.holds}")
+    plot_answer(result).savefig(figure, dpi=110)
 
 
 if __name__ == "__main__":

@@ -272,9 +272,9 @@ class FrequencyAnswer:
 
         That counts where the skew is larger than the tolerance and there are enough scans for a track (from 1 Hz).
         """
-        told = (self.raw.frequencies >= 1.0) & (skew(self.raw.frequencies) > TOLERANCE)
-        relative = np.median(self.raw.values[:, told], axis=2) / skew(self.raw.frequencies[told])
-        return bool(told.any() and ((relative > 1.0) & (relative < 2.0)).all())
+        is_measurable = (self.raw.frequencies >= 1.0) & (skew(self.raw.frequencies) > TOLERANCE)
+        relative = np.median(self.raw.values[:, is_measurable], axis=2) / skew(self.raw.frequencies[is_measurable])
+        return bool(is_measurable.any() and ((relative > 1.0) & (relative < 2.0)).all())
 
     @property
     def helps(self) -> bool:
@@ -361,17 +361,18 @@ def answer_frequency(*, full: bool = False) -> FrequencyAnswer:
 
 def frequency(full: bool) -> Answer:
     """Answer O2: what scan frequency must the laser scanner have?"""
-    found = answer_frequency(full=full)
-    least = {"de-skewed": found.deskewed.least(), "raw": found.raw.least()}
+    result = answer_frequency(full=full)
+    least = {"de-skewed": result.deskewed.least(), "raw": result.raw.least()}
     lower, estimate, upper = (max(bounds) for bounds in zip(*least["de-skewed"], strict=True))
-    told = "; ".join(
-        f"{name}: " + ", ".join(f"{t:g} deg/s {_range(*bounds)}" for t, bounds in zip(found.tumbles, rows, strict=True))
+    ranges = "; ".join(
+        f"{name}: "
+        + ", ".join(f"{t:g} deg/s {_range(*bounds)}" for t, bounds in zip(result.tumbles, rows, strict=True))
         for name, rows in least.items()
     )
     claims = {
-        "the median raw error is once to twice v / (2 f)": found.follows,
-        "de-skewed, a lower frequency suffices": found.helps,
-        "most scans per second are not best": found.thins,
+        "the median raw error is once to twice v / (2 f)": result.follows,
+        "de-skewed, a lower frequency suffices": result.helps,
+        "most scans per second are not best": result.thins,
     }
     return Answer(
         id="O2",
@@ -380,10 +381,10 @@ def frequency(full: bool) -> Answer:
         unit="Hz",
         interval=(lower, upper),
         paper="none given",
-        holds=found.holds,
+        holds=result.holds,
         note=f"Least frequency for which the error at the bar is below {1e3 * TOLERANCE:.1f} mm in {QUANTILE:.0%} of "
-        f"the approaches, at all tumble rates, with de-skewed scans; of {found.raw.values.shape[2]} approaches, with "
-        f"the interval of {CONFIDENCE:.0%}. {told}. "
+        f"the approaches, at all tumble rates, with de-skewed scans; of {result.raw.values.shape[2]} approaches, with "
+        f"the interval of {CONFIDENCE:.0%}. {ranges}. "
         + "; ".join(f"{claim}: {'yes' if true else 'NO'}" for claim, true in claims.items())
         + ".",
     )
@@ -401,16 +402,16 @@ def _range(lower: float, estimate: float, upper: float) -> str:
 @click.option("--figure", default="scan_frequency.png", help="File of the picture.", show_default=True)
 def main(full: bool, figure: str) -> None:
     """Answer O2, and draw the answer."""
-    found = answer_frequency(full=full)
+    result = answer_frequency(full=full)
     click.echo(f"{QUANTILE:.0%} quantile of the error at the bar [mm], [lower, upper bound]")
-    for name, errors in (("raw", found.raw), ("de-skewed", found.deskewed)):
-        for tumble, *bounds in zip(found.tumbles, *errors.quantiles(), strict=True):
+    for name, errors in (("raw", result.raw), ("de-skewed", result.deskewed)):
+        for tumble, *bounds in zip(result.tumbles, *errors.quantiles(), strict=True):
             for frequency, lower, quantile, upper in zip(errors.frequencies, *bounds, strict=True):
                 numbers = f"{1e3 * quantile:6.1f} [{1e3 * lower:.1f}, {1e3 * upper:.1f}]"
                 click.echo(f"{name:>10} {tumble:4g} deg/s {frequency:5g} Hz {numbers}")
         click.echo(f"{name:>10}, least: {', '.join(_range(*bounds) for bounds in errors.least())}")
-    click.echo(f"follows: {found.follows}; helps: {found.helps}; thins: {found.thins}; holds: {found.holds}")
-    plot_answer(found).savefig(figure, dpi=110)
+    click.echo(f"follows: {result.follows}; helps: {result.helps}; thins: {result.thins}; holds: {result.holds}")
+    plot_answer(result).savefig(figure, dpi=110)
 
 
 if __name__ == "__main__":

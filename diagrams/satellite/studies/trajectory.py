@@ -330,19 +330,19 @@ def survey(scenarios: Sequence[ArmMotionScenario], *, echo: Callable[[str], None
 def answer(full: bool) -> Answer:
     """Answer R2: which trajectory of the arm disturbs the base least?"""
     onboard = compare(ArmMotionScenario(onboard=True))
-    found = survey(random_scenarios(_PAIRS_FULL if full else _PAIRS, seed=_SEED))
+    result = survey(random_scenarios(_PAIRS_FULL if full else _PAIRS, seed=_SEED))
     turned = np.degrees([onboard.straight.end, onboard.best.end])
     return Answer(
         id="R2",
         question="Which trajectory of a service satellite's arm disturbs its base least?",
-        answer=found.median,
+        answer=result.median,
         unit="times less rotation at the end than on the straight joint-space path (median)",
-        interval=found.interval,
+        interval=result.interval,
         paper="none given",
-        holds=found.holds and onboard.factor >= _FACTOR and onboard.within_limits,
+        holds=result.holds and onboard.factor >= _FACTOR and onboard.within_limits,
         note=(
             f"In the full testbed: the DPS's decision on board turns the base by {turned[1]:.3f} deg instead of "
-            f"{turned[0]:.2f}. {found}"
+            f"{turned[0]:.2f}. {result}"
         ),
     )
 

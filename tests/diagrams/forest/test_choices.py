@@ -117,7 +117,7 @@ def test_summary_compares_the_choice_with_all_routes() -> None:
         7: RouteAnswer(choice, np.array([0.2, 0.1, 0.3]), np.array([[0.4, 0.3, 0.0], 0.6 * first, 1.64**0.5 * first])),
         8: RouteAnswer(none, np.array([0.3, 0.4, 0.5]), np.array([[0.9, 0.9, 0.9], second, second]), in_use=2),
     }
-    assert [answer.chosen for answer in answers.values()] == [1, 2]
+    assert [answer.choice for answer in answers.values()] == [1, 2]
     assert [answer.rank for answer in answers.values()] == [1, 2]
     mean, use, every, own, promised = summary(answers).splitlines()[-5:]
     assert mean.split() == ["mean", "0.300", "0.400", "0.550", "0.283", "0.100", "1.5"]
