@@ -45,10 +45,9 @@ from vtbdrake.recording.log_format import (
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.codecs import abstract_state
-from vtbdrake.state.snapshot import numeric_groups
-from vtbdrake.state.systems import leaves, read_group
+from vtbdrake.state.systems import read_group, stateful_leaves
 from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
-from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
 
 _log = logging.getLogger(__name__)
 
@@ -345,11 +344,8 @@ class StateDigest:
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:
         self._parts = []
-        for path, system in leaves(target.diagram):
-            if path != "dps" and not path.startswith("dps."):
-                continue
+        for path, system, groups in stateful_leaves(target.diagram, context, only=is_dps):
             leaf_context = system.GetMyContextFromRoot(context)
-            groups = list(numeric_groups(leaf_context))
             abstract = abstract_state(path, system, leaf_context)
             if groups or abstract:
                 self._parts.append((leaf_context, groups, abstract))
@@ -358,8 +354,8 @@ class StateDigest:
         """Return the digest of the present state, 16 bytes."""
         digest = blake2b(digest_size=DIGEST_SIZE)
         for leaf_context, groups, abstract in self._parts:
-            for group, index in groups:
-                digest.update(read_group(leaf_context, group, index).tobytes())
+            for kind, index, _ in groups:
+                digest.update(read_group(leaf_context, kind, index).tobytes())
             arrays = abstract.read(leaf_context)
             for key in sorted(arrays, key=_index_and_name):
                 array = arrays[key]

@@ -13,8 +13,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.rollout.quality import READINGS, Quality
 from vtbdrake.rollout.task import RolloutTask
-from vtbdrake.state.snapshot import numeric_groups
-from vtbdrake.state.systems import leaves, read_group, write_group
+from vtbdrake.state.systems import leaves, read_group, stateful_leaves, write_group
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -64,9 +63,9 @@ class DerivativeRunner:
             ) from error
         converted = dict(leaves(self._diagram))
         self._pairs = [
-            (path, system, converted[path])
-            for path, system in leaves(testbed.diagram)
-            if not isinstance(system, SceneGraph)
+            (leaf, converted[leaf.path])
+            for leaf in stateful_leaves(testbed.diagram)
+            if not isinstance(leaf.system, SceneGraph)
         ]
         self._readers = [testbed.reader(address) for address in self._quality.of]
 
@@ -126,32 +125,31 @@ class DerivativeRunner:
 
     def _groups(self, context: Context) -> dict[tuple[str, str, int], np.ndarray]:
         return {
-            (path, group, index): read_group(system.GetMyContextFromRoot(context), group, index)
-            for path, system, _ in self._pairs
-            for group, index in numeric_groups(system.GetMyContextFromRoot(context))
+            (path, kind, index): read_group(system.GetMyContextFromRoot(context), kind, index)
+            for (path, system, groups), _ in self._pairs
+            for kind, index, _ in groups
         }
 
     def _seeded(self, context: Context, directions: Sequence[Mapping[tuple[str, str, int], np.ndarray]]) -> Any:
         seeded = self._diagram.CreateDefaultContext()
         seeded.SetTimeStateAndParametersFrom(context)
-        systems = {path: system for path, _, system in self._pairs}
-        for (path, group, index), value in self._groups(context).items():
-            gradient = np.stack([direction[path, group, index] for direction in directions], axis=1)
+        systems = {leaf.path: converted for leaf, converted in self._pairs}
+        for (path, kind, index), value in self._groups(context).items():
+            gradient = np.stack([direction[path, kind, index] for direction in directions], axis=1)
             # NaN means no value, such as no command: it has no derivative.
             gradient[np.isnan(gradient)] = 0.0
             if gradient.any():
-                leaf = systems[path].GetMyMutableContextFromRoot(seeded)
-                write_group(leaf, group, index, InitializeAutoDiff(value, gradient).ravel())
+                leaf_context = systems[path].GetMyMutableContextFromRoot(seeded)
+                write_group(leaf_context, kind, index, InitializeAutoDiff(value, gradient).ravel())
         return seeded
 
     def _sample(self, seeded: Any, context: Context, t: float, count: int) -> tuple[float, np.ndarray]:
         context.SetTime(t)
         values, gradients = {}, {}
-        for path, system, converted in self._pairs:
-            leaf = system.GetMyMutableContextFromRoot(context)
-            for group, index in numeric_groups(leaf):
-                entries = read_group(converted.GetMyContextFromRoot(seeded), group, index)
-                key = (path, group, index)
+        for leaf, converted in self._pairs:
+            for kind, index, _ in leaf.groups:
+                entries = read_group(converted.GetMyContextFromRoot(seeded), kind, index)
+                key = (leaf.path, kind, index)
                 values[key] = ExtractValue(entries).ravel()
                 gradient = ExtractGradient(entries)
                 gradients[key] = gradient if gradient.size else np.zeros((values[key].size, count))
@@ -169,10 +167,10 @@ class DerivativeRunner:
         return sample, slope
 
     def _write(self, context: Context, values: Mapping[tuple[str, str, int], np.ndarray]) -> None:
-        for path, system, _ in self._pairs:
-            leaf = system.GetMyMutableContextFromRoot(context)
-            for group, index in numeric_groups(leaf):
-                write_group(leaf, group, index, values[path, group, index])
+        for (path, system, groups), _ in self._pairs:
+            leaf_context = system.GetMyMutableContextFromRoot(context)
+            for kind, index, _ in groups:
+                write_group(leaf_context, kind, index, values[path, kind, index])
 
     def _f(self, context: Context, t: float, *, checked: bool = True) -> float:
         arguments = [read(context) for read in self._readers]

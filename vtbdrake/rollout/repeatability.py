@@ -20,8 +20,7 @@ from vtbdrake.rollout.quality import QualityError
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
-from vtbdrake.state.snapshot import numeric_groups
-from vtbdrake.state.systems import leaves, read_group
+from vtbdrake.state.systems import leaves, read_group, stateful_leaves
 from vtbdrake.testbed import VirtualTestbed
 
 # Seconds of processor time for the reference; the other rollouts are as long in simulated time.
@@ -98,14 +97,14 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
 
 def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:
     """Yield the numbers of all systems at each sample time, and at last what ended the rollout."""
-    systems = list(leaves(runner.testbed.diagram))
+    systems = list(stateful_leaves(runner.testbed.diagram))
     t = 0.0
     try:
         for t in runner.simulate(point):
             sample: dict[str, tuple[Any, ...]] = {"": tuple(runner.measured(t))}
-            for path, system in systems:
+            for path, system, groups in systems:
                 context = system.GetMyContextFromRoot(runner.context)
-                sample[path] = tuple(read_group(context, *group) for group in numeric_groups(context))
+                sample[path] = tuple(read_group(context, kind, index) for kind, index, _ in groups)
             yield t, sample
     except SimulationError as failure:
         yield t, {"": (str(failure),)}

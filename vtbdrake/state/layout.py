@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from vtbdrake.state.codecs import AbstractState, abstract_state
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
-from vtbdrake.state.systems import group_size, is_camera, is_scene_graph, leaves, write_group
+from vtbdrake.state.systems import stateful_leaves, write_group
 from vtbdrake.state.variables import Variable
 
 
@@ -56,24 +56,19 @@ class StateLayout:
         self._abstract: list[tuple[str, System, AbstractState]] = []
         self._slices: dict[str, slice] = {}
         start = 0
-        for path, system in leaves(diagram):
-            if is_scene_graph(system) or is_camera(system) or not (state(path) or parameters(path)):
+        for leaf in stateful_leaves(diagram, only=lambda path: state(path) or parameters(path)):
+            path, system = leaf.path, leaf.system
+            if leaf.holds_ids:
                 continue
-            context = system.CreateDefaultContext()
-            counts = {
-                CONTINUOUS: min(context.num_continuous_states(), 1) if state(path) else 0,
-                DISCRETE: context.num_discrete_state_groups() if state(path) else 0,
-                PARAMETER: context.num_numeric_parameter_groups() if parameters(path) else 0,
-            }
             groups = []
-            for group, index in ((group, index) for group, count in counts.items() for index in range(count)):
-                size = group_size(context, group, index)
-                groups.append((group, index, slice(start, start + size)))
-                self._slices[f"{path}/{group}/{index} ({size})"] = groups[-1][-1]
-                start += size
+            for kind, index, size in leaf.groups:
+                if (parameters if kind == PARAMETER else state)(path):
+                    groups.append((kind, index, slice(start, start + size)))
+                    self._slices[f"{path}/{kind}/{index} ({size})"] = groups[-1][-1]
+                    start += size
             if groups:
                 self._groups.append((system, groups))
-            if state(path) and (codecs := abstract_state(path, system, context)):
+            if state(path) and (codecs := abstract_state(path, system, system.CreateDefaultContext())):
                 self._abstract.append((path, system, codecs))
         self.names = (*self._slices, *(f"{path}/abstract" for path, _, _ in self._abstract))
         self.size = start

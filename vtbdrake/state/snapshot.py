@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from types import MappingProxyType
@@ -15,8 +15,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from vtbdrake.argument_checks import check_plain
 from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.codecs import SnapshotError, abstract_state
-from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER
-from vtbdrake.state.systems import group_size, is_camera, is_scene_graph, leaves, read_group, write_group
+from vtbdrake.state.systems import leaves, read_group, stateful_leaves, write_group
 from vtbdrake.state.variables import VariableError, Variables, html_table
 
 KIND = "vtbdrake snapshot"
@@ -143,10 +142,10 @@ def take(
             with such a system is refused when it is built.)
     """
     groups: dict[str, np.ndarray] = {}
-    for path, system in leaves(diagram):
+    for path, system, numeric in stateful_leaves(diagram, context):
         leaf_context = system.GetMyContextFromRoot(context)
-        for group, index in numeric_groups(leaf_context):
-            groups[f"{path}/{group}/{index}"] = read_group(leaf_context, group, index)
+        for kind, index, _ in numeric:
+            groups[f"{path}/{kind}/{index}"] = read_group(leaf_context, kind, index)
         for name, array in abstract_state(path, system, leaf_context).read(leaf_context).items():
             groups[f"{path}/abstract/{name}"] = array
     values = {v.address: np.asarray(v.get(context)) for v in variables.values() if not v.derived}
@@ -173,19 +172,17 @@ def apply(
     Raises:
         SnapshotError: The Diagram differs in structure from that of the snapshot; the context is unchanged.
     """
-    systems = [(path, system) for path, system in leaves(diagram) if only(path)]
+    systems = list(stateful_leaves(diagram, context, only=only))
     left = {key for key in snapshot.groups if only(key.partition("/")[0])}
     writers = {}
-    for path, system in systems:
-        leaf_context = system.GetMyContextFromRoot(context)
-        for group, index in numeric_groups(leaf_context):
-            key = f"{path}/{group}/{index}"
+    for path, system, numeric in systems:
+        for kind, index, size in numeric:
+            key = f"{path}/{kind}/{index}"
             left.discard(key)
-            found = _as_entries(snapshot.groups[key]) if key in snapshot.groups else "no such group"
-            expected = f"{group_size(leaf_context, group, index)} entries"
-            if found != expected:
-                raise SnapshotError(f"{key} has {expected} in this testbed, but the snapshot has {found}")
-        state = abstract_state(path, system, leaf_context)
+            entries = _as_entries(snapshot.groups[key]) if key in snapshot.groups else "no such group"
+            if entries != f"{size} entries":
+                raise SnapshotError(f"{key} has {size} entries in this testbed, but the snapshot has {entries}")
+        state = abstract_state(path, system, system.GetMyContextFromRoot(context))
         if state:
             prefix = f"{path}/abstract/"
             arrays = {key.removeprefix(prefix): snapshot.groups[key] for key in left if key.startswith(prefix)}
@@ -202,15 +199,15 @@ def apply(
         except VariableError as error:
             raise SnapshotError(f"the snapshot does not fit: {error}") from error
     context.SetTime(snapshot.time)
-    for path, system in systems:
-        leaf_context = system.GetMyMutableContextFromRoot(context)
-        if not (is_scene_graph(system) or is_camera(system)):
+    for leaf in systems:
+        leaf_context = leaf.system.GetMyMutableContextFromRoot(context)
+        if not leaf.holds_ids:
             # Reset the memory of a discrete plant's last step, which a snapshot cannot hold.
-            system.SetDefaultContext(leaf_context)
-        for group, index in numeric_groups(leaf_context):
-            write_group(leaf_context, group, index, snapshot.groups[f"{path}/{group}/{index}"])
-        if path in writers:
-            writers[path](leaf_context)
+            leaf.system.SetDefaultContext(leaf_context)
+        for kind, index, _ in leaf.groups:
+            write_group(leaf_context, kind, index, snapshot.groups[f"{leaf.path}/{kind}/{index}"])
+        if leaf.path in writers:
+            writers[leaf.path](leaf_context)
     for variable in hidden:
         # Write only what differs: writing invalidates the caches of SceneGraph and cameras.
         if not np.array_equal(variable.get(context), snapshot.values[variable.address]):
@@ -221,16 +218,6 @@ def _as_entries(array: np.ndarray) -> str:
     if array.ndim != 1 or array.dtype != float:
         return f"an array of shape {array.shape} and type {array.dtype}"
     return f"{array.size} entries"
-
-
-def numeric_groups(leaf_context: Context) -> Iterator[tuple[str, int]]:
-    """Yield (group, index) of all numeric groups of a leaf context."""
-    if leaf_context.num_continuous_states():
-        yield CONTINUOUS, 0
-    for index in range(leaf_context.num_discrete_state_groups()):
-        yield DISCRETE, index
-    for index in range(leaf_context.num_numeric_parameter_groups()):
-        yield PARAMETER, index
 
 
 class StateCopier:
@@ -257,14 +244,14 @@ class StateCopier:
         *,
         only: Callable[[str], bool] = lambda path: True,
     ) -> None:
-        from_paths, to_paths = dict(leaves(source)), dict(leaves(target))
+        from_paths = dict(leaves(source))
         self._pairs = []
-        for path, system in to_paths.items():
-            if is_scene_graph(system) or is_camera(system) or _is_empty(system) or not only(path):
+        for leaf in stateful_leaves(target, only=only):
+            if leaf.holds_ids or not (leaf.groups or _has_abstract_values(leaf.system)):
                 continue
-            if path not in from_paths:
-                raise ValueError(f"the testbed to copy from has no system {path}")
-            self._pairs.append((from_paths[path], system))
+            if leaf.path not in from_paths:
+                raise ValueError(f"the testbed to copy from has no system {leaf.path}")
+            self._pairs.append((from_paths[leaf.path], leaf.system))
         self._hidden = [
             (source_variables[v.address], v)
             for v in target_variables.values()
@@ -292,6 +279,6 @@ class StateCopier:
                 to_variable.set(target, value)
 
 
-def _is_empty(system: System) -> bool:
+def _has_abstract_values(system: System) -> bool:
     context = system.CreateDefaultContext()
-    return not (any(numeric_groups(context)) or context.num_abstract_states() or context.num_abstract_parameters())
+    return bool(context.num_abstract_states() or context.num_abstract_parameters())

@@ -7,7 +7,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from vtbdrake.state.multibody import Prefix
 
 POSE_UNIT = "m, rad"
+# How groups are called in the addresses of systems that name no variables.
+_GROUP_NAMES = {DISCRETE: "discrete_state", PARAMETER: "parameter"}
 # Drake names a system without a name by its class and its address in memory.
 UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
@@ -38,6 +40,52 @@ def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
             yield from leaves(system, path=below)
         else:
             yield below, system
+
+
+class Group(NamedTuple):
+    """A numeric group of a leaf system."""
+
+    kind: str  # ``continuous``, ``discrete`` or ``parameter``
+    number: int  # among those of its kind
+    size: int
+
+
+class Leaf(NamedTuple):
+    """A leaf system, with all numeric groups of its context."""
+
+    path: str
+    system: System
+    groups: tuple[Group, ...]
+
+    @property
+    def holds_ids(self) -> bool:
+        """Return whether this is a SceneGraph or a camera: their contexts hold ids that differ from build to build."""
+        return is_scene_graph(self.system) or is_camera(self.system)
+
+
+def stateful_leaves(
+    diagram: Diagram, context: Context | None = None, *, only: Callable[[str], bool] = lambda path: True
+) -> Iterator[Leaf]:
+    """Yield the leaf systems below ``diagram`` with their numeric groups, as snapshots, layouts and copies need them.
+
+    Args:
+        diagram: The Diagram.
+        context: A root context, in which the groups are counted; by default in the default context of each system.
+        only: Predicate of a path that selects the systems.
+    """
+    for path, system in leaves(diagram):
+        if only(path):
+            leaf_context = system.CreateDefaultContext() if context is None else system.GetMyContextFromRoot(context)
+            yield Leaf(path, system, tuple(_numeric_groups(leaf_context)))
+
+
+def _numeric_groups(context: Context) -> Iterator[Group]:
+    if size := context.num_continuous_states():
+        yield Group(CONTINUOUS, 0, size)
+    for index in range(context.num_discrete_state_groups()):
+        yield Group(DISCRETE, index, context.get_discrete_state(index).size())
+    for index in range(context.num_numeric_parameter_groups()):
+        yield Group(PARAMETER, index, context.get_numeric_parameter(index).size())
 
 
 def class_name(system: System) -> str:
@@ -107,25 +155,11 @@ def _elements(system: System) -> Iterator[Element]:
         yield from declared
         return
     context = system.CreateDefaultContext()
-    n = context.num_continuous_states()
-    if n:
-        yield Element("continuous_state", CONTINUOUS, 0, (n,))
-    for i in range(context.num_discrete_state_groups()):
-        yield Element(f"discrete_state_{i}", DISCRETE, i, (context.get_discrete_state(i).size(),))
-    for i in range(context.num_numeric_parameter_groups()):
-        size = context.get_numeric_parameter(i).size()
+    for kind, index, size in _numeric_groups(context):
         # The parameter of a constant source is its output value.
-        name = "value" if isinstance(system, ConstantVectorSource) else f"parameter_{i}"
-        yield Element(name, PARAMETER, i, (size,))
-
-
-def group_size(context: Context, group: str, index: int) -> int:
-    """Return the number of entries of a numeric group of a leaf context; 0 if it has no such group."""
-    if group == CONTINUOUS:
-        return int(context.num_continuous_states())
-    if group == DISCRETE:
-        return int(context.get_discrete_state(index).size()) if index < context.num_discrete_state_groups() else 0
-    return int(context.get_numeric_parameter(index).size()) if index < context.num_numeric_parameter_groups() else 0
+        is_value = kind == PARAMETER and isinstance(system, ConstantVectorSource)
+        name = "continuous_state" if kind == CONTINUOUS else f"{_GROUP_NAMES[kind]}_{index}"
+        yield Element("value" if is_value else name, kind, index, (size,))
 
 
 def read_group(context: Context, group: str, index: int) -> np.ndarray:
@@ -149,7 +183,8 @@ def write_group(context: Context, group: str, index: int, value: np.ndarray) -> 
 
 def _numeric(address: str, system: System, element: Element, *, alone: bool) -> Variable:
     size = int(np.prod(element.shape, dtype=int))
-    available = group_size(system.CreateDefaultContext(), element.group, element.index)
+    sizes = {(kind, index): size for kind, index, size in _numeric_groups(system.CreateDefaultContext())}
+    available = sizes.get((element.group, element.index), 0)
     if element.start + size > available:
         raise ValueError(
             f"{address} is declared as entries {element.start} to {element.start + size - 1} of {element.group} "
