@@ -282,7 +282,7 @@ def test_impossible_board_is_rejected(ids: list[int], size: float, message: str)
 
 
 def test_impossible_detector_is_rejected() -> None:
-    with pytest.raises(ValueError, match="refinement is one of lines, subpixel, none, not 'apriltag'"):
+    with pytest.raises(ValueError, match="refinement must be one of lines, subpixel, none, not 'apriltag'"):
         MarkerDetectorConfig(refinement="apriltag")
 
 

@@ -174,8 +174,8 @@ def test_images_of_different_sizes_are_refused() -> None:
     [
         ({"largest_disparity": 50}, "multiple of 16 pixels, not 50"),
         ({"block": 4}, "odd number of pixels, not 4"),
-        ({"directions": 4}, "3, 5, 8 directions, not 4"),
-        ({"texture": -1.0}, "texture of a StereoMatcher is not negative"),
+        ({"directions": 4}, "directions must be one of 3, 5, 8, not 4"),
+        ({"texture": -1.0}, "StereoMatcher.texture must be a number of at least 0, not -1.0"),
     ],
 )
 def test_matchers_that_cannot_be_are_refused(values: dict[str, float], message: str) -> None:

@@ -320,10 +320,10 @@ def test_belief_age_must_be_multiple_of_period() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"period": 0.0}, "period must be positive"),
-        ({"horizon": 0}, "horizon must be an integer of at least 1"),
-        ({"delay": 0.5}, "delay must be an integer of at least 0"),
-        ({"false_alarm_interval": float("nan")}, "false_alarm_interval must be positive"),
+        ({"period": 0.0}, "ResidualConfig.period must be a finite number above 0 s, not 0.0"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1 periods"),
+        ({"delay": 0.5}, "delay must be a whole number of at least 0 periods, not 0.5"),
+        ({"false_alarm_interval": float("nan")}, "false_alarm_interval must be a finite number above 0 s, not nan"),
         ({"tolerance": {"sense.position": -1.0}}, "tolerance of sense.position"),
     ],
 )

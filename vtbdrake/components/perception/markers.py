@@ -20,6 +20,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.perception.estimate import Array, PoseEstimate, cross_matrix, rotation_matrix
 from vtbdrake.components.textures import textured_mesh
+from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.geometry import Mesh, SceneGraphInspector
@@ -174,37 +175,30 @@ REFINEMENTS = ("lines", "subpixel", "none")
 
 @dataclass
 class MarkerDetectorConfig:
-    """Settings of the detection of markers in an image.
+    """Settings of the detection of markers in an image."""
 
-    Attributes:
-        window: The edge of the largest window of the adaptive threshold, in pixels; the smallest has 3.
-        windows: The number of windows that are tried.
-        threshold: The offset of the adaptive threshold below the mean, in 8-bit counts: less finds markers in the dark.
-        min_perimeter: The perimeter of the smallest marker, as a share of the image's longer side.
-        refinement: ``lines`` fits lines to the edges of a marker, ``subpixel`` is OpenCV's search at the corners,
-            ``none`` gives whole pixels.
-        error_correction: The share of the family's capacity for the correction of bits that is used, in [0, 1].
-    """
-
-    window: int = 23
-    windows: int = 3
-    threshold: float = 7.0
-    min_perimeter: float = 0.12
-    refinement: str = "lines"
-    error_correction: float = 0.6
+    window: int = setting(
+        23, "The edge of the largest window of the adaptive threshold; the smallest has 3.", unit="pixels", ge=3
+    )
+    windows: int = setting(3, "The number of windows that are tried.", ge=1)
+    threshold: float = setting(
+        7.0, "The offset of the adaptive threshold below the mean, in 8-bit counts: less finds markers in the dark."
+    )
+    min_perimeter: float = setting(
+        0.12, "The perimeter of the smallest marker, as a share of the image's longer side.", gt=0.0, lt=4.0
+    )
+    refinement: str = setting(
+        "lines",
+        "``lines`` fits lines to the edges of a marker, ``subpixel`` is OpenCV's search at the corners, "
+        "``none`` gives whole pixels.",
+        choices=REFINEMENTS,
+    )
+    error_correction: float = setting(
+        0.6, "The share of the family's capacity for the correction of bits that is used.", ge=0.0, le=1.0
+    )
 
     def __post_init__(self) -> None:
-        if self.window < 3 or self.windows < 1:
-            raise ValueError(
-                f"the adaptive threshold needs a window of at least 3 pixels, and at least one, not {self.window} and "
-                f"{self.windows}"
-            )
-        if not 0.0 < self.min_perimeter < 4.0:
-            raise ValueError(f"min_perimeter is a share of the image between 0 and 4, not {self.min_perimeter}")
-        if self.refinement not in REFINEMENTS:
-            raise ValueError(f"refinement is one of {', '.join(REFINEMENTS)}, not {self.refinement!r}")
-        if not 0.0 <= self.error_correction <= 1.0:
-            raise ValueError(f"error_correction lies in 0 to 1, not at {self.error_correction}")
+        check_settings(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
 from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
+from vtbdrake.settings import check_settings, setting
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,34 +146,35 @@ def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: 
 
 @dataclass
 class RegistrationConfig:
-    """Noise and limits of the registration of laser points.
+    """Noise and limits of the registration of laser points."""
 
-    Attributes:
-        range_noise: The standard deviation of the distance of a point from its face, in m.
-        systematic: The standard deviation of errors that more points do not reduce, in m; assumed, not derived. As an
-            angle it counts per metre.
-        basin: Largest distance from the body of points that are used in the first step, in m. It is halved in every
-            step, down to four times the noise.
-        most_points: Largest number of points that are used, evenly chosen.
-        fewest_points: Least number of points that must lie on the faces after the last step.
-        share: Least share that they must be of the points within ``basin`` of the body.
-        steps: Largest number of steps.
-    """
-
-    range_noise: float = 0.01
-    systematic: float = 0.003
-    basin: float = 0.3
-    most_points: int = 800
-    fewest_points: int = 30
-    share: float = 0.6
-    steps: int = 25
+    range_noise: float = setting(
+        0.01, "The standard deviation of the distance of a point from its face.", unit="m", gt=0.0
+    )
+    systematic: float = setting(
+        0.003,
+        "The standard deviation of errors that more points do not reduce; assumed, not derived. As an angle "
+        "it counts per metre.",
+        unit="m",
+        ge=0.0,
+    )
+    basin: float = setting(
+        0.3,
+        "Largest distance from the body of points that are used in the first step. It is halved in every "
+        "step, down to four times the noise.",
+        unit="m",
+        gt=0.0,
+    )
+    most_points: int = setting(800, "Largest number of points that are used, evenly chosen.")
+    fewest_points: int = setting(30, "Least number of points that must lie on the faces after the last step.")
+    share: float = setting(0.6, "Least share that they must be of the points within ``basin`` of the body.")
+    steps: int = setting(25, "Largest number of steps.")
 
     def __post_init__(self) -> None:
-        if not (self.range_noise > 0.0 and self.basin > 4.0 * self.range_noise and self.systematic >= 0.0):
-            raise ValueError(
-                "a RegistrationConfig needs a positive range_noise and a basin of more than 4 times that, not "
-                f"{self.range_noise} and {self.basin}; systematic is not negative"
-            )
+        check_settings(self)
+        if not self.basin > 4.0 * self.range_noise:
+            least = f"more than 4 times the range_noise, {4.0 * self.range_noise:g} m"
+            raise ValueError(f"RegistrationConfig.basin must be {least}, not {self.basin!r}")
 
 
 # So many steps at least minimize the offsets along the faces, too.

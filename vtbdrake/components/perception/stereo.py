@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.settings import check_settings, setting
+
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
@@ -106,39 +108,42 @@ _MODES = {3: "STEREO_SGBM_MODE_SGBM_3WAY", 5: "STEREO_SGBM_MODE_SGBM", 8: "STERE
 
 @dataclass(frozen=True)
 class StereoMatcher:
-    """Settings of semi-global matching.
+    """Settings of semi-global matching."""
 
-    Attributes:
-        largest_disparity: Largest disparity in pixels, a multiple of 16; nearer surfaces get none, or a wrong one.
-        block: The edge of the blocks that are compared, in pixels, odd.
-        directions: From how many directions semi-global matching collects costs: 3, 5 or 8. Only with 8 are the
-            disparities of slopes not biased (with 5 by more than 0.1 pixels); it takes twice the time or more. On
-            upright surfaces all are alike.
-        uniqueness: By how many per cent the best cost is better than that of any other disparity.
-        symmetry: How far the disparities from left to right and from right to left may differ, in pixels.
-        texture: The least contrast around a pixel: the mean absolute difference of pixels side by side in counts. Parts
-            with less (sky, deep shade) get no disparity.
-        speckle: The least number of connected pixels with similar disparities.
-    """
-
-    largest_disparity: int = 64
-    block: int = 5
-    directions: int = 3
-    uniqueness: int = 10
-    symmetry: int = 1
-    texture: float = 2.0
-    speckle: int = 50
+    largest_disparity: int = setting(
+        64, "Largest disparity, a multiple of 16; nearer surfaces get none, or a wrong one.", unit="pixels", ge=16
+    )
+    block: int = setting(5, "The edge of the blocks that are compared, odd.", unit="pixels", ge=1)
+    directions: int = setting(
+        3,
+        "From how many directions semi-global matching collects costs: 3, 5 or 8. Only with 8 are the "
+        "disparities of slopes not biased (with 5 by more than 0.1 pixels); it takes twice the time or more. "
+        "On upright surfaces all are alike.",
+        choices=tuple(_MODES),
+    )
+    uniqueness: int = setting(
+        10, "By how many per cent the best cost is better than that of any other disparity.", ge=0
+    )
+    symmetry: int = setting(
+        1, "How far the disparities from left to right and from right to left may differ.", unit="pixels", ge=0
+    )
+    texture: float = setting(
+        2.0,
+        "The least contrast around a pixel: the mean absolute difference of pixels side by side in counts. "
+        "Parts with less (sky, deep shade) get no disparity.",
+        ge=0.0,
+        finite=False,
+    )
+    speckle: int = setting(50, "The least number of connected pixels with similar disparities.", ge=0)
 
     def __post_init__(self) -> None:
-        if self.largest_disparity < 16 or self.largest_disparity % 16:
-            raise ValueError(f"the largest disparity is a multiple of 16 pixels, not {self.largest_disparity}")
-        if self.block < 1 or self.block % 2 == 0:
-            raise ValueError(f"blocks have an odd number of pixels, not {self.block}")
-        if self.directions not in _MODES:
-            raise ValueError(f"matching goes in {', '.join(map(str, _MODES))} directions, not {self.directions}")
-        for name in ("uniqueness", "symmetry", "texture", "speckle"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} of a StereoMatcher is not negative, not {getattr(self, name)}")
+        check_settings(self)
+        if self.largest_disparity % 16:
+            raise ValueError(
+                f"StereoMatcher.largest_disparity must be a multiple of 16 pixels, not {self.largest_disparity!r}"
+            )
+        if self.block % 2 == 0:
+            raise ValueError(f"StereoMatcher.block must be an odd number of pixels, not {self.block!r}")
 
     def disparity(
         self, left: ImageRgba8U | NDArray[np.uint8], right: ImageRgba8U | NDArray[np.uint8]

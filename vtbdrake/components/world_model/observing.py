@@ -21,36 +21,38 @@ from vtbdrake.components.world_model.objects import (
     WorldObject,
     finite_part,
 )
+from vtbdrake.settings import check_settings, setting
 
 
 @dataclass(frozen=True)
 class LifeCycleConfig:
-    """When objects are confirmed, revised and retired. The defaults are assumed, not taken from data.
+    """When objects are confirmed, revised and retired. The defaults are assumed, not taken from data."""
 
-    Attributes:
-        gate: The share of right pairs of object and sighting that the gate of the association lets pass.
-        confirm: The number of hits that confirms a tentative object.
-        forget: The number of misses in a row after which a tentative object is removed from the model.
-        retire: The number of misses in a row after which a confirmed object is retired.
-        revise: The number of conflicts in a row after which a confirmed object is moved to where it is seen.
-        revise_within: The horizontal distance in m up to which a sighting beyond the gate counts as a conflict with
-            an object that was expected and not seen; 0 revises nothing.
-    """
-
-    gate: float = 0.997
-    confirm: int = 3
-    forget: int = 2
-    retire: int = 8
-    revise: int = 3
-    revise_within: float = 1.0
+    gate: float = setting(
+        0.997,
+        "The share of right pairs of object and sighting that the gate of the association lets pass.",
+        gt=0.0,
+        lt=1.0,
+    )
+    confirm: int = setting(3, "The number of hits that confirms a tentative object.", ge=1)
+    forget: int = setting(
+        2, "The number of misses in a row after which a tentative object is removed from the model.", ge=1
+    )
+    retire: int = setting(8, "The number of misses in a row after which a confirmed object is retired.", ge=1)
+    revise: int = setting(
+        3, "The number of conflicts in a row after which a confirmed object is moved to where it is seen.", ge=1
+    )
+    revise_within: float = setting(
+        1.0,
+        "The horizontal distance up to which a sighting beyond the gate counts as a conflict with an object "
+        "that was expected and not seen; 0 revises nothing.",
+        unit="m",
+        ge=0.0,
+        finite=False,
+    )
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.gate < 1.0:
-            raise ValueError(f"gate is a probability between 0 and 1, not {self.gate}")
-        if min(self.confirm, self.forget, self.retire, self.revise) < 1:
-            raise ValueError("confirm, forget, retire and revise are counts of at least 1")
-        if not self.revise_within >= 0.0:
-            raise ValueError(f"revise_within is a distance of at least 0 m, not {self.revise_within}")
+        check_settings(self)
 
 
 DEFAULT_LIFE_CYCLE = LifeCycleConfig()

@@ -6,13 +6,13 @@ import logging
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
-from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.testbed import Interface, Scenario
 from vtbdrake.testbed.prediction import Predictor
 
@@ -33,41 +33,45 @@ class ResidualConfig:
     Attributes:
         scenario: Scenario of the predicted world; by default that of the loop's target. It has the latencies of the
             sensors, but no random errors.
-        period: Period of the machine's cycles and the DPS's, in seconds.
-        horizon: Length of a prediction in periods, after which it restarts from the belief.
-        delay: Periods from the instant of a sample until the actuator command that answers it acts: 0 in lock-step,
-            where it acts at once; 1 for a machine with a clock of its own, where it acts from the next period on. A
-            machine whose samples lack the period that simulated sensors take has one less.
-        settle: Windows that are predicted but not used at first and after a gap, while state that the belief does not
-            cover (currents of drives, samples in transit) follows the actuator commands.
         values: Values of variables of the predicted world by address, such as the assumed payload.
         tolerance: By signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
             each; persistent residuals below half of it are not reported.
-        allowance: Allowance k of `Cusum`, in scales.
-        false_alarm_interval: Mean time between two false alarms of all signals together, in seconds, if the calibration
-            includes all motions, and the sums of residuals are about normal. Outliers alarm more often.
 
     Raises:
         ValueError: A value is out of its range.
     """
 
     scenario: Scenario | None = None
-    period: float = 1e-3
-    horizon: int = 10
-    delay: int = 0
-    settle: int = 10
+    period: float = setting(1e-3, "Period of the machine's cycles and the DPS's.", unit="s", gt=0.0)
+    horizon: int = setting(10, "Length of a prediction, after which it restarts from the belief.", unit="periods", ge=1)
+    delay: int = setting(
+        0,
+        "Periods from the instant of a sample until the actuator command that answers it acts: 0 in "
+        "lock-step, where it acts at once; 1 for a machine with a clock of its own, where it acts from the next "
+        "period on. A machine whose samples lack the period that simulated sensors take has one less.",
+        unit="periods",
+        ge=0,
+    )
+    settle: int = setting(
+        10,
+        "Windows that are predicted but not used at first and after a gap, while state that the belief does "
+        "not cover (currents of drives, samples in transit) follows the actuator commands.",
+        unit="windows",
+        ge=0,
+    )
     values: Mapping[str, Any] = field(default_factory=dict)
     tolerance: Mapping[str, ArrayLike] = field(default_factory=dict)
-    allowance: float = 0.5
-    false_alarm_interval: float = 3.6e6
+    allowance: float = setting(0.5, "Allowance k of `Cusum`, in scales.", gt=0.0)
+    false_alarm_interval: float = setting(
+        3.6e6,
+        "Mean time between two false alarms of all signals together, if the calibration includes "
+        "all motions, and the sums of residuals are about normal. Outliers alarm more often.",
+        unit="s",
+        gt=0.0,
+    )
 
     def __post_init__(self) -> None:
-        for name in ("period", "allowance", "false_alarm_interval"):
-            if not 0.0 < getattr(self, name) < inf:
-                raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
-        for name, least in (("horizon", 1), ("delay", 0), ("settle", 0)):
-            if int(getattr(self, name)) != getattr(self, name) or getattr(self, name) < least:
-                raise ValueError(f"{name} must be an integer of at least {least}, not {getattr(self, name)!r}")
+        check_settings(self)
         for signal, tolerance in self.tolerance.items():
             if not (np.asarray(tolerance) >= 0.0).all():
                 raise ValueError(f"the tolerance of {signal} must not be negative, as {tolerance!r} is")
