@@ -114,3 +114,28 @@ def test_names_are_escaped_and_every_role_is_drawn() -> None:
     found = texts(svg(testbed))
     assert {"camera<1>", "arm", "RigidTransform", "PoseRelay"} <= found
     assert any("further systems: logger" in text for text in found)
+
+
+@pytest.mark.parametrize("mode", ["sim", "real"])
+def test_the_side_of_the_actuators_mirrors_that_of_the_sensors(mode: str) -> None:
+    picture = ElementTree.fromstring(svg(RelayScenario().build(mode=mode)))
+    width = float(picture.attrib["width"])
+    dots = {(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in picture.iter(f"{SVG}circle")}
+    assert dots == {(width - x, y) for x, y in dots}
+    levels = {y for _, y in dots}
+    # Each world is connected with the contacts of its own colour.
+    colors = [(dot.get("stroke"), dot.attrib["fill"], dot.attrib["cy"]) for dot in picture.iter(f"{SVG}circle")]
+    assert {(fill, y) for stroke, fill, y in colors if not stroke} <= {(stroke, y) for stroke, _, y in colors}
+    lines: dict[str, set[tuple[str, frozenset[tuple[float, float]]]]] = {"left": set(), "right": set()}
+    for line in picture.iter(f"{SVG}polyline"):
+        ends = [tuple(map(float, point.split(","))) for point in line.attrib["points"].split()]
+        if not levels & {y for _, y in ends}:  # within a world
+            continue
+        is_left = ends[0][0] < width / 2.0
+        points = frozenset((x if is_left else width - x, y) for x, y in ends)
+        lines["left" if is_left else "right"].add((line.attrib["stroke"], points))
+        # Commands arrive at the worlds, measurements at the DPS.
+        if "marker-end" in line.attrib:
+            assert ends[-1][0] == ends[0][0] if not is_left else ends[-1][0] > ends[0][0]
+    assert lines["left"] == lines["right"]
+    assert len(lines["left"]) == 8
