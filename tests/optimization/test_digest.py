@@ -5,6 +5,7 @@ import importlib
 import itertools
 import linecache
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -290,6 +291,9 @@ def test_other_processes_and_hash_seeds_have_the_same_digests():
 def test_functions_of_installed_packages_are_their_names_and_what_they_hold():
     assert digest(np.median) == digest(np.median) != digest(np.mean)
     assert digest(functools.partial(np.clip, a_min=0)) != digest(functools.partial(np.clip, a_min=1))
+    # A function of a package that no name leads to holds values.
+    assert digest(shutil.ignore_patterns("a")) == digest(shutil.ignore_patterns("a"))
+    assert digest(shutil.ignore_patterns("a")) != digest(shutil.ignore_patterns("b"))
 
 
 @pytest.mark.parametrize("statement", ["import {0}; return {0}.A", "from {0} import A; return A", "from . import {0}"])

@@ -219,3 +219,11 @@ def test_the_memory_survives_as_arrays():
         answer, state = unit.step(UNIT_STATE_CODEC.decode(arrays), scan, X_OH=one.reckoned[k], time=PERIOD * k)
         np.testing.assert_array_equal(answer.pose, straight[k].pose)
         np.testing.assert_array_equal(answer.covariance, straight[k].covariance)
+
+
+def test_answers_cannot_be_changed():
+    one = drive(3, ACCURATE)
+    answer, _ = unit_for(one.map).step(unit_for(one.map).start(), one.scans[0], X_OH=one.reckoned[0], time=0.0)
+    for array in (answer.X_OH, answer.pose, answer.covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0

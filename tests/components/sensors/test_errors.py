@@ -208,6 +208,14 @@ def test_impossible_errors_are_refused(errors: ErrorModel) -> None:
         Ramp(errors)
 
 
+def test_seed_is_at_most_what_a_double_counts_to() -> None:
+    sensor = Ramp(ErrorModel(seed=2**53))
+    (seed,) = [element for element in sensor.variables if element.name == "seed"]
+    assert seed.bounds == (0.0, 2.0**53)
+    with pytest.raises(ValueError, match=r"seed must be"):
+        Ramp(ErrorModel(seed=2**53 + 1))
+
+
 def test_noise_of_a_sensor_that_has_none_is_refused() -> None:
     class Switch(SampledSensor):
         def __init__(self) -> None:

@@ -267,6 +267,15 @@ def test_missing_windows_do_not_count() -> None:
     assert 0.9 < found.deviation["sense.a"][1] < 1.5
 
 
+def test_single_windows_of_a_batch_count() -> None:
+    table = np.full((1000, 3), np.nan)
+    table[50::100] = 0.0
+    table[350] = 1.0
+    found = of(table)
+    assert found.mean["act.b"] == pytest.approx([0.1])
+    assert found.deviation["act.b"] == pytest.approx([4 * 0.9])
+
+
 def test_missing_signal_has_no_deviation() -> None:
     table = noise(400)
     table[:, 2] = np.nan
@@ -337,7 +346,7 @@ def test_run_length_matches_simulated_runs(threshold: float, allowance: float) -
     assert run_length(threshold, allowance) == pytest.approx(lengths.mean(), rel=0.1)
 
 
-@pytest.mark.parametrize("length", [10.0, 1e4, 1e12])
+@pytest.mark.parametrize("length", [1.1 * run_length(0.0, 0.5), 10.0, 1e4, 1e12])
 def test_threshold_inverts_run_length(length: float) -> None:
     assert run_length(threshold_for(length, 0.5), 0.5) == pytest.approx(length, rel=1e-6)
 
