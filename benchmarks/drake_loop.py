@@ -17,7 +17,7 @@ from pydrake.systems.primitives import ConstantVectorSource, Gain
 
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.manipulator.arm import JOINTS
-from vtbdrake_diagrams.manipulator.motions import HOME
+from vtbdrake_diagrams.manipulator.motions import Motion
 
 FIRST_MESSAGE = 5.0  # s to wait for
 
@@ -70,7 +70,7 @@ class DrakeLoop:
         )
         vector = builder.AddSystem(_Wrench())
         builder.Connect(wrench.get_output_port(), vector.get_input_port())
-        motion = builder.AddSystem(ConstantVectorSource([float(HOME)]))
+        motion = builder.AddSystem(ConstantVectorSource([float(Motion.HOME)]))
         torque = builder.AddSystem(Gain(-1.0, JOINTS))  # An iiwa sends its measured torques with the opposite sign.
         builder.Connect(arm.GetOutputPort("torque_measured"), torque.get_input_port())
         for port, signal in (

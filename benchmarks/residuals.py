@@ -22,7 +22,7 @@ from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
-from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.safety import CONTINUITY
 
 # Noise of the machine's sensors, in their units.
@@ -117,7 +117,7 @@ def arm_loop(*, seed: int, mass: float | None = None) -> Iterator[Runtime]:
             while not all(received.count for received in bridge.sensed.values()):
                 bridge.poll(PATIENCE)
             runtime.switch("real")
-            runtime.write({"u.motion": float(CIRCLE)})
+            runtime.write({"u.motion": float(Motion.CIRCLE)})
             runtime.cycle()
             yield runtime
         finally:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.measure import HIGHER, Benchmark, spread
 from vtbdrake_diagrams.satellite import SatelliteScenario
-from vtbdrake_diagrams.satellite.supervisor import MODES
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 MODE = "dps.impl.supervisor.mode"
 
@@ -53,5 +53,5 @@ def _real_time_factor(
         better=HIGHER,
         against="real time, on one core",
         note=f"{spread(np.array(factors), unit='x')}; {size if scenario.aboard else ''}"
-        f"{duration:g} s, in which the supervisor comes to {MODES[int(testbed.read(context, MODE))]}",
+        f"{duration:g} s, in which the supervisor comes to {Mode(int(testbed.read(context, MODE))).label}",
     )

@@ -24,7 +24,7 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, FOLLOW, MOTIONS
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.safety import CARRY
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
@@ -149,7 +149,7 @@ class Demo:
 
     def _die_and_recover(self, loop: Runtime, successor: ChildProcess) -> None:
         print("\nThe machine is killed in the middle of a circle:")
-        loop.target.write(loop.context, {"u.motion": float(CIRCLE)})
+        loop.target.write(loop.context, {"u.motion": float(Motion.CIRCLE)})
         loop.run(seconds=2.2)
         _reset_guards(loop)
         killed = time.monotonic()
@@ -171,14 +171,14 @@ class Demo:
         print(f"  a reset is {'rejected' if loop.guards.latched else 'ACCEPTED'} as long as the sensors are silent")
         successor.connection.sendall(b"begin")
         # The reference follows the arm, wherever the machine starts.
-        loop.target.write(loop.context, {"u.motion": float(FOLLOW)})
+        loop.target.write(loop.context, {"u.motion": float(Motion.FOLLOW)})
         loop.run(until=lambda: not _sensor_faults(loop), seconds=60.0)
         loop.run(seconds=0.1)
         print("  the machine is restarted: its sensors are fresh, the arm floats in place")
         _reset_guards(loop)
         self.attendant.reasons.clear()
         self.attendant.loop = loop
-        errors = run_trial(loop, (CIRCLE,)).errors((CIRCLE,))
+        errors = run_trial(loop, (Motion.CIRCLE,)).errors((Motion.CIRCLE,))
         print(
             f"  reset; the next circle is tracked to {1e3 * rms(errors):.2f} mm (RMS), {1e3 * errors.max():.2f} at most"
         )
@@ -201,7 +201,7 @@ class Demo:
         for motion in FREE:
             both = [track.errors((motion,)) for track in (simulated, real)]
             cells = [f"{1e3 * value:.2f}" for errors in both for value in (rms(errors), errors.max())]
-            rows.append((MOTIONS[motion], *cells))
+            rows.append((Motion(motion).label, *cells))
         header = ("tracking error of the tip (mm)", "sim RMS", "sim max", "machine RMS", "machine max")
         print("\n" + table(header, rows) + "\n")
         contacts = [track.contact(self.along_x, self.scenario) for track in (simulated, real)]

@@ -15,7 +15,7 @@ from vtbdrake.state.declarations import DISCRETE, PARAMETER, Element
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
 from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
-from vtbdrake_diagrams.manipulator.motions import HOME, parameters, reference
+from vtbdrake_diagrams.manipulator.motions import Motion, parameters, reference
 
 # Name -> (initial value, unit). Other systems need the first one.
 States = dict[str, tuple[object, str]]
@@ -173,7 +173,7 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
     p = _symbols(gains)
     state: States = {
         "torque": (gravity_torque(model), "N m"),
-        "motion": (HOME, "1"),
+        "motion": (Motion.HOME, "1"),
         "clock": (0.0, "s"),
         "start": (model.arm.home, "rad"),
         "reference": (model.arm.home, "rad"),

@@ -17,6 +17,7 @@ Movements", 1985).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from math import pi
 
 import casadi
@@ -24,8 +25,20 @@ import casadi
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.dynamics import Expression
 
-MOTIONS = ("follow", "home", "swing", "press", "circle")
-FOLLOW, HOME, SWING, PRESS, CIRCLE = range(len(MOTIONS))
+
+class Motion(IntEnum):
+    """The motions; the command ``motion`` and the state of the same name hold their numbers."""
+
+    FOLLOW = 0
+    HOME = 1
+    SWING = 2
+    PRESS = 3
+    CIRCLE = 4
+
+    @property
+    def label(self) -> str:
+        """Return the name as users read it."""
+        return self.name.lower()
 
 
 def parameters(arm: Arm) -> dict[str, tuple[object, str, tuple[float, float]]]:
@@ -83,14 +96,14 @@ def reference(
         period: The sample period, in seconds.
     """
     before = state["motion"]
-    follow = wanted < FOLLOW + 0.5
-    released = before < FOLLOW + 0.5
+    follow = wanted < Motion.FOLLOW + 0.5
+    released = before < Motion.FOLLOW + 0.5
     away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-6
     durations = [0, away * p["home_duration"], p["swing_duration"], p["press_duration"], p["circle_duration"]]
     # The last instant of a motion, at which it has arrived, is the first of the next one.
     begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) + period / 2)
-    motion = casadi.if_else(begins, casadi.if_else(released, HOME, casadi.floor(wanted + 0.5)), before)
-    motion = casadi.if_else(follow, FOLLOW, motion)
+    motion = casadi.if_else(begins, casadi.if_else(released, Motion.HOME, casadi.floor(wanted + 0.5)), before)
+    motion = casadi.if_else(follow, Motion.FOLLOW, motion)
     clock = casadi.if_else(casadi.logic_or(follow, released), 0, casadi.if_else(begins, period, state["clock"]))
     at = casadi.if_else(casadi.logic_or(follow, released), q, state["reference"])
     start = casadi.if_else(casadi.logic_or(begins, follow), at, state["start"])
@@ -106,8 +119,8 @@ def reference(
         (c * rate, s * rate),
         (c * acceleration - s * rate**2, s * acceleration + c * rate**2),
     )
-    is_home, is_swing = _is(motion, HOME), _is(motion, SWING)
-    is_press, is_circle = _is(motion, PRESS), _is(motion, CIRCLE)
+    is_home, is_swing = _is(motion, Motion.HOME), _is(motion, Motion.SWING)
+    is_press, is_circle = _is(motion, Motion.PRESS), _is(motion, Motion.CIRCLE)
     joint = [is_home * (p["home"] - start) * home[k] + is_swing * p["swing"] * swing[k] for k in range(3)]
     tip = [
         casadi.vertcat(
@@ -119,7 +132,7 @@ def reference(
     in_joints = 1 - is_press - is_circle
     x = clock / (is_press * p["press_duration"] + is_circle * p["circle_duration"] + in_joints)
     ease = (1 - in_joints) * 8 / 15 * _flank(x, 1)[1]
-    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, FOLLOW), ease, following)
+    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, Motion.FOLLOW), ease, following)
 
 
 def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression, Expression]:

@@ -35,7 +35,7 @@ from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dps import gravity_torque, make_dps
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import FOLLOW, HOME, MOTIONS
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm_fallback
 
 LARGEST_DELAY = 50
@@ -112,7 +112,7 @@ class ManipulatorScenario(Scenario):
                     idle=0.0,
                 )
             ],
-            commands=[Signal("motion", size=1, lower=0.0, upper=len(MOTIONS) - 1.0, default=HOME)],
+            commands=[Signal("motion", size=1, lower=0.0, upper=float(max(Motion)), default=int(Motion.HOME))],
         )
 
     def deployment(self) -> Deployment:
@@ -138,7 +138,8 @@ class ManipulatorScenario(Scenario):
             period=self.period,
             guards={"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE},
             continuity=CONTINUITY,
-            hint=f"set u.motion to {FOLLOW} (follow), by which the reference is where the arm is; home comes after it",
+            hint=f"set u.motion to {Motion.FOLLOW} (follow), by which the reference is where the arm is; "
+            "home comes after it",
             pace="wrench",  # It is in the last message of the arm's cycle.
             residuals=ResidualConfig(
                 scenario=self._without_chance(),

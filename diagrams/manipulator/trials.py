@@ -14,7 +14,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME, MOTIONS, PRESS, SWING, parameters, reference
+from vtbdrake_diagrams.manipulator.motions import Motion, parameters, reference
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 # The press meets the wall at this distance (m), and the swing does not.
@@ -25,8 +25,8 @@ DURATIONS = {
     "dps.impl.circle_duration": 2.5,
     "dps.impl.press_duration": 3.0,
 }
-PROGRAM = (SWING, CIRCLE, PRESS)
-FREE = (SWING, CIRCLE)
+PROGRAM = (Motion.SWING, Motion.CIRCLE, Motion.PRESS)
+FREE = (Motion.SWING, Motion.CIRCLE)
 
 _STEP = 1e-4  # s, of the prediction's integration
 _AT_REST = 1.0  # N/s; a force that changes less is that of a rest
@@ -50,7 +50,7 @@ class Trial:
         self._runtime = runtime
         self._target: AddressedDiagram = runtime.target
         self._context = runtime.context
-        self._left = [*motions, HOME]
+        self._left = [*motions, Motion.HOME]
         self._every = every
         self._motion = self._target.reader("dps.impl.motion")
         self._readers = {name: self._target.reader(f"dps.{name}") for name in _RECORDED}
@@ -122,7 +122,7 @@ class Track:
 
     def contact(self, law: LawAlongX, scenario: ManipulatorScenario) -> Contact:
         """Return the force during the press, and the prediction from law and wall."""
-        during = self.motion == PRESS
+        during = self.motion == Motion.PRESS
         clock, wanted = self.clock[during], self.wanted[during, 0]
         return Contact(clock, law.force(clock, wanted, scenario), -self.force[during, 0])
 
@@ -229,7 +229,9 @@ def run_trial(runtime: Runtime, motions: Sequence[int] = PROGRAM, *, limit: floa
     trial = Trial(runtime, motions)
     runtime.run(until=trial, cycles=round(limit / runtime.period))
     if not trial.done:
-        raise TimeoutError(f"the motions {', '.join(MOTIONS[motion] for motion in motions)} took longer than {limit} s")
+        raise TimeoutError(
+            f"the motions {', '.join(Motion(motion).label for motion in motions)} took longer than {limit} s"
+        )
     return trial.track()
 
 

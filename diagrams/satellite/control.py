@@ -14,7 +14,7 @@ from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
-from vtbdrake_diagrams.satellite.supervisor import ABORT, GUIDANCE, HOLD, RETREAT, Guidance, stopping_speed
+from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Guidance, Mode, stopping_speed
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ class ArmController(AddressedSystem):
         relative, measured = Relative.of(self._relative.Eval(context)), self._joints.Eval(context)
         command, q, before = self._command.array(context), measured[:ARM_JOINTS], memory.joint_rate_command.copy()
         mode = guidance.mode
-        if mode == ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
+        if mode == Mode.ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
             memory.aborted_for += T
             if memory.aborted_for < p.back_off:
                 away = np.concatenate((np.zeros(3), -p.back_off_speed * relative.R_BG[:, 2]))
@@ -130,14 +130,14 @@ class ArmController(AddressedSystem):
         elif guidance.follows:
             twist = self._twist(relative, guidance, p)
             rates = self._rates.value((q, twist, [p.posture_gain, p.damping])).copy()
-        elif mode in (RETREAT, HOLD, ABORT):
+        elif mode in (Mode.RETREAT, Mode.HOLD, Mode.ABORT):
             rates = before * np.exp(-T / max(p.brake_time, T))
         else:
             rates = np.zeros(ARM_JOINTS)
         rates *= min(1.0, p.joint_rate / max(float(np.abs(rates).max()), 1e-9))
         if self._wheels:
             momentum, most = self._momentum.mutable(state), T * p.largest_reaction
-            holding = mode in (RETREAT, HOLD)
+            holding = mode in (Mode.RETREAT, Mode.HOLD)
             # When the target is gripped, its momentum comes at once.
             had = momentum.momentum if holding == (momentum.holding > 0.5) else None
             rates, has, reaction = self._gentle(q, before, rates, had, most=most, holding=holding)
@@ -231,7 +231,7 @@ class AttitudeController(AddressedSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         bandwidth = self._settings.view(context).bandwidth
         base, q = self._base.Eval(context), self._joints.Eval(context)[:ARM_JOINTS]
-        holding = Guidance.of(self._guidance.Eval(context)).mode in (RETREAT, HOLD)
+        holding = Guidance.of(self._guidance.Eval(context)).mode in (Mode.RETREAT, Mode.HOLD)
         J = arm_reaction(holding=holding).value((q, np.zeros(ARM_JOINTS)))[3:].reshape(3, 3)
         # The rotation vector of a small turn, whichever the sign of the quaternion; the same in B and in I. And
         # R_IB' w_IB: for the rate, too, the base's turn is small.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,43 +17,51 @@ from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
 
 Array = NDArray[np.float64]
 
-MODES = ("wait", "approach", "track", "grip", "retreat", "hold", "abort")
-"""The modes by number: the value of the variable ``mode``."""
-WAIT, APPROACH, TRACK, GRIP, RETREAT, HOLD, ABORT = map(float, range(len(MODES)))
 
-REASONS = (
-    "start",
-    "the target is tracked and within reach",
-    "the gripper is before the bar",
-    "the bar is between the fingers",
-    "the fingers hold the bar",
-    "the relative motion has stopped",
-    "the fingers missed the bar, next attempt",
-    "abort commanded",
-    "the target is lost",
-    "the target is out of reach",
-    "the target moves too fast",
-    "out of time",
-    "the fingers missed the bar too often",
-    "the bar slipped out",
-)
-"""Why the mode was entered, by number: the value of the variable ``reason``."""
-(
-    _START,
-    _FIX,
-    _BEFORE,
-    _AT_BAR,
-    _HELD,
-    _STOPPED,
-    _MISSED,
-    COMMANDED,
-    LOST,
-    OUT_OF_REACH,
-    TOO_FAST,
-    TIMEOUT,
-    MISSED_ALL,
-    SLIPPED,
-) = map(float, range(len(REASONS)))
+class Mode(IntEnum):
+    """The modes; the variable ``mode`` holds their numbers."""
+
+    WAIT = 0
+    APPROACH = 1
+    TRACK = 2
+    GRIP = 3
+    RETREAT = 4
+    HOLD = 5
+    ABORT = 6
+
+    @property
+    def label(self) -> str:
+        """Return the name as users read it."""
+        return self.name.lower()
+
+
+class Reason(IntEnum):
+    """Why the mode was entered; the variable ``reason`` holds the numbers."""
+
+    label: str
+
+    START = 0, "start"
+    TRACKED = 1, "the target is tracked and within reach"
+    BEFORE_BAR = 2, "the gripper is before the bar"
+    AT_BAR = 3, "the bar is between the fingers"
+    GRIPPED = 4, "the fingers hold the bar"
+    STOPPED = 5, "the relative motion has stopped"
+    MISSED = 6, "the fingers missed the bar, next attempt"
+    COMMANDED = 7, "abort commanded"
+    LOST = 8, "the target is lost"
+    OUT_OF_REACH = 9, "the target is out of reach"
+    TOO_FAST = 10, "the target moves too fast"
+    TIMEOUT = 11, "out of time"
+    MISSED_TOO_OFTEN = 12, "the fingers missed the bar too often"
+    SLIPPED = 13, "the bar slipped out"
+
+    def __new__(cls, number: int, label: str) -> Reason:
+        """Make a member with its number and what users read."""
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.label = label
+        return member
+
 
 GO, STAY, STOP = 1.0, 0.0, -1.0
 """Values of the command ``capture``: go ahead, wait, abort."""
@@ -161,7 +170,7 @@ class Supervisor(AddressedSystem):
     The open fingers' lips leave 25 mm of room on each side of the bar. The grip tolerance takes half of it; the other
     half is for what the target does while the fingers close.
 
-    The variables ``mode`` and ``reason`` are numbers: positions in `MODES` and `REASONS`.
+    The variables ``mode`` and ``reason`` are numbers: those of `Mode` and `Reason`.
     """
 
     def __init__(self, *, period: float, acceleration: float) -> None:
@@ -177,7 +186,7 @@ class Supervisor(AddressedSystem):
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
         flag = (0.0, 1.0)
         self._instructions = self.declare_discrete_state(
-            mode=Quantity(WAIT, bounds=(0.0, ABORT)),
+            mode=Quantity(Mode.WAIT, bounds=(0, Mode.ABORT)),
             follows=Quantity(0.0, bounds=flag),
             distance=Quantity(0.0, "m"),
             rate=Quantity(0.0, "m/s"),
@@ -186,7 +195,7 @@ class Supervisor(AddressedSystem):
         )
         self.DeclareStateOutputPort("guidance", self._instructions.index)
         self._memory = self.declare_discrete_state(
-            reason=Quantity(_START, bounds=(0.0, len(REASONS) - 1.0)),
+            reason=Quantity(Reason.START, bounds=(0, Reason.SLIPPED)),
             time_in_mode=Quantity(0.0, "s"),
             capture_time=Quantity(0.0, "s"),
             steady_for=Quantity(0.0, "s"),
@@ -230,7 +239,7 @@ class Supervisor(AddressedSystem):
         go = float(self._capture.Eval(context)[0])
         still = bool((np.abs(fingers - memory.last_fingers) < 5e-4 * T / 0.02).all())
         holds = 0.6 * self._bar < float(fingers.sum()) < 1.4 * self._bar
-        in_mode, since = memory.time_in_mode + T, memory.capture_time + T if mode != WAIT else 0.0
+        in_mode, since = memory.time_in_mode + T, memory.capture_time + T if mode != Mode.WAIT else 0.0
 
         step = _Step(
             mode=mode,
@@ -244,25 +253,25 @@ class Supervisor(AddressedSystem):
         )
         trouble = self._trouble(mode, go, relative, since, p)
         fresh = relative.age < p.hold_after
-        if trouble:
-            step.mode, step.reason = ABORT, trouble
-        elif mode == WAIT:
+        if trouble is not None:
+            step.mode, step.reason = Mode.ABORT, trouble
+        elif mode == Mode.WAIT:
             if go > 0.5 and relative.valid and fresh and not self._unreachable(relative, p):
-                step.mode, step.reason, step.distance = APPROACH, _FIX, p.standoff
+                step.mode, step.reason, step.distance = Mode.APPROACH, Reason.TRACKED, p.standoff
                 step.flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
-        elif mode in (APPROACH, TRACK) and fresh:
+        elif mode in (Mode.APPROACH, Mode.TRACK) and fresh:
             self._steer(step, relative, last.rate, p)
-        elif mode == GRIP:
+        elif mode == Mode.GRIP:
             self._grip(step, still, holds, in_mode, p)
-        elif mode == RETREAT and holds and self._lasts(step, rests) > p.still_time:
-            step.mode, step.reason = HOLD, _STOPPED
-        elif mode in (RETREAT, HOLD) and not holds and still:
-            step.mode, step.reason = ABORT, SLIPPED
-        if step.mode == ABORT:
+        elif mode == Mode.RETREAT and holds and self._lasts(step, rests) > p.still_time:
+            step.mode, step.reason = Mode.HOLD, Reason.STOPPED
+        elif mode in (Mode.RETREAT, Mode.HOLD) and not holds and still:
+            step.mode, step.reason = Mode.ABORT, Reason.SLIPPED
+        if step.mode == Mode.ABORT:
             step.opening = self._opening
         if step.mode != mode:
             in_mode = step.steady = 0.0
-        follows = step.mode in (APPROACH, TRACK, GRIP) and fresh
+        follows = step.mode in (Mode.APPROACH, Mode.TRACK, Mode.GRIP) and fresh
         following = self._instructions.mutable(state)
         following.mode, following.follows, following.flip = step.mode, follows, step.flip
         following.distance, following.rate, following.opening = step.distance, step.rate, step.opening
@@ -283,9 +292,9 @@ class Supervisor(AddressedSystem):
         error, angle = self._errors(relative, step.distance, step.flip)
         close = error < p.position_tolerance and angle < p.orientation_tolerance
         lasts = self._lasts(step, close)
-        if step.mode == APPROACH:
+        if step.mode == Mode.APPROACH:
             if lasts > 0.5:
-                step.mode, step.reason = TRACK, _BEFORE
+                step.mode, step.reason = Mode.TRACK, Reason.BEFORE_BAR
         elif step.distance > 0.0:
             push = p.acceleration
             goal = min(p.closing_speed, stopping_speed(step.distance, gain=1.0 / T, acceleration=push))
@@ -294,7 +303,7 @@ class Supervisor(AddressedSystem):
         else:
             step.steady = lasts if error < p.grip_tolerance else 0.0
             if step.steady > p.grip_time:
-                step.mode, step.reason = GRIP, _AT_BAR
+                step.mode, step.reason = Mode.GRIP, Reason.AT_BAR
 
     def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: NamedView) -> None:
         """Close the fingers; ``still`` tells whether they rest, ``holds`` whether the bar is between them."""
@@ -302,25 +311,25 @@ class Supervisor(AddressedSystem):
         if self._lasts(step, still) <= 0.3 or in_mode <= 0.5:
             return
         if holds:
-            step.mode, step.reason = RETREAT, _HELD
+            step.mode, step.reason = Mode.RETREAT, Reason.GRIPPED
         elif step.attempts + 1.0 >= p.attempts:
-            step.mode, step.reason = ABORT, MISSED_ALL
+            step.mode, step.reason = Mode.ABORT, Reason.MISSED_TOO_OFTEN
         else:
-            step.mode, step.reason, step.attempts = APPROACH, _MISSED, step.attempts + 1.0
+            step.mode, step.reason, step.attempts = Mode.APPROACH, Reason.MISSED, step.attempts + 1.0
             step.distance, step.opening = p.standoff, self._opening
 
     def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: NamedView) -> float:
-        """Return the reason for an abort, or 0."""
-        if mode not in (APPROACH, TRACK, GRIP):
-            return COMMANDED if go < -0.5 and mode in (RETREAT, HOLD) else 0.0
+        """Return the reason for an abort, or None."""
+        if mode not in (Mode.APPROACH, Mode.TRACK, Mode.GRIP):
+            return Reason.COMMANDED if go < -0.5 and mode in (Mode.RETREAT, Mode.HOLD) else None
         checks = {
-            COMMANDED: go < -0.5,
-            LOST: relative.age > p.lost_after or not relative.valid,
-            OUT_OF_REACH: self._unreachable(relative, p),
-            TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p.largest_speed,
-            TIMEOUT: since > p.time_limit,
+            Reason.COMMANDED: go < -0.5,
+            Reason.LOST: relative.age > p.lost_after or not relative.valid,
+            Reason.OUT_OF_REACH: self._unreachable(relative, p),
+            Reason.TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p.largest_speed,
+            Reason.TIMEOUT: since > p.time_limit,
         }
-        return next((reason for reason, is_present in checks.items() if is_present), 0.0)
+        return next((reason for reason, is_present in checks.items() if is_present), None)
 
     def _unreachable(self, relative: Relative, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""

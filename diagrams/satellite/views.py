@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake_diagrams.satellite.supervisor import MODES
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def film_strip(testbed: VirtualTestbed, times: Sequence[float]) -> Figure:
     figure, axes = plt.subplots(2, len(times), figsize=(3.2 * len(times), 5.0), squeeze=False, layout="constrained")
     for column, time in zip(axes.T, times, strict=True):
         simulator.AdvanceTo(time)
-        mode = MODES[int(testbed.read(context, "dps.impl.supervisor.mode"))]
+        mode = Mode(int(testbed.read(context, "dps.impl.supervisor.mode"))).label
         for axis, picture in zip(column, pictures(testbed, context), strict=True):
             axis.imshow(picture)
             axis.set_axis_off()

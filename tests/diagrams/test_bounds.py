@@ -13,7 +13,7 @@ from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
 
@@ -65,7 +65,7 @@ def test_arm_is_stable_at_the_bounds_of_its_gains(law: str) -> None:
             context = testbed.default_context()
             address = f"dps.impl.{gain}"
             value = np.asarray(testbed.variables()[address].bounds[bound])
-            testbed.write(context, {address: value, "u.motion": float(CIRCLE)})
+            testbed.write(context, {address: value, "u.motion": float(Motion.CIRCLE)})
             simulator = testbed.simulator(context)
             simulator.AdvanceTo(0.3)
             torque, changes = testbed.read(context, "dps.impl.torque"), []

@@ -33,7 +33,7 @@ from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
 from vtbdrake_diagrams.satellite.kinematics import gripper
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import Start, random_start
-from vtbdrake_diagrams.satellite.supervisor import HOLD, MODES, REASONS
+from vtbdrake_diagrams.satellite.supervisor import Mode, Reason
 
 LARGEST_TUMBLE = np.radians(3.0)
 HORIZON = 75.0
@@ -83,7 +83,7 @@ class Capture:
     @property
     def failure(self) -> str:
         """Why the capture failed; empty if it succeeded."""
-        if self.mode != MODES[int(HOLD)]:
+        if self.mode != Mode.HOLD.label:
             return self.reason
         if abs(self.offset[1]) > GRIP_LENGTH or abs(self.offset[2]) > GRIP_DEPTH or abs(self.offset[0]) > 0.01:
             return "the bar is not between the fingers"
@@ -95,7 +95,9 @@ class Capture:
 def capture_task(scenario: SatelliteScenario) -> RolloutTask:
     """Return the rollouts of a capture, which end when it has succeeded or is aborted."""
     quality = Quality(lambda mode: mode, of=MODE)
-    return RolloutTask(scenario, HORIZON, quality, HOLD - 0.5, sample_period=_SAMPLE_PERIOD, record=capture_record())
+    return RolloutTask(
+        scenario, HORIZON, quality, Mode.HOLD - 0.5, sample_period=_SAMPLE_PERIOD, record=capture_record()
+    )
 
 
 def capture_record() -> list[str]:
@@ -113,8 +115,8 @@ def judge(result: RolloutResult) -> Capture:
     arm = np.array([[record[address][k] for address in _JOINTS[:ARM_JOINTS]] for k in (-2, -1)])
     return Capture(
         tumble=tumble,
-        mode=MODES[int(record[MODE][-1])],
-        reason=REASONS[int(record[REASON][-1])],
+        mode=Mode(int(record[MODE][-1])).label,
+        reason=Reason(int(record[REASON][-1])).label,
         duration=float(result.times[-1]),
         offset=after.translation(),
         creep=float(np.linalg.norm(after.translation() - before.translation())),

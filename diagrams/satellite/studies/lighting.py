@@ -52,7 +52,7 @@ from vtbdrake_diagrams.satellite.bodies import Target
 from vtbdrake_diagrams.satellite.relative_motion import Relative
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
-from vtbdrake_diagrams.satellite.supervisor import HOLD, RETREAT
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 Array = NDArray[np.float64]
 
@@ -166,7 +166,7 @@ class LightingScenario(SatelliteScenario):
 
 def time_to_grip(mode: float, time: float) -> float:
     """Return the cost: the time of the DPS if the fingers hold the bar, else `FAILURE`."""
-    return time if mode in (RETREAT, HOLD) else FAILURE
+    return time if mode in (Mode.RETREAT, Mode.HOLD) else FAILURE
 
 
 def condition(light: str, seed: int) -> dict[str, Any]:

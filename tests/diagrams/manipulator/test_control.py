@@ -14,7 +14,7 @@ from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME, PRESS, SWING
+from vtbdrake_diagrams.manipulator.motions import Motion
 
 T = 0.001
 ARM = Arm()
@@ -25,7 +25,7 @@ SMOOTH = {"sim.act.drives.coulomb": np.zeros(7)}
 class Run:
     """One simulation of a testbed."""
 
-    def __init__(self, testbed: VirtualTestbed, motion: int = HOME, **values: object) -> None:
+    def __init__(self, testbed: VirtualTestbed, motion: int = Motion.HOME, **values: object) -> None:
         self.testbed = testbed
         self.context: Context = testbed.default_context()
         testbed.write(self.context, {"u.motion": float(motion), **values})
@@ -69,7 +69,7 @@ def profile(x: float) -> float:
 def wanted_tip(run: Run, motion: int, t: float) -> np.ndarray:
     """Where the tip should be, from the definition of the motions."""
     home = np.array(ARM.home)
-    if motion == SWING:
+    if motion == Motion.SWING:
         return run.tip_at(home + run.read("dps.impl.swing") * profile(t / 2.5))
     angle = 2 * np.pi * profile(t / 4.0)
     return run.tip_at(home) + 0.1 * np.array([0.0, np.sin(angle), 1 - np.cos(angle)])
@@ -78,12 +78,12 @@ def wanted_tip(run: Run, motion: int, t: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("law", "motion", "tolerance"),
     [
-        ("joint_impedance", SWING, 0.002),
-        ("joint_impedance", CIRCLE, 0.002),
-        ("cartesian_impedance", SWING, 0.006),
-        ("cartesian_impedance", CIRCLE, 0.006),
-        ("admittance", SWING, 0.002),
-        ("admittance", CIRCLE, 0.002),
+        ("joint_impedance", Motion.SWING, 0.002),
+        ("joint_impedance", Motion.CIRCLE, 0.002),
+        ("cartesian_impedance", Motion.SWING, 0.006),
+        ("cartesian_impedance", Motion.CIRCLE, 0.006),
+        ("admittance", Motion.SWING, 0.002),
+        ("admittance", Motion.CIRCLE, 0.002),
     ],
 )
 def test_motions_are_tracked_in_free_space(law: str, motion: int, tolerance: float) -> None:
@@ -96,10 +96,10 @@ def test_motions_are_tracked_in_free_space(law: str, motion: int, tolerance: flo
 
 @pytest.mark.parametrize("law", LAWS)
 def test_without_friction_motions_are_tracked_closely(law: str) -> None:
-    run = Run(TESTBEDS[law], CIRCLE, **SMOOTH, **{"sim.act.drives.viscous": np.zeros(7)})
+    run = Run(TESTBEDS[law], Motion.CIRCLE, **SMOOTH, **{"sim.act.drives.viscous": np.zeros(7)})
     for t in np.arange(1, 8) * 0.2:
         run.advance(t)
-        assert np.linalg.norm(run.tip - wanted_tip(run, CIRCLE, t)) < 0.0005
+        assert np.linalg.norm(run.tip - wanted_tip(run, Motion.CIRCLE, t)) < 0.0005
 
 
 def test_pushed_joint_impedance_yields_by_torque_over_stiffness() -> None:
@@ -143,7 +143,7 @@ def test_pushed_admittance_moves_like_its_mass_damper_and_spring() -> None:
 @pytest.mark.parametrize("law", ["cartesian_impedance", "admittance"])
 def test_force_on_the_wall_is_that_of_two_springs_in_series(law: str) -> None:
     scenario = ManipulatorScenario(law=law, wall=True)
-    run = Run(scenario.build(), PRESS, **SMOOTH)
+    run = Run(scenario.build(), Motion.PRESS, **SMOOTH)
     start = run.tip
     gap = scenario.wall_distance - ARM.ball_radius - start[0]
     run.advance(3.9)  # the tip waits from 2 s to 4 s
@@ -174,7 +174,7 @@ def test_resting_arm_senses_its_tools_weight_and_no_contact(turn: list[float]) -
 
 def test_work_of_the_drives_becomes_energy() -> None:
     """Kinetic and potential energy, that of the rotors included, against the integral of torque times velocity."""
-    run = Run(TESTBEDS["joint_impedance"], SWING)
+    run = Run(TESTBEDS["joint_impedance"], Motion.SWING)
 
     def energy() -> float:
         v = run.plant.GetVelocities(run.plant_context)

@@ -26,7 +26,7 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, HOME
+from vtbdrake_diagrams.manipulator.motions import Motion
 
 PATIENCE = 30.0  # s
 
@@ -60,7 +60,7 @@ def test_alone_from_a_snapshot_it_commands_what_the_whole_testbed_does(law: str,
     scenario = ManipulatorScenario(law=law)
     testbed = scenario.build()
     simulator = testbed.simulator()
-    testbed.write(simulator.get_mutable_context(), {"u.motion": float(CIRCLE)})
+    testbed.write(simulator.get_mutable_context(), {"u.motion": float(Motion.CIRCLE)})
     simulator.AdvanceTo(0.1)
     testbed.snapshot(simulator.get_context()).save(tmp_path / "s")
     snapshot = Snapshot.load(tmp_path / "s")
@@ -121,12 +121,12 @@ def test_the_motion_is_chosen_over_lcm() -> None:
         before = testbed.read(runtime.context, "dps.impl.motion")
         say(1, 99.0)
         refused = testbed.read(runtime.context, "u.motion")
-        say(2, float(CIRCLE))
+        say(2, float(Motion.CIRCLE))
         runtime.run(cycles=2500)
         bridge.close()
-    assert (before, refused) == (HOME, HOME)
+    assert (before, refused) == (Motion.HOME, Motion.HOME)
     assert received.rejected == {"limits": 1}
-    assert testbed.read(runtime.context, "dps.impl.motion") == CIRCLE
+    assert testbed.read(runtime.context, "dps.impl.motion") == Motion.CIRCLE
 
 
 class FakeArm:

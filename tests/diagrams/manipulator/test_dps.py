@@ -13,7 +13,7 @@ from vtbdrake.state import Variables, collect
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, Arm
 from vtbdrake_diagrams.manipulator.dps import SENSOR_SIGNALS, make_dps
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.world import add_arm
 
 T = 0.001
@@ -214,7 +214,7 @@ def test_the_posture_stays_while_the_tip_goes_round_and_round() -> None:
     """Inverse kinematics alone does not close a redundant arm's circle (Klein, Huang, "Review of Pseudoinverse Control
     for Use with Kinematically Redundant Manipulators", 1983)."""
     bench = Bench("joint_impedance")
-    bench.feed(motion=[float(CIRCLE)])
+    bench.feed(motion=[float(Motion.CIRCLE)])
     bench.step(8)
     postures = []
     for _ in range(2):

@@ -8,7 +8,7 @@ import pytest
 
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import function
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, FOLLOW, HOME, PRESS, SWING, parameters, reference
+from vtbdrake_diagrams.manipulator.motions import Motion, parameters, reference
 
 T = 0.005
 HOME_POSE = np.array(Arm().home)
@@ -47,7 +47,7 @@ def steps(seconds: float) -> int:
 
 
 @pytest.mark.parametrize(("position", "speed", "acceleration"), [("q_r", "v_r", "a_r"), ("dp", "dv", "da")])
-@pytest.mark.parametrize("motion", [SWING, PRESS, CIRCLE])
+@pytest.mark.parametrize("motion", [Motion.SWING, Motion.PRESS, Motion.CIRCLE])
 def test_derivatives_are_those_of_the_motion(motion: int, position: str, speed: str, acceleration: str) -> None:
     r = play([motion] * steps(6.1))
     for value, rate in ((position, speed), (speed, acceleration)):
@@ -56,7 +56,7 @@ def test_derivatives_are_those_of_the_motion(motion: int, position: str, speed: 
 
 
 def test_swing_goes_to_its_pose_and_back() -> None:
-    r = play([SWING] * steps(5.0))
+    r = play([Motion.SWING] * steps(5.0))
     half = steps(2.5)
     np.testing.assert_allclose(r["q_r"][half], HOME_POSE + VALUES["swing"], atol=1e-6)
     np.testing.assert_allclose(r["v_r"][half], 0.0, atol=1e-6)
@@ -65,56 +65,59 @@ def test_swing_goes_to_its_pose_and_back() -> None:
 
 
 def test_swing_is_a_minimum_jerk_motion() -> None:
-    r = play([SWING] * steps(1.3))
+    r = play([Motion.SWING] * steps(1.3))
     quarter = steps(1.25)
     np.testing.assert_allclose(r["q_r"][quarter], HOME_POSE + VALUES["swing"] / 2, atol=1e-9)
     np.testing.assert_allclose(r["v_r"][quarter], 15 / 8 * VALUES["swing"] / 2.5, atol=1e-9)
 
 
 def test_press_goes_straight_ahead_and_waits() -> None:
-    r = play([PRESS] * steps(6.0))
+    r = play([Motion.PRESS] * steps(6.0))
     np.testing.assert_allclose(r["dp"][steps(2.0) : steps(4.0)], [[0.1, 0, 0]] * steps(2.0), atol=1e-6)
     np.testing.assert_array_equal(r["dp"][:, 1:], 0.0)
     np.testing.assert_array_equal(r["q_r"], np.tile(HOME_POSE, (steps(6.0), 1)))
 
 
 def test_circle_is_one() -> None:
-    r = play([CIRCLE] * steps(4.0))
+    r = play([Motion.CIRCLE] * steps(4.0))
     radius = VALUES["circle_radius"]
     np.testing.assert_allclose(np.linalg.norm(r["dp"] - [0, 0, radius], axis=1), radius, atol=1e-12)
     np.testing.assert_allclose(r["dp"][steps(2.0)], [0, 0, 2 * radius], atol=1e-9)
 
 
 def test_a_command_waits_for_the_motion_under_way() -> None:
-    r = play([SWING] * steps(1.0) + [CIRCLE] * steps(5.0))
+    r = play([Motion.SWING] * steps(1.0) + [Motion.CIRCLE] * steps(5.0))
     motion = r["motion_next"].ravel()
-    assert set(motion[1 : steps(5.0) + 1]) == {SWING}
-    assert set(motion[steps(5.0) + 1 :]) == {CIRCLE}
+    assert set(motion[1 : steps(5.0) + 1]) == {Motion.SWING}
+    assert set(motion[steps(5.0) + 1 :]) == {Motion.CIRCLE}
 
 
 def test_motions_repeat() -> None:
-    r = play([CIRCLE] * steps(8.0))
+    r = play([Motion.CIRCLE] * steps(8.0))
     np.testing.assert_allclose(r["dp"][steps(4.0) :], r["dp"][: steps(4.0)], atol=1e-12)
 
 
 def test_follow_is_obeyed_at_once_and_stays_with_the_arm() -> None:
     at = HOME_POSE + 0.1
-    r = play([SWING] * 100 + [FOLLOW] * 3, at=at)
+    r = play([Motion.SWING] * 100 + [Motion.FOLLOW] * 3, at=at)
     np.testing.assert_array_equal(r["q_r"][100:], [at] * 3)
     np.testing.assert_array_equal(r["v_r"][100:], 0.0)
 
 
 def test_after_follow_the_arm_first_goes_home_from_where_it_is() -> None:
     at = HOME_POSE + 0.3
-    r = play([CIRCLE] * steps(3.1), at=at, state={"motion": float(FOLLOW), "reference": HOME_POSE})
+    r = play([Motion.CIRCLE] * steps(3.1), at=at, state={"motion": float(Motion.FOLLOW), "reference": HOME_POSE})
     np.testing.assert_allclose(r["q_r"][0], at)
     np.testing.assert_array_equal(r["v_r"][0], 0.0)
     motion = r["motion_next"].ravel()
-    assert motion[0] == HOME
+    assert motion[0] == Motion.HOME
     np.testing.assert_allclose(r["q_r"][steps(3.0)], HOME_POSE, atol=1e-9)
-    assert motion[-1] == CIRCLE
+    assert motion[-1] == Motion.CIRCLE
     assert np.abs(np.diff(r["q_r"], axis=0)).max() < 1.01 * 15 / 8 * 0.3 / 3.0 * T
 
 
 def test_at_home_a_command_is_obeyed_at_once() -> None:
-    assert play([HOME] * 10 + [PRESS] * 3)["motion_next"].ravel().tolist() == [HOME] * 10 + [PRESS] * 3
+    assert (
+        play([Motion.HOME] * 10 + [Motion.PRESS] * 3)["motion_next"].ravel().tolist()
+        == [Motion.HOME] * 10 + [Motion.PRESS] * 3
+    )

@@ -16,7 +16,7 @@ from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import CIRCLE, SWING
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 PATIENCE = 60.0  # s
@@ -46,10 +46,10 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
                 break
             bridge.poll(1.0)
         runtime.switch("real")
-        runtime.write({"u.motion": float(SWING)})
+        runtime.write({"u.motion": float(Motion.SWING)})
         runtime.cycle()
         runtime.run(cycles=CYCLES // 2 - 1)
-        runtime.write({"u.motion": float(CIRCLE)})
+        runtime.write({"u.motion": float(Motion.CIRCLE)})
         runtime.run(cycles=CYCLES // 2)
         bridge.close()
     assert not runtime.guards.latched
@@ -60,5 +60,5 @@ def test_every_control_law_is_replayed_to_the_last_bit(hub: Hub, tmp_path: Path,
         report = replay(log, target, record=["dps.impl.motion", "u.motion"])
         assert report.identical and report.cycles == CYCLES and report.digests == 15, report
         assert np.array_equal(report.actuation["joint_torque"], log.actuation["joint_torque"])
-        assert SWING in report.record["dps.impl.motion"]
-        assert set(report.record["u.motion"].ravel()) == {SWING, CIRCLE}
+        assert Motion.SWING in report.record["dps.impl.motion"]
+        assert set(report.record["u.motion"].ravel()) == {Motion.SWING, Motion.CIRCLE}

@@ -14,7 +14,7 @@ from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.machine.machine import Machine, MachineConfig
 from vtbdrake.monitoring.residuals import ResidualMonitor
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.motions import Motion
 
 TOOL = "sim.sys.arm.tool.mass"
 MASS = 0.4  # kg
@@ -37,7 +37,7 @@ def noisy(latency: int = 0) -> ManipulatorScenario:
 
 def together_with(scenario: ManipulatorScenario, **values: Any) -> Together:
     machine = Machine(scenario, MachineConfig(values=values))
-    return Together(scenario, machine, shadowing=scenario, values={"u.motion": float(CIRCLE)})
+    return Together(scenario, machine, shadowing=scenario, values={"u.motion": float(Motion.CIRCLE)})
 
 
 def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:

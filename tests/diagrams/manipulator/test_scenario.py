@@ -13,7 +13,7 @@ from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.laws import LAWS
-from vtbdrake_diagrams.manipulator.motions import PRESS, SWING
+from vtbdrake_diagrams.manipulator.motions import Motion
 
 T = 0.001
 SIGNALS = ("joint_position", "joint_velocity", "joint_torque_measured", "wrench")
@@ -71,7 +71,7 @@ def test_signals_fit_the_robots_messages() -> None:
 
 def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
     testbed = rough().build()
-    context = start(testbed, PRESS)
+    context = start(testbed, Motion.PRESS)
     simulator = testbed.simulator(context)
     simulator.AdvanceTo(1.2)
     assert testbed.read(context, "dps.env.contact_wrench")[3] < -2.0  # in contact
@@ -90,7 +90,7 @@ def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
 def test_dps_cannot_tell_real_from_sim(law: str) -> None:
     """The same values through the real ports give the same commands, whatever the simulated world does meanwhile."""
     testbed = rough(law).build()
-    context = start(testbed, SWING)
+    context = start(testbed, Motion.SWING)
     simulator = testbed.simulator(context)
     sensed, commanded = [], []
     for k in range(200):
@@ -98,7 +98,7 @@ def test_dps_cannot_tell_real_from_sim(law: str) -> None:
         simulator.AdvanceTo((k + 1) * T)
         commanded.append(testbed.read(context, "dps.joint_torque"))
 
-    real = start(testbed, SWING)
+    real = start(testbed, Motion.SWING)
     testbed.write(real, {"sim.sys.arm.joint_2.position": 0.0})
     for name in SIGNALS:
         testbed.diagram.GetInputPort(f"real.sense.{name}").FixValue(real, sensed[0][name])
@@ -114,7 +114,7 @@ def test_dps_cannot_tell_real_from_sim(law: str) -> None:
 
 def test_simulated_arm_starts_from_what_the_dps_perceives() -> None:
     testbed = ManipulatorScenario().build()
-    context = start(testbed, SWING)
+    context = start(testbed, Motion.SWING)
     testbed.simulator(context).AdvanceTo(1.0)
     q = testbed.read(context, "dps.env.joint_position")
     testbed.write(context, {f"sim.sys.arm.joint_{k}.position": 0.0 for k in range(1, 8)})
@@ -154,7 +154,7 @@ def test_compiled_dps_gives_the_same_torques(law: str) -> None:
     torques = []
     for compiled in (False, True):
         testbed = ManipulatorScenario(law=law, compile=compiled).build()
-        context = start(testbed, SWING)
+        context = start(testbed, Motion.SWING)
         testbed.simulator(context).AdvanceTo(0.5)
         torques.append(testbed.read(context, "dps.joint_torque"))
     np.testing.assert_array_equal(*torques)

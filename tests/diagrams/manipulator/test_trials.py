@@ -9,7 +9,7 @@ from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake_diagrams.manipulator.arm import Arm
-from vtbdrake_diagrams.manipulator.motions import CIRCLE
+from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 
 SCENARIO = trial_scenario("admittance")
@@ -23,13 +23,13 @@ def circle() -> Track:
     bridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), "memq://")
     bridge.open()
     loop = Runtime(testbed, bridge, context=context, clock=SimulatedClock())
-    track = run_trial(loop, (CIRCLE,))
+    track = run_trial(loop, (Motion.CIRCLE,))
     bridge.close()
     return track
 
 
 def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
-    during = circle.motion == CIRCLE
+    during = circle.motion == Motion.CIRCLE
     x = circle.clock[during] / DURATIONS["dps.impl.circle_duration"]
     angle = 2 * np.pi * x**3 * (10 - 15 * x + 6 * x**2)
     radius = 0.1
@@ -40,9 +40,9 @@ def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
 
 
 def test_errors_are_the_distances_from_it(circle: Track) -> None:
-    errors = circle.errors((CIRCLE,))
+    errors = circle.errors((Motion.CIRCLE,))
     assert 1e-5 < errors.max() < 0.002
-    nearest = np.linalg.norm(circle.tip - circle.wanted, axis=1)[circle.motion == CIRCLE]
+    nearest = np.linalg.norm(circle.tip - circle.wanted, axis=1)[circle.motion == Motion.CIRCLE]
     np.testing.assert_array_equal(errors, nearest)
 
 
@@ -64,5 +64,5 @@ def test_trial_that_does_not_end_is_told() -> None:
     bridge.open()
     loop = Runtime(testbed, bridge, clock=SimulatedClock())
     with pytest.raises(TimeoutError, match="circle"):
-        run_trial(loop, (CIRCLE,), limit=0.1)
+        run_trial(loop, (Motion.CIRCLE,), limit=0.1)
     bridge.close()

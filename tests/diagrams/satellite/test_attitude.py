@@ -14,7 +14,7 @@ from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS
 from vtbdrake_diagrams.satellite.kinematics import REST, reaction
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target
-from vtbdrake_diagrams.satellite.supervisor import HOLD, RETREAT, stopping_speed
+from vtbdrake_diagrams.satellite.supervisor import Mode, stopping_speed
 
 
 @pytest.mark.parametrize("holding", [False, True])
@@ -86,12 +86,12 @@ def test_wheels_keep_the_stack_after_the_grip(testbed: VirtualTestbed) -> None:
         )
 
     modes, peak = [], 0.0
-    while not modes or modes[-1] < HOLD:
+    while not modes or modes[-1] < Mode.HOLD:
         simulator.AdvanceTo(context.get_time() + 0.5)
         assert context.get_time() < 45.0
         modes.append(float(testbed.read(context, "dps.impl.supervisor.mode")))
         peak = max(peak, turned())
-    assert RETREAT in modes
+    assert Mode.RETREAT in modes
     # In truth, too, the arm rests.
     rates = [testbed.read(context, f"sim.sys.servicer.{name}.velocity") for name in ARM_JOINT_NAMES]
     assert np.abs(rates).max() < 4e-3

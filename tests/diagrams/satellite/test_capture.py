@@ -14,7 +14,7 @@ from vtbdrake.components.environment import LightConfig
 from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, Servicer
-from vtbdrake_diagrams.satellite.supervisor import MODES, REASONS
+from vtbdrake_diagrams.satellite.supervisor import Mode, Reason
 
 
 @cache
@@ -23,11 +23,11 @@ def built() -> VirtualTestbed:
 
 
 def mode(context: Context) -> str:
-    return MODES[int(built().read(context, "dps.impl.supervisor.mode"))]
+    return Mode(int(built().read(context, "dps.impl.supervisor.mode"))).label
 
 
 def reason(context: Context) -> str:
-    return REASONS[int(built().read(context, "dps.impl.supervisor.reason"))]
+    return Reason(int(built().read(context, "dps.impl.supervisor.reason"))).label
 
 
 def fixture_in_gripper(context: Context) -> RigidTransform:

@@ -15,7 +15,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.plant import add_servicer
-from vtbdrake_diagrams.satellite.supervisor import RETREAT
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 TORQUES = np.array([2.0, -3.0, 1.5, 2.5, -1.0, 0.8, -0.5])
 
@@ -57,7 +57,7 @@ def test_capture_conserves_momentum_and_wheels_hold_the_attitude() -> None:
         own = testbed.plant.GetMyContextFromRoot(context)
         before = momentum(testbed.plant, own)
         simulator.AdvanceTo(14.0)
-        assert testbed.read(context, "dps.impl.supervisor.mode") == RETREAT  # With contact.
+        assert testbed.read(context, "dps.impl.supervisor.mode") == Mode.RETREAT  # With contact.
         # At a step of 10 ms the plant is accurate to the first order.
         for part in (slice(0, 3), slice(3, 6)):
             error = momentum(testbed.plant, own)[part] - before[part]

@@ -32,7 +32,7 @@ from vtbdrake_diagrams.satellite.studies.lighting import (
     plot_answer,
     time_to_grip,
 )
-from vtbdrake_diagrams.satellite.supervisor import ABORT, GRIP, HOLD, RETREAT
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 
 def test_default_is_what_the_robot_does_by_itself() -> None:
@@ -58,8 +58,8 @@ def test_conditions_are_all_lights_from_all_starts() -> None:
 
 
 def test_only_a_held_bar_counts() -> None:
-    assert [time_to_grip(mode, 12.5) for mode in (RETREAT, HOLD)] == [12.5, 12.5]
-    assert [time_to_grip(mode, 12.5) for mode in (0.0, GRIP, ABORT)] == [FAILURE] * 3
+    assert [time_to_grip(mode, 12.5) for mode in (Mode.RETREAT, Mode.HOLD)] == [12.5, 12.5]
+    assert [time_to_grip(mode, 12.5) for mode in (0.0, Mode.GRIP, Mode.ABORT)] == [FAILURE] * 3
 
 
 def test_bar_error_is_seen_from_the_base() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from vtbdrake.reasoning import Belief
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake_diagrams.satellite import SatelliteScenario
-from vtbdrake_diagrams.satellite.supervisor import HOLD
+from vtbdrake_diagrams.satellite.supervisor import Mode
 
 MODE = "dps.impl.supervisor.mode"
 WORLD = {
@@ -37,7 +37,7 @@ def test_mental_capture_begins_with_the_estimates() -> None:
     measured, true = testbed.read(context, "dps.impl.controller.measured_position")[1], testbed.read(context, name)
     assert abs(record[name][0] - true) < 0.2 * abs(measured - true)
     assert record[MODE][0] == testbed.read(context, MODE)
-    assert record[MODE][-1] == HOLD
+    assert record[MODE][-1] == Mode.HOLD
 
 
 def test_seeing_servicer_continues_in_its_mental_copy() -> None:

@@ -10,7 +10,7 @@ import pytest
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.satellite import SatelliteScenario
-from vtbdrake_diagrams.satellite.supervisor import APPROACH
+from vtbdrake_diagrams.satellite.supervisor import Mode
 from vtbdrake_diagrams.satellite.views import looking, pictures
 
 pytest.importorskip("cv2")
@@ -36,7 +36,7 @@ def test_target_is_tracked_by_what_is_seen(perception: str) -> None:
     error = X_WT.InvertAndCompose(X_IT)
     assert np.linalg.norm(error.translation()) < 0.03
     assert error.rotation().ToAngleAxis().angle() < np.radians(3.0)
-    assert testbed.read(context, "dps.impl.supervisor.mode") == APPROACH
+    assert testbed.read(context, "dps.impl.supervisor.mode") == Mode.APPROACH
     assert testbed.read(context, "dps.env.markers.count") >= 3.0
 
 
