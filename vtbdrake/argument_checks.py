@@ -16,13 +16,13 @@ def as_number(name: str, value: Any) -> float:
             return float(value)
         except (TypeError, ValueError):
             pass
-    raise ValueError(f"{name} is a number, not {value!r}")
+    raise ValueError(f"{name} must be a number, not {value!r}")
 
 
 def as_whole(name: str, value: Any) -> int:
     """Return ``value`` as an int; raise a ValueError if it is no whole number (1e4 is one, 1.5 is none)."""
     if not as_number(name, value).is_integer():
-        raise ValueError(f"{name} is a whole number, not {value!r}")
+        raise ValueError(f"{name} must be a whole number, not {value!r}")
     return int(value)
 
 
@@ -40,7 +40,7 @@ def as_array(name: str, value: Any) -> np.ndarray:
 def as_flag(name: str, value: Any) -> bool:
     """Return ``value``; raise a ValueError if it is neither True nor False (the text "no" would count as true)."""
     if not isinstance(value, bool):
-        raise ValueError(f"{name} is True or False, not {value!r}")
+        raise ValueError(f"{name} must be True or False, not {value!r}")
     return value
 
 

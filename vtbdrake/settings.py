@@ -15,6 +15,7 @@ import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import lru_cache
 from inspect import getdoc
 from math import inf, isfinite
 from numbers import Integral, Real
@@ -104,7 +105,7 @@ _ANY = Setting()
 def setting(default: Any = MISSING, doc: str = "", *, default_factory: Any = MISSING, **limits: Any) -> Any:
     """Return a field of a dataclass, as `dataclasses.field` does, with a `Setting`.
 
-    A subclass that only gives another default keeps the range.
+    A subclass that only gives another default keeps the rest.
 
     Args:
         default: The default value.
@@ -160,20 +161,24 @@ class _Type(NamedTuple):
 _BETWEEN_TYPES, _BETWEEN_ENTRIES = re.compile(r"\s*\|\s*(?![^\[]*\])"), re.compile(r",\s*(?![^\[]*\])")
 
 
-def _alternatives(annotation: Any) -> list[_Type]:
+def _alternatives(annotation: Any) -> tuple[_Type, ...]:
     """Return the alternatives of the type of a field."""
     # By their names: in another process, the types of a class from a notebook cannot be looked up.
-    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    return _parsed(annotation.__name__ if isinstance(annotation, type) else str(annotation))
+
+
+@lru_cache(maxsize=1024)
+def _parsed(text: str) -> tuple[_Type, ...]:
     parts = [part.partition("[") for part in _BETWEEN_TYPES.split(text)]
-    return [
+    return tuple(
         _Type(name.rpartition(".")[2], tuple(_BETWEEN_ENTRIES.split(inner.removesuffix("]"))) if inner else ())
         for name, _, inner in parts
-    ]
+    )
 
 
-def _known(types: list[_Type]) -> list[_Type]:
+def _known(types: tuple[_Type, ...]) -> tuple[_Type, ...]:
     """Return the types, or none if one of them is not among `_TYPES`: the values can be anything then."""
-    return types if all(each.name in _TYPES for each in types) else []
+    return types if all(each.name in _TYPES for each in types) else ()
 
 
 def plain_types(annotation: Any) -> tuple[str, ...]:
@@ -216,7 +221,7 @@ def check_value(
     Raises:
         ValueError: The value is not possible.
     """
-    if field_types(value):
+    if field_types(value) and not isinstance(value, type):
         check_settings(value, name=name, error=error)
         return
     if hasattr(value, "tolist"):

@@ -184,7 +184,12 @@ def test_the_steps_of_a_logarithmic_range_are_ratios():
     [
         (Parameter("m", 1.0, 10.0, log=True), 0.5, 2.0, "are ratios of neighbouring values, 1 < resolution"),
         (Parameter("m", 1.0, 10.0, log=True), 2.0, 20.0, "<= coarse <= 10 .the ratio"),
-        (Parameter("m", 1, 10, integer=True), 0.5, 2.0, "the resolution of m, an integer, is a whole number, not 0.5"),
+        (
+            Parameter("m", 1, 10, integer=True),
+            0.5,
+            2.0,
+            "the resolution of m, an integer, must be a whole number, not 0.5",
+        ),
         (Parameter("m", 1, 10, integer=True, log=True), 2.0, 4.0, "leave log out"),
     ],
 )
@@ -322,9 +327,9 @@ def test_a_boundary_beyond_the_range_is_told_with_repeats_too():
     ("options", "message"),
     [
         ({"repeats": -1}, "repeats >= 0"),
-        ({"repeats": 2.5}, "the number of repeats is a whole number"),
+        ({"repeats": 2.5}, "the number of repeats must be a whole number"),
         ({"repeats": 2, "jitter": 0.0}, "0 < jitter <= 0.5"),
-        ({"repeats": 2, "jitter": "x"}, "the jitter is a number"),
+        ({"repeats": 2, "jitter": "x"}, "the jitter must be a number"),
     ],
 )
 def test_repeats_that_make_no_sense_are_refused(options, message):

@@ -412,8 +412,8 @@ def test_a_solver_that_asks_nothing_new_ends_a_study():
         ({"rollouts": 0}, "at least one rollout, not 0"),
         ({"seconds": -1.0}, "positive and finite, not -1.0 s"),
         ({"target": float("nan")}, "a target is a number, not nan"),
-        ({"rollouts": 1.5}, "a budget of rollouts is a whole number, not 1.5"),
-        ({"seconds": "3"}, "a budget of wall time is a number, not '3'"),
+        ({"rollouts": 1.5}, "a budget of rollouts must be a whole number, not 1.5"),
+        ({"seconds": "3"}, "a budget of wall time must be a number, not '3'"),
     ],
 )
 def test_a_budget_that_makes_no_sense_is_refused(budget, message):
@@ -540,10 +540,10 @@ def test_a_quality_function_that_has_changed_is_refused(tmp_path):
     ("wrong", "message"),
     [
         ({"solver": 3}, "a solver is given by its name, one of auto, "),
-        ({"seed": 1.5}, "a seed is a whole number, not 1.5"),
-        ({"seed": True}, "a seed is a number, not True"),
+        ({"seed": 1.5}, "a seed must be a whole number, not 1.5"),
+        ({"seed": True}, "a seed must be a number, not True"),
         ({"parallel": 0}, "parallel is the number of rollouts side by side, at least one, not 0"),
-        ({"parallel": 2.5}, "parallel is a whole number, not 2.5"),
+        ({"parallel": 2.5}, "parallel must be a whole number, not 2.5"),
         ({"options": 3}, "the options of a solver are given as {name: value, ...}, not as 3"),
     ],
 )

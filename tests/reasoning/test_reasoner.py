@@ -589,7 +589,7 @@ def test_a_decision_shows_itself(mass):
         ({}, "a budget is given as"),
         ({"rollouts": 0}, "at least one rollout, not 0"),
         ({"rollouts": 1.5}, "whole number, not 1.5"),
-        ({"rollouts": "many"}, "is a number, not 'many'"),
+        ({"rollouts": "many"}, "must be a number, not 'many'"),
         ({"seconds": 0.0}, "positive and finite, not 0.0 s"),
         ({"seconds": -1.0}, "positive and finite"),
         ({"seconds": float("nan")}, "positive and finite"),

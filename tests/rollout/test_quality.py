@@ -343,7 +343,7 @@ def test_f_may_not_exceed_its_stated_upper_end():
     [
         (lambda: Quality(above, THETA, reading="mean"), "is read as one of best, worst, end, integral, not 'mean'"),
         (lambda: Quality(above, THETA, upper=0.0), "is positive, not 0.0"),
-        (lambda: Quality(above, THETA, minimize="no"), "minimize of the quality above is True or False, not 'no'"),
+        (lambda: Quality(above, THETA, minimize="no"), "minimize of the quality above must be True or False, not 'no'"),
         (lambda: Quality(above, THETA, upper=1.0, minimize=True), "the best that a cost can be is 0"),
         (lambda: Constraint(above, THETA), "takes at_most, at_least or both"),
         (lambda: Constraint(above, THETA, at_least=1.0, at_most=0.0), "at_least 1, at_most 0"),

@@ -253,8 +253,8 @@ def test_a_rule_with_a_period_is_told_how_late_its_estimates_are():
         ({"period": np.inf}, "at least 0 s, not inf"),
         ({"period": 0.1}, "no function that uses it"),
         ({"age": np.nan}, "at least 0 s, not nan"),
-        ({"age": "1 s"}, "is a number, not '1 s'"),
-        ({"period": "1 s", "by": abs}, "is a number, not '1 s'"),
+        ({"age": "1 s"}, "must be a number, not '1 s'"),
+        ({"period": "1 s", "by": abs}, "must be a number, not '1 s'"),
         ({"by": 3}, "is a function of estimates, not 3"),
     ],
 )
