@@ -87,7 +87,7 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "middle_deviation": "(0, inf)",
             "width_deviation": "(0, inf)",
             "fattening": "[0, inf)",
-            "floor": "[0, inf)",
+            "least_deviation": "[0, inf)",
         },
     ),
     "ErrorModel": (

@@ -227,7 +227,7 @@ def test_maps_and_parameters_are_checked():
         ConstellationMap(landmarks([[0.0, 0.0], [1.0, 1.0]]))
     with pytest.raises(ValueError, match="share lies between 0 and 1"):
         ConstellationMap(landmarks(np.eye(3, 2)), share=1.0)
-    with pytest.raises(ValueError, match="correlation is finite and at least 0, .*, nan and 16"):
+    with pytest.raises(ValueError, match="correlation is finite and at least 0, .*, nan, 16 and 0.02"):
         ConstellationMap(landmarks(np.eye(3, 2)), correlation=np.nan)
 
 

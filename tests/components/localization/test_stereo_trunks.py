@@ -96,8 +96,8 @@ def test_deviations_are_those_of_disparity_and_pixels() -> None:
         e /= distance
         n = np.array([-e[1], e[0]])
         expected = distance**2 / 120.0 * np.hypot(EXACT.disparity_deviation, EXACT.disparity_bias)
-        assert np.sqrt(e @ covariance @ e) == pytest.approx(np.hypot(expected, EXACT.floor), rel=0.03)
-        across = np.hypot(EXACT.middle_deviation * distance / 400.0, EXACT.floor)
+        assert np.sqrt(e @ covariance @ e) == pytest.approx(np.hypot(expected, EXACT.least_deviation), rel=0.03)
+        across = np.hypot(EXACT.middle_deviation * distance / 400.0, EXACT.least_deviation)
         assert np.sqrt(n @ covariance @ n) == pytest.approx(across, rel=0.03)
         assert e @ covariance @ n == pytest.approx(0.0, abs=1e-4)
 

@@ -21,7 +21,7 @@ def test_landmarks_of_a_drive_are_near_their_true_places():
     submap = Submap.empty(one.reckoned[0])
     for k, scan in enumerate(one.scans):
         motion = one.motion(k)[1] if k else np.zeros((3, 3))
-        submap = submap.moved(one.reckoned[k], motion).with_scan(scan)
+        submap = submap.moved(one.reckoned[k], motion).with_scan(scan, least_deviation=0.02)
     landmarks = submap.landmarks()
     assert len(landmarks) > 2 * max(len(scan) for scan in one.scans) / 1.5
     places = transform(one.poses[-1], landmarks.positions)
@@ -36,7 +36,11 @@ def test_covariances_grow_as_samples_of_the_odometry_do():
     places, motion = np.array([[8.0, 3.0], [-4.0, 6.0]]), np.array([2.0, 0.0, 0.3])
     C = DRIFT.covariance(motion, 10.0 * PERIOD)
     begin = np.array([5.0, 1.0, 0.7])
-    submap = Submap.empty(begin).with_scan(seen(places, deviation=0.0)).moved(compose(begin, motion), C)
+    submap = (
+        Submap.empty(begin)
+        .with_scan(seen(places, deviation=0.0), least_deviation=0.02)
+        .moved(compose(begin, motion), C)
+    )
     true_motions = rng.multivariate_normal(motion, C, 50_000)
     samples = np.array([[transform(inverse(true), places)] for true in true_motions[:5000]])[:, 0]
     for k, found in enumerate(submap.landmarks().covariances):
@@ -44,7 +48,11 @@ def test_covariances_grow_as_samples_of_the_odometry_do():
 
 
 def test_a_landmark_seen_again_is_merged():
-    submap = Submap.empty().with_scan(seen([[5.0, 0.0]])).with_scan(seen([[5.03, 0.0], [7.0, 2.0]], diameter=0.34))
+    submap = (
+        Submap.empty()
+        .with_scan(seen([[5.0, 0.0]]), least_deviation=0.02)
+        .with_scan(seen([[5.03, 0.0], [7.0, 2.0]], diameter=0.34), least_deviation=0.02)
+    )
     landmarks = submap.landmarks()
     assert len(landmarks) == 2
     np.testing.assert_allclose(landmarks.positions[0], [5.015, 0.0], atol=1e-9)
@@ -54,22 +62,22 @@ def test_a_landmark_seen_again_is_merged():
 
 def test_detections_seen_once_in_many_scans_are_left_out():
     there, flicker = [[5.0, 0.0], [0.0, 9.0]], [[3.0, 3.0]]
-    submap = Submap.empty().with_scan(seen(there + flicker))
+    submap = Submap.empty().with_scan(seen(there + flicker), least_deviation=0.02)
     assert len(submap.landmarks()) == 3
     for _ in range(3):
-        submap = submap.with_scan(seen(there))
+        submap = submap.with_scan(seen(there), least_deviation=0.02)
     np.testing.assert_allclose(submap.landmarks().positions, there, atol=1e-9)
 
 
 def test_landmarks_far_behind_are_dropped():
-    submap = Submap.empty().with_scan(seen([[5.0, 0.0]]))
+    submap = Submap.empty().with_scan(seen([[5.0, 0.0]]), least_deviation=0.02)
     for k in range(1, 12):
         submap = submap.moved([4.0 * k, 0.0, 0.0], np.zeros((3, 3)), length=40.0)
         assert len(submap) == (k <= 10)
 
 
 def test_submaps_are_values_with_a_codec():
-    submap = Submap.empty([1.0, 2.0, 0.5]).with_scan(seen([[5.0, 0.0]]))
+    submap = Submap.empty([1.0, 2.0, 0.5]).with_scan(seen([[5.0, 0.0]]), least_deviation=0.02)
     codec = codec_of(Submap.empty())
     arrays = codec.encode(submap)
     assert codec.encode(codec.decode(arrays)).keys() == arrays.keys()

@@ -104,6 +104,7 @@ class Wrong:
     pose: np.ndarray
     covariance: np.ndarray
     is_sure: bool = True
+    least_deviation: float = 0.02
 
     def locate(self, local):
         return self

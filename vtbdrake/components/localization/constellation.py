@@ -50,9 +50,7 @@ from vtbdrake.components.localization.planar import compose, rotation, rotations
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# Standard deviations in m that are added to those of positions and diameters: assumed, for bark, lean and roots. They
-# also keep the likelihoods of exact landmarks finite.
-_FLOOR = 0.02
+# Standard deviation in m that is added to those of diameters: assumed, for bark.
 _DIAMETER_FLOOR = 0.01
 
 # The share of diameters that are measured badly, ε: assumed.
@@ -181,23 +179,34 @@ class ConstellationMap:
         correlation: Length L in m over which errors of the map are shared by neighbours; 0 if they are independent.
         share: The share w of the local landmarks that are on the map, assumed.
         fewest: The least number of local landmarks with which a pose can be sure.
+        least_deviation: Standard deviation in m that is added to those of local landmarks, per axis: assumed, for bark,
+            lean and roots. It also keeps the likelihoods of exact landmarks finite.
 
     Raises:
         ValueError: The map has fewer than 3 landmarks, or a parameter is outside of its range.
     """
 
-    def __init__(self, landmarks: Landmarks, *, correlation: float = 0.0, share: float = 0.4, fewest: int = 16) -> None:
+    def __init__(
+        self,
+        landmarks: Landmarks,
+        *,
+        correlation: float = 0.0,
+        share: float = 0.4,
+        fewest: int = 16,
+        least_deviation: float = 0.02,
+    ) -> None:
         if len(landmarks) < 3:
             raise ValueError(f"a constellation needs a map of at least 3 landmarks, not {len(landmarks)}")
-        if not (0.0 < share < 1.0 and 0.0 <= correlation < inf and fewest >= 2):
+        if not (0.0 < share < 1.0 and 0.0 <= correlation < inf and fewest >= 2 and 0.0 < least_deviation < inf):
             raise ValueError(
-                "share lies between 0 and 1, correlation is finite and at least 0, and fewest at least 2, "
-                f"not {share}, {correlation} and {fewest}"
+                "share lies between 0 and 1, correlation is finite and at least 0, fewest at least 2, and "
+                f"least_deviation positive and finite, not {share}, {correlation}, {fewest} and {least_deviation}"
             )
         self.landmarks = landmarks
         self.correlation = correlation
         self.share = share
         self.fewest = fewest
+        self.least_deviation = least_deviation
         # The frame M of the map: W with its origin among the landmarks, so that large coordinates cost no digits.
         self._p_WoMo_W = landmarks.positions.mean(axis=0)
         self._places = landmarks.positions - self._p_WoMo_W
@@ -226,7 +235,7 @@ class ConstellationMap:
         p_HoCo_H = local.positions.mean(axis=0)
         here = self._seen(local, local.positions - p_HoCo_H)
         relative = self._relative(here.places)
-        variance = relative + float(np.mean(here.variances)) + _FLOOR**2
+        variance = relative + float(np.mean(here.variances)) + self.least_deviation**2
         judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
         ranking = sorted(
             (candidate for candidate in judged if candidate is not None),
@@ -254,7 +263,7 @@ class ConstellationMap:
         """Return the log-likelihood ratio Λ that a sure pose needs at least with these landmarks."""
         local_variance = 0.5 * float(np.mean(np.trace(local.covariances, axis1=1, axis2=2)))
         return self._required(
-            self._relative(local.positions - local.positions.mean(axis=0)) + local_variance + _FLOOR**2
+            self._relative(local.positions - local.positions.mean(axis=0)) + local_variance + self.least_deviation**2
         )
 
     def _required(self, variance: float) -> float:
@@ -300,7 +309,7 @@ class ConstellationMap:
         S = (
             relative * self.landmarks.covariances[landmark_indices]
             + here.covariances[local_rows]
-            + _FLOOR**2 * np.eye(2)
+            + self.least_deviation**2 * np.eye(2)
         )
         errors = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(_SAMPLES, 2)))
         true = self.landmarks.diameters[landmark_indices]
@@ -327,7 +336,7 @@ class ConstellationMap:
         """Return the poses X_MC to be judged, (k, 3); ``deviation`` (m) is that of local from mapped positions."""
         local = LocalPairs.of(
             here.places,
-            here.variances + _FLOOR**2,
+            here.variances + self.least_deviation**2,
             diameters=here.diameters,
             diameter_variances=here.diameter_variances,
             map_variance=self._variance,
@@ -387,7 +396,7 @@ class ConstellationMap:
         """
         R_MC = rotation(pose[2])
         places_M = transform(pose, here.places)
-        C = R_MC @ here.covariances @ R_MC.T + _FLOOR**2 * np.eye(2)
+        C = R_MC @ here.covariances @ R_MC.T + self.least_deviation**2 * np.eye(2)
         _, near = self._tree.query(places_M + self._variance**0.5 * mean, k=min(_NEIGHBOURS, len(self._places)))
         L = self._roots[near]
         S = L @ (spread + here.independent[:, np.newaxis, np.newaxis] * np.eye(2))[:, np.newaxis] @ L.swapaxes(-1, -2)

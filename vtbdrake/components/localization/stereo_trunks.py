@@ -69,7 +69,7 @@ class StereoTrunkDetectorConfig:
     fattening: float = setting(
         1.0, "Number of pixels by which trunks appear too wide, as matching widens near objects.", unit="pixels", ge=0.0
     )
-    floor: float = setting(
+    least_deviation: float = setting(
         0.02,
         "Standard deviation that is added to positions, per axis, and diameters: trunks are not round, nor upright.",
         unit="m",
@@ -217,13 +217,14 @@ def _landmarks(
     pixel = distance / camera.focal_length
     # A hidden part displaces the middle by up to half of the diameter.
     cross_variance = (detector.middle_deviation * pixel) ** 2 + np.where(is_whole, 0.0, (0.5 * diameter) ** 2)
-    covariances = detector.floor**2 * np.eye(2) + sum(
+    covariances = sum(
         variance[:, None, None] * axis[:, :, None] * axis[:, None, :]
         for variance, axis in ((range_variance, along), (cross_variance, across))
     )
-    return Landmarks(
+    landmarks = Landmarks(
         X_HC.translation()[:2] + distance[:, None] * along,
         covariances,
         diameter,
-        np.where(is_whole, np.hypot(detector.width_deviation * pixel, detector.floor), inf),
+        np.where(is_whole, detector.width_deviation * pixel, inf),
     )
+    return landmarks.widened(detector.least_deviation)

@@ -22,9 +22,6 @@ Array = NDArray[np.float64]
 # The share of right pairs that the gate of the association lets pass.
 _GATE = 0.997
 
-# Standard deviation in m that is added to that of each position, per axis: a trunk is not a point.
-_LEAST_DEVIATION = 0.02
-
 # A place that was in view of at least so many scans is a landmark only if it was detected at least twice.
 _CHANCES = 3
 
@@ -100,12 +97,17 @@ class Submap:
         grown = self.covariances + J @ C_O @ J.transpose(0, 2, 1)
         return replace(self, X_OH=pose, distance=distance, covariances=grown)._select(distance - self.last <= length)
 
-    def with_scan(self, landmarks: Landmarks) -> Submap:
-        """Return the map after a scan at its pose: detections, in H, are merged with known landmarks, or added."""
+    def with_scan(self, landmarks: Landmarks, *, least_deviation: float) -> Submap:
+        """Return the map after a scan at its pose: detections are merged with landmarks that it has, or added.
+
+        Args:
+            landmarks: The detections, in H.
+            least_deviation: Standard deviation in m that is added to those of positions, see `ConstellationMap`.
+        """
         if not len(landmarks):
             return self
         scan = landmarks.seen_from(self.X_OH)
-        R = scan.covariances + _LEAST_DEVIATION**2 * np.eye(2)
+        R = scan.covariances + least_deviation**2 * np.eye(2)
         nu = scan.positions - self.positions[:, None]
         squares = squared_distances(nu, self.covariances[:, None] + R)
         old, new = one_to_one(chi_square_quantile(_GATE, 2) - squares)

@@ -178,7 +178,7 @@ class LocalizationUnit:
                     answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
                 return answer, replace(state, answer=answer, track=track)
             lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
-            submap = Submap.empty(pose).with_scan(landmarks)
+            submap = Submap.empty(pose).with_scan(landmarks, least_deviation=self.locator.least_deviation)
             return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
         return self._searched(state, landmarks, pose, C, time)
 
@@ -186,7 +186,8 @@ class LocalizationUnit:
         self, state: UnitState, landmarks: Landmarks, X_OH: Array, C: Array, time: float
     ) -> tuple[Localization, UnitState]:
         """Return the answer and the memory after a scan that follows an answer without a pose."""
-        submap = state.submap.moved(X_OH, C, length=self.submap_length).with_scan(landmarks)
+        submap = state.submap.moved(X_OH, C, length=self.submap_length)
+        submap = submap.with_scan(landmarks, least_deviation=self.locator.least_deviation)
         none = Localization.unknown(state.answer.status, time=time, X_OH=X_OH, detected=len(landmarks))
         state = replace(state, answer=none, submap=submap)
         gathered = submap.landmarks()
