@@ -32,14 +32,14 @@ BELOW: dict[str, set[str]] = {
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
 # Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
-# travel to them, when the names of a package are imported, what a cache keeps, splines and laser scans.
+# travel to them, when the names of a package are imported, what a cache keeps, arrays, splines and laser scans.
 for _layers in BELOW.values():
-    _layers.update(
-        {"argument_checks", "child_process", "failures", "lazy", "lru", "pickling", "scan", "settings", "spline"}
-    )
-BELOW["spline"] = {"argument_checks", "spline_kernel"}
+    _layers.update({"argument_checks", "arrays", "child_process", "failures", "lazy"})
+    _layers.update({"lru", "pickling", "scan", "settings", "spline"})
+BELOW["spline"] = {"argument_checks", "arrays", "spline_kernel"}
 BELOW["spline_kernel"] = {"state"}
-BELOW["scan"] = set()
+BELOW["scan"] = {"arrays"}
+BELOW["arrays"] = set()
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}
 BELOW["argument_checks"] = set()

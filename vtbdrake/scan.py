@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
 
 # How far the length of a direction may be from 1: messages carry directions as 32-bit numbers.
 _TOLERANCE = 1e-5

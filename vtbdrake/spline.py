@@ -8,12 +8,11 @@ from math import comb, factorial, inf, perm
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import as_number, as_whole
+from vtbdrake.arrays import Array
 from vtbdrake.spline_kernel import value_at, weights_at
-
-Array = NDArray[np.float64]
 
 # The least number of knots, by order; and how many derivatives are finite everywhere.
 _LEAST_KNOTS = {"zero": 1, "linear": 2, "cubic": 2, "bspline": 4}

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
+from vtbdrake.arrays import Array
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.reasoning import Budget, Decision, Reasoner
@@ -19,8 +19,6 @@ from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.cart_pole.decision import reasoning
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
 from vtbdrake_diagrams.cart_pole.scenario import CartPoleScenario
-
-Array = NDArray[np.float64]
 
 # The longest time in which processes start, or a decision is made, in seconds.
 _PATIENCE = 60.0

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.planar import chord, compose, inverse
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route
-
-Array = NDArray[np.float64]
 
 _PLACE = ("dps.env.pose.position", "dps.env.pose.heading")
 _MOTION = ("dps.env.dead_reckoning.speed", "dps.env.dead_reckoning.turn_rate")

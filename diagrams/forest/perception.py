@@ -13,11 +13,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 from threadpoolctl import ThreadpoolController
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.localization.dead_reckoning import (
     MOTION,
@@ -41,8 +41,6 @@ from vtbdrake.components.localization.unit import (
 from vtbdrake.scan import Scan
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed.slow_part import SlowPart
-
-Array = NDArray[np.float64]
 
 # The time in s for which dead reckoning alone gives a valid pose; assumed.
 _PATIENCE = 10.0

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
@@ -37,8 +36,6 @@ from vtbdrake_diagrams.forest.world.routes import Route
 from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, MapErrors, Stand
 from vtbdrake_diagrams.forest.world.vegetation import Vegetation
 from vtbdrake_diagrams.plain.rocks import RockField
-
-Array = NDArray[np.float64]
 
 PERCEPTIONS = ("scanner", "stereo")
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import body_rotation, carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from vtbdrake.testbed import VirtualTestbedBuilder
 
-Array = NDArray[np.float64]
 
 IMAGES = ("left_image", "right_image")
 """The names of the signals of the left and the right camera."""

@@ -13,17 +13,15 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface, copies, unit_sphere
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 from vtbdrake_diagrams.forest.world.stand import MapErrors, surveyed
-
-Array = NDArray[np.float64]
 
 # Streams of random numbers; the forest has others.
 _ROCKS, _MAP = 6, 7

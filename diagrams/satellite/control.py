@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.estimate import cross_matrix, rotation_vector
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
@@ -15,8 +15,6 @@ from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
 from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Guidance, Mode, stopping_speed
-
-Array = NDArray[np.float64]
 
 # Share of their opening from which on the fingers release the bar.
 _OPEN = 0.9

@@ -6,15 +6,13 @@ from functools import lru_cache
 
 import casadi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.components.perception.tracking import pose_of_state
 from vtbdrake.state import AddressedSystem, Quantity
-
-Array = NDArray[np.float64]
 
 BASE = 14
 """Size of the estimate of the base: [time (s), q_IB (wxyz), p_IoBo (m), w_IB (rad/s), v_IBo (m/s)], in I."""

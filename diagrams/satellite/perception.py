@@ -15,10 +15,10 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetectorConfig, detect_markers, pose_from_markers
@@ -37,8 +37,6 @@ from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, BaseEstimator,
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo, ImageRgba8U
-
-Array = NDArray[np.float64]
 
 
 def target_board(target: Target | None = None) -> MarkerBoard:

@@ -7,16 +7,14 @@ from functools import lru_cache
 
 import casadi
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state import AddressedSystem
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
 from vtbdrake_diagrams.satellite.estimation import BASE, rotated, turned
 from vtbdrake_diagrams.satellite.kinematics import gripper
-
-Array = NDArray[np.float64]
 
 # An age in s that stands for never, because ports carry finite numbers.
 _LONG_AGO = 1e6

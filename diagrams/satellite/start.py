@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
@@ -14,11 +13,10 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
+from vtbdrake.arrays import Array
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.satellite.bodies import Target
-
-Array = NDArray[np.float64]
 
 MEETING = 15.0
 """When the gripper meets the bar in a capture without delays, in s: the servicer waits for a target that will then face

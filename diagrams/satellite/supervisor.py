@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.estimate import rotation_vector
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
 from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
-
-Array = NDArray[np.float64]
 
 
 class Mode(IntEnum):

@@ -41,9 +41,8 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 from scipy.special import ndtr
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import obj_mesh
-
-Array = NDArray[np.float64]
 
 RIM_RADIUS = 40.0
 DEPTH = 6.0

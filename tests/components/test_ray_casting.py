@@ -6,7 +6,6 @@ from math import inf
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydrake.common import MemoryFile
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import (
@@ -33,9 +32,9 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.ray_casting import TOLERANCE, Hits, RayCaster
 
-Array = NDArray[np.float64]
 AT_REST = SpatialVelocity.Zero()
 X_BG = RigidTransform(RollPitchYaw(0.4, -0.3, 0.8), [0.1, -0.2, 0.05])
 TETRAHEDRON = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])

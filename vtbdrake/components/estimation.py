@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
+
 Indices = NDArray[np.intp]
 Numbers = TypeVar("Numbers", float, Array)
 

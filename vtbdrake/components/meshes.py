@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
+
 if TYPE_CHECKING:
     from pydrake.geometry import InMemoryMesh
 
-Array = NDArray[np.float64]
 Triangles = NDArray[np.int64]
 # Vertices in m, shape (v, 3), and triangles of vertices counted from 0, shape (t, 3), counterclockwise from outside.
 Surface = tuple[Array, Triangles]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.ray_kernel import keep_nearest, to_body, to_world
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import RigidBody
 
-Array = NDArray[np.float64]
 # Vertices in m, shape (v, 3), and the triangles between them, shape (t, 3).
 Surface = tuple[Array, NDArray[np.int32]]
 

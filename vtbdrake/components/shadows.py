@@ -15,10 +15,11 @@ from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, Query
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from vtbdrake.arrays import Array
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Array = NDArray[np.float64]
 
 # Pixels per side of the sun's depth images, at least and at most.
 _SMALLEST, _LARGEST = 64, 1024

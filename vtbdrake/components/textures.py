@@ -17,7 +17,6 @@ from vtbdrake.components.meshes import Surface, vertex_normals
 if TYPE_CHECKING:
     from pydrake.geometry import Mesh
 
-Array = NDArray[np.float64]
 
 # Of a grained image: the highest frequency of its grain in waves per pixel, and the deviation of the brightness as a
 # share of its mean.

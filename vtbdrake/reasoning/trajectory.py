@@ -7,14 +7,13 @@ from functools import cached_property
 from math import inf
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.arrays import Array
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.spline import Spline
 from vtbdrake.state import Variables
-
-Array = NDArray[np.float64]
 
 # Rows that are this small beside the largest one are rounding errors of zero.
 _NEGLIGIBLE = 1e-12

@@ -75,8 +75,12 @@ def stateful_leaves(
     """
     for path, system in leaves(diagram):
         if only(path):
-            leaf_context = system.CreateDefaultContext() if context is None else system.GetMyContextFromRoot(context)
-            yield Leaf(path, system, tuple(_numeric_groups(leaf_context)))
+            leaf = Leaf(path, system, ())
+            # A context of a large scene takes long to make, and has no numeric group.
+            if not leaf.holds_ids:
+                made = system.CreateDefaultContext() if context is None else system.GetMyContextFromRoot(context)
+                leaf = leaf._replace(groups=tuple(_numeric_groups(made)))
+            yield leaf
 
 
 def _numeric_groups(context: Context) -> Iterator[Group]:

@@ -7,16 +7,14 @@ from math import isclose
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams
 
+from vtbdrake.arrays import Array
 from vtbdrake.testbed.parts import WorldAlone
 from vtbdrake.testbed.testbed import BeliefRule
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 class Predictor:

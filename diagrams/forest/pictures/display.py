@@ -11,10 +11,11 @@ from collections.abc import Mapping
 
 import click
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
+from vtbdrake.arrays import Array
 from vtbdrake.cli import BadInputError
 from vtbdrake.cli.options import option, scenario_argument, timeout_option, url_option
 from vtbdrake.components.localization.planar import transform
@@ -27,8 +28,6 @@ from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model
 from vtbdrake.visualization.world_model import text_strokes
 from vtbdrake_diagrams.forest.scenario import CarrierScenario
-
-Array = NDArray[np.float64]
 
 POSITION, HEADING, COVARIANCE, STATUS = (
     f"dps.env.pose.{name}" for name in ("position", "heading", "covariance", "status")

@@ -15,14 +15,13 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from PIL import Image
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import deskewed
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.components.localization.planar import transform
 from vtbdrake.visualization.plots import Picture, finish
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import StereoConfig
-
-Array = NDArray[np.float64]
 
 SCENARIO = ForestScenario(seed=3, length=60.0, width=60.0, start=12.0, map="remote")
 """The drive that is drawn."""

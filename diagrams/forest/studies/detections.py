@@ -13,11 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import chord, compose, inverse, rotations, transform, wrap
 from vtbdrake_diagrams.forest.world.stand import Stand
-
-Array = NDArray[np.float64]
 
 # The number of rays across each trunk that determine how much of it is visible.
 _RAYS = 9

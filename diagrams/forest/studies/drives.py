@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
+from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -41,8 +42,6 @@ from vtbdrake_diagrams.forest.perception import SETTLED
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
-
-Array = NDArray[np.float64]
 
 INDEPENDENT = 100.0
 """Estimates count as independent if they are at least this far apart along the path, in m."""

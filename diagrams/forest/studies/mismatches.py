@@ -25,7 +25,6 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
@@ -33,8 +32,6 @@ from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake_diagrams.forest.studies.detections import Detector, Wood
 from vtbdrake_diagrams.forest.studies.recordings import FOLDER, rioja, stems
 from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, Stand
-
-Array = NDArray[np.float64]
 
 SEED = 800_000
 DENSITIES = (300.0, 1500.0)

@@ -28,10 +28,10 @@ from dataclasses import dataclass, field, fields, replace
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 import vtbdrake as vtb
+from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.components.world_model import WorldModel
@@ -40,8 +40,6 @@ from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import Track, localize, recorded_drive
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
-
-Array = NDArray[np.float64]
 
 SEED = 410_000
 """The seed of the first forest. Forests from 400,000 on were driven before, with clusters instead of gaps."""

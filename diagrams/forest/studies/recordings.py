@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from vtbdrake.components.localization.landmarks import Landmarks
 
-Array = NDArray[np.float64]
-
 FOLDER = Path(os.environ.get("VTBDRAKE_RECORDINGS", Path(__file__).parents[4] / "shared" / "real"))
 """The folder of the recordings."""
 

@@ -17,15 +17,13 @@ from dataclasses import dataclass
 import click
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import vtbdrake as vtb
+from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-
-Array = NDArray[np.float64]
 
 SEED = 300_000
 HORIZON = 10.0

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
@@ -26,8 +26,6 @@ from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.forest.stereo import IMAGES
 from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
-
-Array = NDArray[np.float64]
 
 SEED = 200_000
 FALSE = 25.0

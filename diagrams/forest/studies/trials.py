@@ -24,16 +24,14 @@ from dataclasses import dataclass
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, wrap
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, gathered
 from vtbdrake_diagrams.forest.world.stand import MAPS, Stand
-
-Array = NDArray[np.float64]
 
 SEED = 100_000
 MARGIN = 10.0

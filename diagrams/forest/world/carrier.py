@@ -45,12 +45,11 @@ from pydrake.systems.framework import (
     DiscreteValues,
 )
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.forest.world.ground import Ground
-
-Array = NDArray[np.float64]
 
 INSTANCE = "carrier"
 

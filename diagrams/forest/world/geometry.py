@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import (
     GeometryInstance,
     IllustrationProperties,
@@ -14,13 +13,12 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface, surface_mesh
 from vtbdrake.components.textures import grain, tiled_mesh
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.stand import Stand
 from vtbdrake_diagrams.forest.world.vegetation import Vegetation, branches, crowns, trunks, undergrowth
-
-Array = NDArray[np.float64]
 
 # The ground goes on around a stand by this distance, in m.
 _MARGIN = 15.0

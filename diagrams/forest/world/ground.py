@@ -7,11 +7,10 @@ from functools import cached_property
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface
-
-Array = NDArray[np.float64]
 
 # Wave lengths in m of hills and of bumps, and the numbers of their waves.
 _HILLS, _BUMPS = (40.0, 150.0), (2.5, 8.0)

@@ -8,9 +8,9 @@ from functools import cached_property
 from math import atan2, cos, pi, sin
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
 
 # The stream of random numbers; `stand` and `ground` have others.
 _ROADS = 3

@@ -16,10 +16,9 @@ from math import exp, inf, pi
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
-
-Array = NDArray[np.float64]
 
 HECTARE = 1e4
 

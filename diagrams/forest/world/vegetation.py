@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface, copies, unit_cone, unit_sphere
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake_diagrams.forest.world.ground import Ground
-
-Array = NDArray[np.float64]
 
 BREAST_HEIGHT = 1.3
 """The height over the ground in m at which the diameter of a trunk is measured."""

@@ -8,11 +8,11 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import AffineSystem, MatrixGain, ZeroOrderHold
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.compiled_plant import momentum_world, rotation_angle
 from vtbdrake.components.sensors import ErrorModel, JointEncoders
 from vtbdrake.components.spline_command import SplineCommand
@@ -27,7 +27,6 @@ from vtbdrake_diagrams.satellite.studies.arm_move import ORDER, REACHING, RESTIN
 if TYPE_CHECKING:
     from vtbdrake.reasoning import OnboardReasoner
 
-Array = NDArray[np.float64]
 
 PERIOD = 0.02
 """The sample period of sensors and DPS in s."""

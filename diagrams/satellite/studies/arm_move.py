@@ -24,17 +24,16 @@ from math import inf
 
 import casadi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, MomentumModel, base_poses
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake.spline import Spline
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, Servicer
 from vtbdrake_diagrams.satellite.plant import add_servicer
 from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance
-
-Array = NDArray[np.float64]
 
 ORDER = "bspline"
 RESTING = 2

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolverInterface, SolverOptions
 
+from vtbdrake.arrays import Array
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS
 from vtbdrake_diagrams.satellite.studies.arm_move import FEASIBILITY, RESTING, Move, move_space
-
-Array = NDArray[np.float64]
 
 GOOD_ENOUGH, GOOD_SHARE = 2e-3, 0.02
 """The deviation q at which no further start is tried: in rad, and as a share of that on the straight path."""

@@ -19,7 +19,7 @@ from math import ceil, hypot
 
 import casadi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.geometry import (
     Capsule,
     CollisionFilterDeclaration,
@@ -35,6 +35,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame
 from pydrake.systems.framework import DiagramBuilder
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.compiled_plant import MomentumModel
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake_diagrams.satellite.bodies import (
@@ -46,8 +47,6 @@ from vtbdrake_diagrams.satellite.bodies import (
     Servicer,
 )
 from vtbdrake_diagrams.satellite.plant import add_servicer
-
-Array = NDArray[np.float64]
 
 CLEARANCE = 0.02
 """The least distance in m that the arm keeps from base, panels and itself."""

@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
 import vtbdrake as vtb
+from vtbdrake.arrays import Array
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.visualization.plots import Picture, finish
@@ -53,8 +54,6 @@ from vtbdrake_diagrams.satellite.relative_motion import Relative
 from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
 from vtbdrake_diagrams.satellite.supervisor import Mode
-
-Array = NDArray[np.float64]
 
 HORIZON = 36.0
 """How long a capture may take, in s. With the default and the sun beside it takes half of it."""

@@ -28,9 +28,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import vtbdrake as vtb
+from vtbdrake.arrays import Array
 from vtbdrake.optimization import Sweep
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutResult, RolloutRunner
 from vtbdrake.state.systems import pose_to_array
@@ -61,8 +62,6 @@ _X, _REACH = 0.62, 0.45
 _TURN = 0.5
 # How far the camera stays away from the axis of the arm's foot, in m.
 _FOOT = 0.18
-
-Array = NDArray[np.float64]
 
 
 def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:

@@ -23,6 +23,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from scipy.stats import binom
 
 import vtbdrake as vtb
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.tracking import TargetTracker
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScannerConfig, connect_laser_scanner
@@ -39,8 +40,6 @@ from vtbdrake_diagrams.satellite.estimation import BaseEstimator
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, add_scan_part
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target, plant_config
 from vtbdrake_diagrams.satellite.start import Release, Start
-
-Array = NDArray[np.float64]
 
 APPROACH = 16.0
 """How long the approach takes, in s."""

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.compiled_plant import rotation_angle
 from vtbdrake.optimization import Problem
 from vtbdrake.rollout.executor import cores
@@ -42,7 +42,6 @@ from vtbdrake_diagrams.satellite.studies.clearance import DrakeClearance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 # How far starts are from the stowed pose, and goals from the middle of the workspace, at most; in rad.
 _START_SPREAD, _GOAL_SPREAD = 0.2, 0.6

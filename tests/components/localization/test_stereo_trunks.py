@@ -18,12 +18,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
 from vtbdrake.components.textures import grain, tiled_mesh
-
-Array = NDArray[np.float64]
 
 CAMERA = StereoCamera(640, 480, 400.0, 320.0, 240.0, 0.3)
 EXACT = StereoTrunkDetectorConfig(fattening=0.0)

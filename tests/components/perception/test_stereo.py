@@ -23,10 +23,9 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
 from vtbdrake.components.textures import grain, textured_mesh
-
-Array = NDArray[np.float64]
 
 INFO = CameraInfo(320, 240, 300.0, 300.0, 150.0, 125.0)  # The axis does not meet the middle.
 CAMERA = StereoCamera.of(INFO, baseline=0.3)

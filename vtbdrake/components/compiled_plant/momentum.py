@@ -20,18 +20,17 @@ from functools import cached_property
 
 import casadi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, Joint
 from pydrake.systems.framework import Context
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
 from vtbdrake.components.compiled_plant.links import FLOATING, Expression, UnsupportedPlantError, skew
 from vtbdrake.spline import Spline
-
-Array = NDArray[np.float64]
 
 
 class MomentumModel(PlantDynamics):

@@ -10,10 +10,9 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.components.compiled_plant.links import Expression
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import transform
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # Hypotheses that are tried in the association of a scan.

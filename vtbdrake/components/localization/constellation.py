@@ -43,11 +43,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
 from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Standard deviation in m that is added to those of diameters: assumed, for bark.

@@ -12,16 +12,15 @@ from itertools import pairwise
 from math import atan2, ceil, cos, hypot, inf, sin, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.planar import rotation
 from vtbdrake.scan import Scan
 from vtbdrake.state import AddressedSystem, NamedVector, Quantity
 from vtbdrake.state.declarations import NamedView
-
-Array = NDArray[np.float64]
 
 MOTION = NamedVector(
     time=Quantity(unit="s"),

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
 from scipy.sparse import kron
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
 
 # The distance of the nodes of the surface, and the edge length of the cells whose lowest points count, in m.
 _SPACING, _CELL = 4.0, 1.5

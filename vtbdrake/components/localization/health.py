@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.track_state import TrackState
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # A scan fails if it matches a smaller share of its detections, or of the landmarks that should be seen again.

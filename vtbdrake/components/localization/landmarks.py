@@ -7,12 +7,11 @@ from dataclasses import dataclass, fields, replace
 from math import inf
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.planar import rotation, transform
 from vtbdrake.components.world_model import WorldModel
-
-Array = NDArray[np.float64]
 
 DIAMETERS = {"tree": "trunk_diameter", "rock": "width"}
 """The attribute that is the diameter of a landmark, by the class of the object."""

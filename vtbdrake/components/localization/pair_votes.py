@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
+
 Singles = NDArray[np.float32]
 
 # The least and the largest distance of a pair in m: close pairs say little about the heading, far ones are too many.

@@ -6,9 +6,10 @@ from math import cos, pi, sin
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
+
 Numbers = TypeVar("Numbers", float, Array)
 
 

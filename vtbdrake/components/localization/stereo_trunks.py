@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.ndimage import convolve1d, find_objects, label
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.perception.stereo import StereoCamera
 from vtbdrake.settings import check_settings, setting
-
-Array = NDArray[np.float64]
 
 # Cells per pixel of disparity. A trunk of one disparity is spread over three: a cell, and one on either side.
 _CELLS = 2

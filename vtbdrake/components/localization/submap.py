@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import (
     chi_square_quantile,
     kalman_update,
@@ -16,8 +17,6 @@ from vtbdrake.components.estimation import (
 )
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import inverse, rotation
-
-Array = NDArray[np.float64]
 
 # The share of right pairs that the gate of the association lets pass.
 _GATE = 0.997

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
+
 Indices = NDArray[np.int64]
 
 BIAS, ODOMETRY, RATE = 3, 4, 5

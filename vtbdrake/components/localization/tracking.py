@@ -45,6 +45,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization import health
 from vtbdrake.components.localization.association import Association, ExpectedDetections, MatchedPairs
@@ -53,7 +54,6 @@ from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState
 from vtbdrake.settings import check_settings, setting
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # The number of leading elements of x on which a detection depends, beside the landmark.

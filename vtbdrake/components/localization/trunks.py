@@ -27,12 +27,12 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
 from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
 from vtbdrake.settings import setting
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # The number of layers of the slice, one bit each.

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite, nan
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -23,8 +24,6 @@ from vtbdrake.components.localization.track_state import TrackState
 from vtbdrake.components.localization.tracking import Matches, Tracker
 from vtbdrake.state import Codec
 from vtbdrake.state.codecs import codec_of
-
-Array = NDArray[np.float64]
 
 SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
 """The values of `Localization.status`: no pose yet; a pose; the pose was lost, and the unit searches again; the last

@@ -7,10 +7,10 @@ from math import inf, sin, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.components.perception.estimate import Array, PoseEstimate, cross_matrix, rotation_matrix
+from vtbdrake.arrays import Array
+from vtbdrake.components.perception.estimate import (
+    PoseEstimate,
+    cross_matrix,
+    rotation_matrix,
+)
 from vtbdrake.components.textures import textured_mesh
 from vtbdrake.settings import check_settings, setting
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
+from vtbdrake.arrays import Array
+from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.settings import check_settings, setting
 
 

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo, ImageRgba8U
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

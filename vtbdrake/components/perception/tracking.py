@@ -13,9 +13,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import RotationalInertia
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
-    Array,
     PoseEstimate,
     cross_matrix,
     rotation_matrix,

@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
     State,
 )
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from vtbdrake.components.environment import Haze
     from vtbdrake.components.ray_casting import RayCaster
 
-Array = NDArray[np.float64]
 
 # The largest difference in s of two instants that are equal but for rounding.
 _ROUNDING = 1e-9

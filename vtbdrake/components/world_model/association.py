@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.objects import (
-    Array,
     Quantity,
     WorldObject,
     check_pose,

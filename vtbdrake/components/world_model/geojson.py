@@ -27,10 +27,16 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.local_frame import LocalFrame
 from vtbdrake.components.world_model.model import WorldModel
-from vtbdrake.components.world_model.objects import CONFIRMED, Array, Quantity, Relation, WorldObject
+from vtbdrake.components.world_model.objects import (
+    CONFIRMED,
+    Quantity,
+    Relation,
+    WorldObject,
+)
 from vtbdrake.state.archive import whole_file
 
 _Read = TypeVar("_Read")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from math import isfinite, radians
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vtbdrake.arrays import Array
 
 # The ellipsoid of WGS84 (NIMA TR8350.2): semi-major axis in m, flattening.
 _A = 6378137.0

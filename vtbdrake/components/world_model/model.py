@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.objects import STATUSES, Quantity, Relation, WorldObject
 from vtbdrake.state.declarations import Codec
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 # What is nearer to the outline of a polygon than this, in m, lies on it.

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.perception.estimate import PoseEstimate
-
-Array = NDArray[np.float64]
 
 TENTATIVE, CONFIRMED, REVISED, RETIRED = STATUSES = ("tentative", "confirmed", "revised", "retired")
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RotationMatrix
 
+from vtbdrake.arrays import Array
 from vtbdrake.components.estimation import kalman_update, one_to_one, weighted_mean
-from vtbdrake.components.perception.estimate import Array, PoseEstimate, rotation_matrix
+from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.world_model.association import Sighting, associate, check_units
 from vtbdrake.components.world_model.model import WorldModel
 from vtbdrake.components.world_model.objects import (

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vtbdrake.arrays import Array
 from vtbdrake.monitoring.residuals.comparison import ResidualConfig, Window
-
-Array = NDArray[np.float64]
 
 _BATCH = 100  # consecutive windows from which a calibration takes one mean and deviation
 _MIN_WINDOWS = 2 * _BATCH

@@ -9,8 +9,9 @@ from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vtbdrake.arrays import Array
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.testbed import Interface, Scenario
@@ -18,7 +19,6 @@ from vtbdrake.testbed.prediction import Predictor
 
 _log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 SHADOW, TWIN = "shadow", "twin"
 INDEX, TIME = 0, 1

@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from vtbdrake.arrays import Array
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
@@ -22,7 +23,6 @@ from vtbdrake.monitoring.residuals.comparison import (
     SHADOW,
     TIME,
     TWIN,
-    Array,
     Comparison,
     ResidualConfig,
     RowLayout,
