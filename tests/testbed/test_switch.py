@@ -12,8 +12,7 @@ from pydrake.systems.primitives import ConstantValueSource, Integrator, LinearSy
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
-from vtbdrake.state.snapshot import numeric_groups
-from vtbdrake.state.systems import leaves, read_group
+from vtbdrake.state.systems import read_group, stateful_leaves
 from vtbdrake.state.variables import VariableError
 from vtbdrake.testbed import ActuatorCommand, Interface, Signal, SignalError, VirtualTestbedBuilder
 
@@ -105,10 +104,10 @@ def _record(dps_factory, sense, act, samples, mode):
             value = testbed.read(context, f"dps.{signal.name}")
             outputs.append(value.tobytes() if signal.is_vector else value.GetAsMatrix34().tobytes())
     memory = {}
-    for path, system in leaves(testbed.diagram):
+    for path, system, groups in stateful_leaves(testbed.diagram, context):
         if path == "dps" or path.startswith("dps."):
-            own = system.GetMyContextFromRoot(context)
-            memory |= {(path, *g): read_group(own, *g).tobytes() for g in numeric_groups(own)}
+            leaf = system.GetMyContextFromRoot(context)
+            memory |= {(path, kind, k): read_group(leaf, kind, k).tobytes() for kind, k, _ in groups}
     assert memory
     return outputs, memory
 
