@@ -105,6 +105,15 @@ def test_sent_image_arrives_exactly(image_type: Any, compress: bool) -> None:
     assert received.sent == 7.0
 
 
+def test_image_of_a_single_row_arrives_exactly() -> None:
+    image = ImageRgba8U(WIDTH, 1)
+    image.mutable_data[:] = np.arange(4 * WIDTH, dtype=np.uint8).reshape(1, WIDTH, 4)
+    signal = Signal("camera", model_value=ImageRgba8U(WIDTH, 1))
+    map = image_map(CHANNEL, "camera")
+    received = take(map, [signal], map.encoder([signal])({"camera": image}, 1))["camera"]
+    np.testing.assert_array_equal(received.value.data, image.data)
+
+
 def test_image_of_another_size_is_not_sent() -> None:
     encode = image_map(CHANNEL, "camera").encoder([camera()])
     with pytest.raises(
