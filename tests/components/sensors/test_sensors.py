@@ -172,6 +172,30 @@ def test_encoders_show_a_constant_rate_sampled() -> None:
     assert reading(encoders, simulator) == pytest.approx([0.1 + 2.0 * 5 * PERIOD], abs=1e-6)
 
 
+@pytest.mark.parametrize("names", [["CartSlider", "PolePin"], ["PolePin", "CartSlider"], ["PolePin"]])
+def test_joint_sensors_show_their_joints_in_order(names: list[str]) -> None:
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(MultibodyPlant(0.001))
+    Parser(plant).AddModelsFromUrl("package://drake/examples/multibody/cart_pole/cart_pole.sdf")
+    plant.Finalize()
+    joints = [plant.GetJointByName(name) for name in names]
+    sensors = [sensor(plant, joints, period=PERIOD) for sensor in (JointEncoders, JointTachometers)]
+    for sensor in sensors:
+        builder.AddSystem(sensor)
+        builder.Connect(plant.get_state_output_port(), sensor.get_input_port())
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    angles, rates = {"CartSlider": 0.3, "PolePin": -0.7}, {"CartSlider": 1.5, "PolePin": -2.5}
+    for name in angles:
+        joint = plant.GetJointByName(name)
+        (joint.set_translation if name == "CartSlider" else joint.set_angle)(context, angles[name])
+        (joint.set_translation_rate if name == "CartSlider" else joint.set_angular_rate)(context, rates[name])
+    simulator.AdvanceTo(0.5 * PERIOD)
+    # The first sample is that after a step of the plant.
+    assert reading(sensors[0], simulator) == pytest.approx([angles[name] for name in names], abs=0.02)
+    assert reading(sensors[1], simulator) == pytest.approx([rates[name] for name in names], abs=0.2)
+
+
 def test_units_are_those_of_the_joints() -> None:
     plant = MultibodyPlant(0.001)
     Parser(plant).AddModelsFromUrl("package://drake/examples/multibody/cart_pole/cart_pole.sdf")

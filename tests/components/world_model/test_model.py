@@ -38,6 +38,24 @@ def stand() -> WorldModel:
     return WorldModel([*trees, rock])
 
 
+def test_covariance_with_a_negative_eigenvalue_is_refused() -> None:
+    for entries, possible in (([[2.0, 1.0], [1.0, 2.0]], True), ([[1.0, 2.0], [2.0, 1.0]], False)):
+        covariance = np.eye(6)
+        covariance[3:5, 3:5] = entries
+        pose = PoseEstimate.of(RigidTransform(), covariance, time=0.0)
+        if possible:
+            assert WorldObject("a", "tree", pose).pose.covariance[3, 4] == entries[0][1]
+            continue
+        with pytest.raises(ValueError, match="covariance of a.* is not positive semidefinite"):
+            WorldObject("a", "tree", pose)
+
+
+def test_position_of_a_single_known_axis_is_accepted() -> None:
+    covariance = np.diag([np.inf] * 5 + [0.04])
+    pose = PoseEstimate.of(RigidTransform([0.0, 0.0, 2.0]), covariance, time=0.0)
+    assert WorldObject("a", "tree", pose).pose.covariance[5, 5] == 0.04
+
+
 def test_queries_equal_a_search_of_all_objects(stand: WorldModel) -> None:
     point = np.array([40.0, 60.0])
     found = stand.find("tree", near=(point, 15.0), attributes={"trunk_diameter": (0.2, 0.3), "species": "spruce"})
