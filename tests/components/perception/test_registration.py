@@ -88,6 +88,24 @@ def test_errors_agree_with_their_covariance() -> None:
     assert 1.0 < np.mean(distances) < 7.4
 
 
+def test_systematic_error_is_the_covariance_of_exact_points() -> None:
+    settings = RegistrationConfig(range_noise=1e-4, systematic=0.01)
+    points = measure(0.0, seed=0)
+    estimate = register_points(points, FACES, X_AT, eye=EYE, time=2.0, registration=settings)
+    np.testing.assert_allclose(estimate.covariance, 0.01**2 * np.eye(6), atol=0.01**3)
+
+
+@pytest.mark.parametrize(("share", "valid"), [(0.75, True), (0.45, False)])
+def test_most_of_the_points_close_by_must_be_on_the_body(share: float, valid: bool) -> None:
+    points = measure(0.001, seed=0, count=24)
+    count = round(len(points) * (1.0 / share - 1.0))
+    # Between 5 and 15 cm in front of the body.
+    before = np.random.default_rng(1).uniform(0.05, 0.15, (count, 1))
+    ends = np.resize(points, (count, 3))
+    clutter = ends - before * (ends - EYE) / np.linalg.norm(ends - EYE, axis=1, keepdims=True)
+    assert register(np.concatenate([points, clutter]), X_AT, noise=0.001).valid == valid
+
+
 def test_start_may_be_fifteen_degrees_and_ten_centimetres_away() -> None:
     for seed in range(8):
         start = near(X_AT, angle=np.radians(15.0), distance=0.1, seed=seed)
