@@ -50,6 +50,7 @@ class SlowEye(Eye):
 
 def test_possible_values_are_accepted() -> None:
     check_settings(Eye(rate=50.0, pixels=np.int32(4), shift=np.float64(-1e9), window=[2, 3], names=["a", 1], timeout=3))
+    check_settings(Eye(pixels=10**400))
     check_settings(Eye(gains={"a": 0.0}, timeout=0.1, kind="", lenses=[Lens()], anything=nan, names={"a"}))
 
 
@@ -64,6 +65,7 @@ def test_possible_values_are_accepted() -> None:
         ({"rate": None}, "Eye.rate must be a number above 0 and at most 50 Hz, not None"),
         ({"rate": [9.0]}, "Eye.rate must be a number above 0 and at most 50 Hz, not [9.0]"),
         ({"pixels": 0}, "Eye.pixels must be a whole number of at least 1, not 0"),
+        ({"pixels": -(10**400)}, "Eye.pixels must be a whole number of at least 1, not -1000"),
         ({"pixels": 2.0}, "Eye.pixels must be a whole number of at least 1, not 2.0"),
         ({"share": 1.0}, "Eye.share must be a number from 0 to below 1, not 1.0"),
         ({"shift": -inf}, "Eye.shift must be a finite number in m, not -inf"),

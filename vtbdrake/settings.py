@@ -67,7 +67,7 @@ class Setting:
         if not isinstance(value, int | float):
             return True
         return (
-            (isfinite(value) or (value == value and not self.finite))
+            (isinstance(value, int) or isfinite(value) or (value == value and not self.finite))
             and (self.gt is None or value > self.gt)
             and (self.ge is None or value >= self.ge)
             and (self.lt is None or value < self.lt)
@@ -224,9 +224,11 @@ def check_value(
     if field_types(value) and not isinstance(value, type):
         check_settings(value, name=name, error=error)
         return
-    if hasattr(value, "tolist"):
-        value = value.tolist()
     types = _known(_alternatives(annotation))
+    if hasattr(value, "tolist"):
+        if not (types or limits):  # An array of data.
+            return
+        value = value.tolist()
     matches = [each for each in types if each.accepts(value)]
     entries: Iterable[tuple[Any, Any]] | None = None
     if isinstance(value, Collection) and not isinstance(value, str | bytes):

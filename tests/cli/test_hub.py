@@ -7,11 +7,13 @@ import socket
 import subprocess
 import sys
 
+import click
 import lcm
 import pytest
 
 from tests.cli.program import ROOT, error_of
-from vtbdrake.lcm.hub import HubStatistics
+from vtbdrake.cli.hub import hub
+from vtbdrake.lcm.hub import HubConfig, HubStatistics
 
 
 @contextlib.contextmanager
@@ -96,6 +98,17 @@ def test_hub_without_scenario_does_not_import_drake() -> None:
     code = "import sys, vtbdrake.cli.hub; print([name for name in sys.modules if 'pydrake' in name])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout == "[]\n"
+
+
+def test_options_have_defaults_and_ranges_of_the_configuration() -> None:
+    options = {option.name: option for option in hub.params if isinstance(option, click.Option)}
+    config = HubConfig()
+    for name in ("host", "port", "lease", "max_clients", "patience", "priority"):
+        assert options[name].default == getattr(config, name)
+    for name in ("max_message", "max_queue", "max_memory"):
+        assert options[name].default * 2**20 == getattr(config, name)
+    assert "(from 0 to 65535)" in str(options["port"].help)
+    assert "(above 0 s)" in str(options["lease"].help)
 
 
 @pytest.mark.parametrize(
