@@ -20,7 +20,7 @@ from vtbdrake.control.background_process import pack, unpack
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.slow_parts import SlowParts
-from vtbdrake.control.stepping import RESULT
+from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
@@ -105,7 +105,7 @@ def replayed(scenario, cycles, *, results):
     part = target.diagram.GetSubsystemByName("dps").GetSubsystemByName("perception")
     for n, cycle in enumerate(cycles):
         for change in cycle.changes:
-            if results and change.kind == RESULT:
+            if results and change.kind == ChangeKind.RESULT:
                 ((path, arrays),) = change.values.items()
                 assert path == PATH
                 part.deliver(context, arrays["tick"], {k: v for k, v in arrays.items() if k != "tick"})
@@ -169,7 +169,7 @@ def test_loop_does_not_wait_for_a_function_that_hangs(gate):
         # Due at 10, 30, 50, 70 and 90 ms.
         assert (real.read("missed"), real.read("valid"), real.counts.missed) == (5.0, 0.0, 5)
         assert np.array_equal(real.read("estimate"), [0.0, 0.0])
-        missing = [cycle.time for cycle in real.cycles for change in cycle.changes if change.kind == RESULT]
+        missing = [cycle.time for cycle in real.cycles for change in cycle.changes if change.kind == ChangeKind.RESULT]
         assert missing == pytest.approx([0.01, 0.03, 0.05, 0.07, 0.09])
         # 20 latencies later, another process is started; on a busy computer that one may have been replaced already.
         assert real.wait()
@@ -294,7 +294,7 @@ def test_function_of_50_ms_runs_beside_a_loop_of_1_ms():
         cycles = len(real.cycles)
         assert real.runtime.time == cycles * PERIOD and len(real.bridge.sent) == cycles
         # While it computed, the loop ran.
-        begins = [n for n, cycle in enumerate(real.cycles) if any(c.kind == RESULT for c in cycle.changes)]
+        begins = [n for n, cycle in enumerate(real.cycles) if any(c.kind == ChangeKind.RESULT for c in cycle.changes)]
         assert begins[0] > 1
     for n, state in enumerate(replayed(real.scenario, real.cycles, results=True)):
         assert not state.compare(real.states[n])
@@ -332,7 +332,7 @@ def test_images_are_sent_both_ways():
     assert np.array_equal(part.GetOutputPort("colour").Eval(own), image.data.mean(axis=(0, 1)))
     assert np.array_equal(part.GetOutputPort("mirrored").Eval(own), image.data[:, ::-1])
     ((kind, values),) = changes
-    assert kind == RESULT and {k: np.shape(v) for k, v in values["dps"].items()} == {
+    assert kind == ChangeKind.RESULT and {k: np.shape(v) for k, v in values["dps"].items()} == {
         "tick": (),
         "colour": (4,),
         "mirrored": (480, 640, 4),

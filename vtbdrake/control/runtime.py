@@ -20,7 +20,7 @@ from vtbdrake.control.guards import MOST_UNSENT, Guards
 from vtbdrake.control.pace import PaceMonitor
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
-from vtbdrake.control.stepping import RESET, Cycle, Stepped
+from vtbdrake.control.stepping import ChangeKind, Cycle, Stepped
 from vtbdrake.control.switching import (
     Continuity,
     Preparation,
@@ -548,7 +548,7 @@ class Runtime(Stepped):
         reasons = self.guards.reset(self.clock.now(), self.watched, against)
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
-        self.note_change(RESET, {})
+        self.note_change(ChangeKind.RESET, {})
 
 
 def _check_fit(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:

@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.clock import Clock, Throttle
-from vtbdrake.control.slow_worker import ERROR, LOST, RESULT, supervise
+from vtbdrake.control.slow_worker import Report, supervise
 from vtbdrake.control.statistics import Histogram
-from vtbdrake.control.stepping import RESULT as CHANGE
+from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.failures import error_text
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
@@ -152,7 +152,7 @@ class _Part:
         self._ready = False
         self._last_failure = ""
         self._log_missed = Throttle(clock)
-        self._answers: list[tuple[str, Any]] = []
+        self._answers: list[tuple[Report, Any]] = []
         name = f"the supervisor of the slow part {path}"
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
 
@@ -171,18 +171,18 @@ class _Part:
                 *(self.path, self._part.latency, reason, self.statistics.missed),
             )
 
-    def _handle(self, kind: str, content: Any) -> None:
-        self._ready = kind != LOST
-        if kind == LOST:
+    def _handle(self, kind: Report, content: Any) -> None:
+        self._ready = kind != Report.LOST
+        if kind == Report.LOST:
             self.statistics.restarts += 1
             self._fail(self._requested, content)
             self._requested = None
-        elif kind in (RESULT, ERROR):
+        elif kind in (Report.RESULT, Report.ERROR):
             tick, answer = content
             if tick == self._requested:
                 self.statistics.took.record(self._clock.now() - self._requested_at)
                 self._requested = None
-            if kind == RESULT:
+            if kind == Report.RESULT:
                 self._use(tick, answer)
             else:
                 self.statistics.errors += 1
@@ -214,7 +214,7 @@ class _Part:
     def _deliver(self, tick: int, arrays: Arrays) -> None:
         self._waiting.pop(tick, None)
         self._part.deliver(self._context, tick, arrays)
-        self._changed(CHANGE, {self.path: {"tick": tick, **arrays}})
+        self._changed(ChangeKind.RESULT, {self.path: {"tick": tick, **arrays}})
 
     def send(self) -> None:
         self._supervisor.flush()

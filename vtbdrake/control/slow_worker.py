@@ -10,12 +10,19 @@ import pickle
 import select
 import time
 import traceback
+from enum import StrEnum
 from math import inf
 
 from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 
-# The kinds of messages to the loop, which are pairs of a kind and its content.
-READY, RESULT, ERROR, LOST = "ready", "result", "error", "lost"
+
+class Report(StrEnum):
+    """The kinds of messages to the loop, which are pairs of a kind and its content."""
+
+    READY = "ready"  # for the first request
+    RESULT = "result"
+    ERROR = "error"  # raised by the function
+    LOST = "lost"  # the worker, which is replaced
 
 
 def supervise(loop: FrameConnection, function: bytes, patience: float, name: str) -> None:
@@ -34,7 +41,7 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
             reason = _forward(loop, worker, patience)
         finally:
             worker.kill()
-        loop.send((LOST, reason))
+        loop.send((Report.LOST, reason))
         # A worker that dies at its start must not be restarted all the time.
         if (pause := begin + patience - time.monotonic()) > 0.0:
             try:
@@ -67,11 +74,11 @@ def compute(supervisor: FrameConnection, function: bytes) -> None:
     """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error)."""
     evaluate = pickle.loads(function)
     evaluate.prepare()
-    supervisor.send((READY, None))
+    supervisor.send((Report.READY, None))
     while True:
         tick, arrays = supervisor.receive()
         try:
-            answer = RESULT, (tick, evaluate(arrays))
+            answer = Report.RESULT, (tick, evaluate(arrays))
         except Exception:
-            answer = ERROR, (tick, traceback.format_exc())
+            answer = Report.ERROR, (tick, traceback.format_exc())
         supervisor.send(answer)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,16 +23,24 @@ from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE, Position
 
 _log = logging.getLogger(__name__)
 
-WRITE, SWITCH, RESET, RESULT = "write", "switch", "reset", "result"
 
 _ON_GRID = 1e-6  # Of a period: a start time this close to a multiple counts as one.
+
+
+class ChangeKind(StrEnum):
+    """The kinds of changes, as logs name them."""
+
+    WRITE = "write"  # of variables
+    SWITCH = "switch"
+    RESET = "reset"  # of the guards
+    RESULT = "result"  # of a slow part
 
 
 class Change(NamedTuple):
     """A change of the stepped target before a cycle's step, other than by time and sensor values.
 
     Attributes:
-        kind: ``write`` (variables), ``switch``, ``reset`` (of the guards) or ``result`` (of a slow part).
+        kind: A `ChangeKind`; in a log of a newer version it may be another one.
         values: For ``write``, the new values by address; for ``switch``, the positions by ``sense.<signal>`` and
             ``act.<signal>``; for ``result``, one entry: path of the slow part -> ``{"tick": number of the sample (int),
             name: array, ...}``, where the arrays (any dtype and shape; none if the result is declared missing) are
@@ -264,7 +273,7 @@ class Stepped:
             if address == "time" or address.startswith((T_SENSE, T_ACT)):
                 raise ValueError(f"{address} is not written while the loop runs: switches are thrown by switch()")
         self.target.write(self._context, values)
-        self.note_change(WRITE, values)
+        self.note_change(ChangeKind.WRITE, values)
 
     def note_change(self, kind: str, values: Mapping[str, Any]) -> None:
         """Record a change of the target for the watchers; see `Change`."""

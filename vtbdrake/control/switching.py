@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.stepping import SWITCH
+from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
 from vtbdrake.testbed.switch import Position
@@ -182,7 +182,7 @@ def perform(runtime: Runtime, senses: Mapping[str, Position], acts: Mapping[str,
             runtime.guards.start(name, runtime.bridge.sensed[runtime.continuity[name][0]].value)
             runtime.uncompared.add(name)
     runtime.note_change(
-        SWITCH,
+        ChangeKind.SWITCH,
         {f"sense.{name}": position.value for name, position in senses.items()}
         | {f"act.{name}": position.value for name, position in acts.items()},
     )

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.control.stepping import RESET, RESULT, SWITCH, WRITE, Change
+from vtbdrake.control.stepping import Change, ChangeKind
 from vtbdrake.lazy import extra_module
 from vtbdrake.recording.log_reader import ControlLog
 from vtbdrake.state.archive import whole_file
@@ -175,7 +175,7 @@ def _initial(log: ControlLog) -> Iterator[tuple[int, str, str, Mapping[str, Any]
     if log.header.positions:
         positions = {f"{side}.{name}": at for side, by in log.header.positions.items() for name, at in by.items()}
         yield 0, "/switches", "vtbdrake.Switches", {"time": time, "positions": positions}
-    changed = {address for _, change in log.changes if change.kind == WRITE for address in change.values}
+    changed = {address for _, change in log.changes if change.kind == ChangeKind.WRITE for address in change.values}
     for address in sorted(changed & log.start.values.keys()):
         value = _json_rows(np.reshape(log.start[address], (1, -1)))[0]
         yield 0, f"/variable/{address}", "vtbdrake.Value", {"time": time, "value": value}
@@ -188,15 +188,15 @@ def _changes(log: ControlLog) -> Iterator[tuple[int, str, str, Mapping[str, Any]
 
 
 def _change_messages(change: Change) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    if change.kind == SWITCH:
+    if change.kind == ChangeKind.SWITCH:
         yield "/switches", "vtbdrake.Switches", {"positions": dict(change.values)}
-    elif change.kind == WRITE:
+    elif change.kind == ChangeKind.WRITE:
         for address, value in change.values.items():
             row = _json_rows(np.reshape(np.asarray(value, dtype=float), (1, -1)))[0]
             yield f"/variable/{address}", "vtbdrake.Value", {"value": row}
-    elif change.kind == RESET:
+    elif change.kind == ChangeKind.RESET:
         yield "/reset", "vtbdrake.Reset", {}
-    elif change.kind == RESULT:
+    elif change.kind == ChangeKind.RESULT:
         for path, result in change.values.items():
             message = {"tick": int(result["tick"]), "missing": len(result) == 1}
             yield f"/result/{path}", "vtbdrake.Result", message

@@ -16,11 +16,8 @@ from pydrake.systems.primitives import Demultiplexer, TrajectorySource, VectorLo
 from pydrake.trajectories import DiscreteTimeTrajectory
 
 from vtbdrake.control.stepping import (
-    RESET,
-    RESULT,
-    SWITCH,
-    WRITE,
     Change,
+    ChangeKind,
     RealPorts,
     numeric_parameters,
     time_after,
@@ -192,10 +189,12 @@ class _Replay:
         self._readers = {address: target.reader(address) for address in record}
         self._decoders = _abstract_decoders(log, target)
         self._handlers: dict[str, Callable[[Mapping[str, Any]], None]] = {
-            WRITE: self._write,
-            SWITCH: self._switch,
-            RESET: lambda values: None,  # The guards are not replayed: the sent actuator commands are in the log.
-            RESULT: self._deliver,
+            ChangeKind.WRITE: self._write,
+            ChangeKind.SWITCH: self._switch,
+            ChangeKind.RESET: lambda values: (
+                None
+            ),  # The guards are not replayed: the sent actuator commands are in the log.
+            ChangeKind.RESULT: self._deliver,
         }
         self.count = n = int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)
         self.ended = f"the replay ends where the log lacks {log.gaps[0]}" if log.gaps else ""
@@ -393,7 +392,7 @@ def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> 
 
 def _check_fed_by_machine(log: ControlLog) -> None:
     positions = {f"sense.{name}": position for name, position in log.header.positions["sense"].items()}
-    switched = [change.values for _, change in log.changes if change.kind == SWITCH]
+    switched = [change.values for _, change in log.changes if change.kind == ChangeKind.SWITCH]
     for values in (positions, *switched):
         simulated = [
             name for name, position in values.items() if name.startswith("sense.") and position != Position.REAL
@@ -515,7 +514,7 @@ class _BatchReplay(_Replay):
     def run(self) -> None:
         log, header = self._log, self._log.header
         changes, digests = self._changes_by_cycle(), {i for i, _ in log.digests}
-        switched = [i for i, change in log.changes if change.kind == SWITCH]
+        switched = [i for i, change in log.changes if change.kind == ChangeKind.SWITCH]
         first = min([*switched, self.count] if self._idle else [0])
         steps = self._steps + np.arange(self.count - first + 1)
         times = times_after(steps, start=header.start_time, period=header.period)

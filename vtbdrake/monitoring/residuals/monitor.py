@@ -15,7 +15,7 @@ from vtbdrake.arrays import Array
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.stepping import SWITCH, Cycle
+from vtbdrake.control.stepping import ChangeKind, Cycle
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, CalibrationError, calibrate
 from vtbdrake.monitoring.residuals.comparison import (
@@ -160,7 +160,7 @@ class ResidualMonitor:
         """Take one cycle, as a watcher of the runtime."""
         if not self._open:
             return
-        if self._filled and any(change.kind == SWITCH for change in cycle.changes):
+        if self._filled and any(change.kind == ChangeKind.SWITCH for change in cycle.changes):
             self._begin_block()
         if self._filled == 0 and not self._sampler.fed_by_machine():
             return
