@@ -72,11 +72,7 @@ class LaserScannerConfig:
     )
     reflectivity: float = setting(0.5, "Share of the light that all surfaces reflect, diffusely.", ge=0.0, le=1.0)
     divergence: float = setting(
-        0.0,
-        "Full angle of the beam's divergence, where its intensity has fallen to 1/e^2.",
-        unit="rad",
-        ge=0.0,
-        lt=0.5,
+        0.0, "Full angle of the beam's divergence, where its intensity has fallen to 1/e^2.", unit="rad", ge=0.0, lt=0.5
     )
 
     def check(self, slice_period: float) -> None:
