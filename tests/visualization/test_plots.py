@@ -214,8 +214,10 @@ def test_two_valued_qualities_have_a_row_each() -> None:
 
 
 def test_quality_of_no_rollout_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one sample"):
-        plot_quality([])
+    without = replace(rollout(TIMES), times=np.zeros(0), quality=np.zeros(0))
+    for rollouts in ([], [rollout(TIMES), without], [without]):
+        with pytest.raises(ValueError, match="at least one sample"):
+            plot_quality(rollouts)
 
 
 def test_notebook_shows_the_figure_once() -> None:

@@ -139,6 +139,19 @@ def test_the_lean_aside_displaces_no_near_trunk(height):
         np.testing.assert_allclose(across, 0.05 * (height - 1.3), atol=0.001)
 
 
+def test_the_lean_aside_displaces_no_far_trunk():
+    """Few rows of rays: the edges tell where a trunk is that leans by 3 degrees."""
+    directions = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    left = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
+    places = EYE[:2] + 12.0 * directions
+    points, _ = Scene(places, np.full(4, 0.25), 0.05 * left).scan(EYE, rows=16)
+    trunks = detect_trunks(points, replace(EXACT, range_noise=0.02, lean=0.1), p_HoLo_H=EYE)
+    which, truth = pairs(trunks.positions, places, within=0.1)
+    assert sorted(truth) == [0, 1, 2, 3]
+    across = np.sum((trunks.positions[which] - places[truth]) * left[truth], axis=1)
+    assert np.abs(across).max() < 0.005
+
+
 @pytest.mark.parametrize(("bushes", "recall", "precision"), [(0, 0.95, 0.99), (100, 0.93, 0.97)])
 def test_stands_on_uneven_ground(bushes, recall, precision):
     shown = found = claimed = right = 0
