@@ -191,9 +191,8 @@ class _Replay:
         self._handlers: dict[str, Callable[[Mapping[str, Any]], None]] = {
             ChangeKind.WRITE: self._write,
             ChangeKind.SWITCH: self._switch,
-            ChangeKind.RESET: lambda values: (
-                None
-            ),  # The guards are not replayed: the sent actuator commands are in the log.
+            # The guards are not replayed: the sent actuator commands are in the log.
+            ChangeKind.RESET: lambda values: None,
             ChangeKind.RESULT: self._deliver,
         }
         self.count = n = int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)
