@@ -1,1 +1,1 @@
-"""A planetary plain with rocks, on which the carrier of the forest localizes itself."""
+"""A rock-strewn plain of Mars, on which the carrier of the forest localizes itself: its rocks, and the testbed."""

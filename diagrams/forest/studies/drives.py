@@ -39,9 +39,10 @@ from vtbdrake.components.localization.planar import wrap
 from vtbdrake.components.localization.unit import LOST, TRACKING, LocalizationUnit
 from vtbdrake_diagrams.forest.dps import PERIOD
 from vtbdrake_diagrams.forest.perception import SETTLED
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, dead_reckoned
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
+from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 INDEPENDENT = 100.0
 """Estimates count as independent if they are at least this far apart along the path, in m."""

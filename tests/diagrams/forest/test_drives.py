@@ -9,7 +9,7 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.unit import LOST, SEARCHING, TRACKING
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.studies.drives import (
     GOALS,
     SOURCES,
@@ -27,6 +27,7 @@ from vtbdrake_diagrams.forest.studies.drives import (
     simulated_drive,
 )
 from vtbdrake_diagrams.forest.world.stand import Stand
+from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 pytestmark = pytest.mark.one_python
 

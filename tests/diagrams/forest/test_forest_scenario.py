@@ -25,7 +25,7 @@ from vtbdrake.components.world_model import (
 )
 from vtbdrake.scan import Scan
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.world.geometry import add_ground, add_surface
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.stand import Stand
@@ -37,6 +37,7 @@ from vtbdrake_diagrams.forest.world.vegetation import (
     trunks,
     undergrowth,
 )
+from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 GROUND = Ground(seed=6)
 AT_REST = SpatialVelocity(np.zeros(3), np.zeros(3))

@@ -42,8 +42,9 @@ from vtbdrake.visualization import make_meshcat
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD
 from vtbdrake_diagrams.forest.perception import Localizer
 from vtbdrake_diagrams.forest.pictures.display import STATUS, WATCHED, DriverDisplay, main, status_text
-from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario, PlainScenario
+from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.world.carrier import Carrier
+from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 POSE, LOCALIZER = "dps.env.pose", "dps.env.localizer"
 CYCLES = 200

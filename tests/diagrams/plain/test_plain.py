@@ -8,10 +8,10 @@ from scipy.spatial.distance import pdist, squareform
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.testbed import ScenarioError
-from vtbdrake_diagrams.forest.scenario import PlainScenario
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.stand import ACCURATE, REMOTE
 from vtbdrake_diagrams.plain.rocks import RockField, rock_surface
+from vtbdrake_diagrams.plain.scenario import PlainScenario
 
 pytestmark = pytest.mark.one_python
 

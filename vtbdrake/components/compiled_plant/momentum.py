@@ -68,13 +68,13 @@ class MomentumModel(PlantDynamics):
         self.joints = tuple(names)
         self.damping = np.array([joint.GetDampingVector(context)[0] for joint in joints])
         self._q, self._v = ([at(joint) for joint in joints] for at in (Joint.position_start, Joint.velocity_start))
-        self._held = np.array(plant.GetPositions(context))
+        self._default_positions = np.array(plant.GetPositions(context))
         base = self._links[0]
         self._base = base.v
         everything = (plant.get_joint(index) for index in plant.GetJointIndices())
         (self.base,) = (joint.child_body().name() for joint in everything if joint.type_name() == FLOATING)
         # The base frame is that of its joint, and its axes are those of B0.
-        self._held[base.q] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        self._default_positions[base.q] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
     def _check_tree(self, plant: MultibodyPlant) -> None:
         """Refuse what is not one free-floating tree without gravity."""
@@ -180,7 +180,7 @@ class MomentumModel(PlantDynamics):
     # -- parts
 
     def _positions(self, q: Expression) -> Expression:
-        positions = casadi.SX(casadi.DM(self._held))
+        positions = casadi.SX(casadi.DM(self._default_positions))
         positions[self._q] = q
         return positions
 
