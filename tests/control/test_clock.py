@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from vtbdrake.control.clock import Clock, SimulatedClock, WallClock
+from vtbdrake.control.clock import Clock, SimulatedClock, Throttle, WallClock
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -167,3 +167,12 @@ def test_simulated_time_cannot_run_backwards(seconds: float) -> None:
 def test_simulated_clock_is_never_early() -> None:
     with pytest.raises(ValueError, match="not be negative"):
         SimulatedClock(lateness=[-0.1]).wait_until(1.0)
+
+
+def test_throttle_calls_at_once_and_then_once_per_period() -> None:
+    clock, calls = SimulatedClock(start=5.0), []
+    throttle = Throttle(clock, period=0.5)
+    for _ in range(40):
+        throttle(calls.append, clock.now())
+        clock.advance(0.125)
+    assert calls == [5.0 + 0.5 * k for k in range(10)]
