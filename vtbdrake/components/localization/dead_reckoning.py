@@ -272,10 +272,10 @@ class DeadReckoning(AddressedSystem):
         is_first, at_rest = counts.samples == 1.0, counts.samples_at_rest * T > _SETTLING_TIME
         if at_rest:
             up = _direction(gravity)
-            gain = vertical / max(vertical + gyro_noise**2, _TINY)
-            excess = gain * sum((rate - b) * e for rate, b, e in zip(sample, bias, up, strict=False))
+            K = vertical / max(vertical + gyro_noise**2, _TINY)
+            excess = K * sum((rate - b) * e for rate, b, e in zip(sample, bias, up, strict=False))
             bias = [b + excess * e for b, e in zip(bias, up, strict=True)]
-            vertical *= 1.0 - gain
+            vertical *= 1.0 - K
         w = [rate - b for rate, b in zip(sample, bias, strict=False)]
         velocity = [0.0, 0.0] if counts.samples_at_rest else [sample[6], -settings.axle * w[2]]
         if is_first:
@@ -290,12 +290,12 @@ class DeadReckoning(AddressedSystem):
         tilt += T * (2.0 * both + T * level) + (gyro_noise * T) ** 2
         both += T * level
         level += bias_drift**2 * T
-        spread = max(tilt + settings.sway**2 / square, _TINY)
-        gain, learned = tilt / spread, both / spread
-        bias = [b + learned * e / square for b, e in zip(bias, _cross(gravity, a), strict=True)]
-        gravity = [e + gain * (b - e) for e, b in zip(gravity, a, strict=True)]
+        S = max(tilt + settings.sway**2 / square, _TINY)
+        K, K_bias = tilt / S, both / S
+        bias = [b + K_bias * e / square for b, e in zip(bias, _cross(gravity, a), strict=True)]
+        gravity = [e + K * (b - e) for e, b in zip(gravity, a, strict=True)]
         levelling.gravity, levelling.velocity, levelling.gyro_bias = gravity, velocity, bias
-        variances.levelling_covariance = ((1.0 - gain) * tilt, (1.0 - gain) * both, level - learned * both)
+        variances.levelling_covariance = ((1.0 - K) * tilt, (1.0 - K) * both, level - K_bias * both)
         variances.vertical_bias_variance = vertical
         return _direction(gravity), w
 
