@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 
 # How far the length of a direction may be from 1: messages carry directions as 32-bit numbers.
 _TOLERANCE = 1e-5
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Scan:
     """The n returns of one scan, in the scanner's frame L at each ray's own firing time.
 
@@ -40,7 +37,7 @@ class Scan:
     def __post_init__(self) -> None:
         n = np.size(self.ranges)
         for name, shape in (("directions_L", (n, 3)), ("ranges", (n,)), ("times", (n,))):
-            object.__setattr__(self, name, _own(name, getattr(self, name), shape))
+            _check(name, getattr(self, name), shape)
         object.__setattr__(self, "stamp", float(self.stamp))
         if not np.isfinite(self.stamp):
             raise ValueError(f"the stamp of a scan is a finite time in seconds, not {self.stamp}")
@@ -66,16 +63,9 @@ class Scan:
     def __repr__(self) -> str:
         return f"Scan({len(self.ranges)} returns, complete at {self.stamp:g} s)"
 
-    def __deepcopy__(self, memo: object) -> Scan:
-        return self
 
-
-def _own(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return the values as a read-only array that nobody else can change."""
-    array = np.array(values, dtype=float)
+def _check(name: str, array: Array, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise ValueError(f"{name} of a scan with {shape[0]} ranges has the shape {shape}, not {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} of a scan are finite numbers; leave rays without a return out")
-    array.flags.writeable = False
-    return array

@@ -21,7 +21,7 @@ def codec_of(model: Any, *, varying: bool = False) -> Codec:
     """Return the codec for values like ``model``, exact to the last bit.
 
     There are codecs for arrays, numbers, texts, poses, rotations, Drake's images and point clouds, and for dataclasses
-    whose fields are arrays and numbers: these become one array per field, by its name.
+    of arrays, numbers and such dataclasses: these become one array per field, by its name, such as ``track.mean``.
 
     Args:
         model: A value of the type to encode.
@@ -139,23 +139,35 @@ def _cloud_codec(model: Any) -> Codec:
 
 def _dataclass_codec(model: Any) -> Codec:
     kind = type(model)
-    parts = {field.name: _part(kind, field.name, getattr(model, field.name)) for field in fields(model)}
+    parts: dict[str, Codec] = {
+        field.name: _part(kind, field.name, getattr(model, field.name)) for field in fields(model)
+    }
 
     def encode(value: Any) -> dict[str, np.ndarray]:
-        return {name: np.asarray(getattr(value, name)) for name in parts}
+        return {
+            f"{name}.{part}" if part else name: array
+            for name, codec in parts.items()
+            for part, array in codec.encode(getattr(value, name)).items()
+        }
 
     def decode(arrays: Mapping[str, np.ndarray]) -> Any:
-        return kind(**{name: restore(arrays[name]) for name, restore in parts.items()})
+        arrays_by_field: dict[str, dict[str, np.ndarray]] = {name: {} for name in parts}
+        for key, array in arrays.items():
+            name, _, part = key.partition(".")
+            arrays_by_field.setdefault(name, {})[part] = array
+        return kind(**{name: codec.decode(arrays_by_field[name]) for name, codec in parts.items()})
 
     return Codec(encode, decode)
 
 
-def _part(owner: type, name: str, value: Any) -> Callable[[np.ndarray], Any]:
+def _part(owner: type, name: str, value: Any) -> Codec:
     if isinstance(value, np.ndarray):
-        return np.asarray
+        return Codec(lambda value: {"": np.asarray(value)}, lambda arrays: np.asarray(arrays[""]))
     if isinstance(value, bool | int | float):
         number = type(value)
-        return lambda array: number(array.item())
+        return Codec(lambda value: {"": np.asarray(value)}, lambda arrays: number(arrays[""].item()))
+    if is_dataclass(value) and not isinstance(value, type):
+        return _dataclass_codec(value)
     raise ValueError(
         f"there is no codec for a {owner.__name__}: its field {name} is neither an array nor a number, but a "
         f"{type(value).__name__}; give a Codec"

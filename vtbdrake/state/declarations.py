@@ -149,13 +149,16 @@ def _accessor(start: int, shape: tuple[int, ...]) -> property:
     def get_vector(view: NamedView) -> np.ndarray:
         return view._array[entries]
 
+    def set_vector(view: NamedView, value: ArrayLike) -> None:
+        view._array[entries] = value
+
     def get_array(view: NamedView) -> np.ndarray:
         return view._array[entries].reshape(shape)
 
-    def set_entries(view: NamedView, value: ArrayLike) -> None:
+    def set_array(view: NamedView, value: ArrayLike) -> None:
         view._array[entries].reshape(shape)[...] = value
 
-    return property(get_vector if len(shape) == 1 else get_array, set_entries)
+    return property(get_vector, set_vector) if len(shape) == 1 else property(get_array, set_array)
 
 
 class _Group:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, InputPort, State
 
+from vtbdrake.arrays import immutable
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.declarations import weakly
@@ -160,7 +161,7 @@ class Work:
     arrays: Arrays
 
 
-@dataclass(frozen=True)
+@immutable
 class Progress:
     """The samples, results and memory of a slow part: immutable, and so shared by all copies of a context.
 
@@ -173,9 +174,6 @@ class Progress:
     shown: Arrays
     memory: Arrays
     under_way: tuple[Work, ...] = ()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Progress:
-        return self
 
     def find(self, tick: int) -> Work | None:
         """Return the work on sample number ``tick``, or None if it is not under way."""

@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
 from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
@@ -77,7 +77,7 @@ _FACTOR, _LEAST_AREA = 1e6, 1e4
 _LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 5.0, 0.5, 0.6
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Fix:
     """The result of matching local landmarks with a map: a pose of the carrier on it. Immutable.
 
@@ -98,13 +98,6 @@ class Fix:
     margin: float
     fit: float
     pairs: Indices
-
-    def __post_init__(self) -> None:
-        for array in (self.pose, self.covariance, self.pairs):
-            array.flags.writeable = False
-
-    def __deepcopy__(self, memo: object) -> Fix:
-        return self
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.localization.planar import rotation, transform
 from vtbdrake.components.world_model import WorldModel
 
@@ -20,7 +20,7 @@ DIAMETERS = {"tree": "trunk_diameter", "rock": "width"}
 _LARGEST_DIAMETER = 20.0
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Landmarks:
     """n upright landmarks, seen from above, in one frame. Immutable: the arrays are read-only.
 
@@ -41,16 +41,14 @@ class Landmarks:
     diameter_deviations: Array
 
     def __post_init__(self) -> None:
-        n = len(np.asarray(self.positions))
+        n = len(self.positions)
         shapes = {"positions": (n, 2), "covariances": (n, 2, 2), "diameters": (n,), "diameter_deviations": (n,)}
         for name, shape in shapes.items():
-            array = np.array(getattr(self, name), dtype=float)
+            array = getattr(self, name)
             if array.shape != shape:
                 raise ValueError(f"{name} of {n} landmarks have the shape {shape}, not {array.shape}")
             if np.isnan(array).any() or (name != "diameter_deviations" and np.isinf(array).any()):
                 raise ValueError(f"{name} of landmarks are finite numbers: leave out those of which nothing is known")
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)
         if (self.diameter_deviations < 0.0).any() or (variances < 0.0).any():
             raise ValueError("standard deviations and variances of landmarks are at least 0")
@@ -68,9 +66,6 @@ class Landmarks:
 
     def __len__(self) -> int:
         return len(self.diameters)
-
-    def __deepcopy__(self, memo: object) -> Landmarks:
-        return self
 
     def select(self, rows: ArrayLike) -> Landmarks:
         """Return the landmarks with these indices, or those for which a mask (n,) is true."""

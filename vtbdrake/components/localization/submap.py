@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.estimation import (
     chi_square_quantile,
     kalman_update,
@@ -28,7 +28,7 @@ _CHANCES = 3
 _IN_VIEW = 0.7
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Submap:
     """Landmarks detected so far, relative to the carrier. Immutable, with read-only arrays.
 
@@ -57,21 +57,11 @@ class Submap:
     chances: Array
     last: Array
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                array = np.array(value, dtype=float)
-                array.flags.writeable = False
-                object.__setattr__(self, name, array)
-
     @classmethod
     def empty(cls, X_OH: ArrayLike = (0.0, 0.0, 0.0)) -> Submap:
         """Return a map without landmarks that begins at a pose (3,)."""
         none = np.zeros(0)
         return cls(np.asarray(X_OH), 0.0, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none, none, none, none)
-
-    def __deepcopy__(self, memo: object) -> Submap:
-        return self
 
     def __len__(self) -> int:
         return len(self.diameters)

@@ -5,13 +5,13 @@ x = [X_WH; b; e; g; l_1; ...; l_n], see `vtbdrake.components.localization.tracki
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 
 Indices = NDArray[np.int64]
 
@@ -21,7 +21,7 @@ FIXED = 6
 """The place of the first landmark in x."""
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class TrackState:
     """The memory of a `Tracker`: an immutable value with read-only arrays.
 
@@ -47,21 +47,10 @@ class TrackState:
     distortion: float = 0.0
     drift: float = 1.0
 
-    def __post_init__(self) -> None:
-        for name in ("mean", "covariance", "indices", "is_recent"):
-            array = getattr(self, name)
-            if not isinstance(array, np.ndarray) or array.flags.writeable:
-                array = np.array(array)
-                array.flags.writeable = False
-            object.__setattr__(self, name, array)
-
     @classmethod
     def none(cls) -> TrackState:
         """Return the state in which nothing is tracked."""
         return cls(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool))
-
-    def __deepcopy__(self, memo: object) -> TrackState:
-        return self
 
     def with_arrays(self, **arrays: Any) -> TrackState:
         """Return the state with other arrays, which are not copied and are read-only from now on."""

@@ -14,7 +14,7 @@ from math import inf, isfinite, nan
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -36,7 +36,7 @@ _LARGEST = 1e9
 _FEWEST = 4
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Localization:
     """The answer of a `LocalizationUnit` to one scan: the pose of the carrier.
 
@@ -62,12 +62,6 @@ class Localization:
     nis: float = 0.0
     range_bias: float = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("X_OH", "pose", "covariance"):
-            array = np.array(getattr(self, name), dtype=float)
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
-
     @classmethod
     def unknown(
         cls, status: int = SEARCHING, *, time: float = -inf, X_OH: ArrayLike = (0.0, 0.0, 0.0), detected: int = 0
@@ -75,11 +69,8 @@ class Localization:
         """Return an answer without a pose."""
         return cls(time, np.asarray(X_OH), np.full(3, nan), np.diag(np.full(3, inf)), status, detected)
 
-    def __deepcopy__(self, memo: object) -> Localization:
-        return self
 
-
-@dataclass(frozen=True, eq=False)
+@immutable
 class UnitState:
     """The memory of a `LocalizationUnit`, an immutable value; `UNIT_STATE_CODEC` converts it to arrays.
 
@@ -98,9 +89,6 @@ class UnitState:
     tried_at: Array = field(default_factory=lambda: np.array([-inf, -inf]))
     ignored: int = 0
     losses: int = 0
-
-    def __deepcopy__(self, memo: object) -> UnitState:
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,30 +199,17 @@ class LocalizationUnit:
         )
 
 
-_PARTS = {
-    "answer": codec_of(Localization.unknown()),
-    "track": codec_of(TrackState.none()),
-    "submap": codec_of(Submap.empty()),
-    "tried_at": codec_of(np.zeros(2)),
-    "ignored": codec_of(0),
-    "losses": codec_of(0),
-}
+_CODEC = codec_of(UnitState())
 
 
+# In files, the names of the arrays of the state's own fields end with a dot: ``tried_at.`` beside ``track.mean``.
 def _encode(state: UnitState) -> dict[str, np.ndarray]:
-    return {
-        f"{name}.{part}": array
-        for name, codec in _PARTS.items()
-        for part, array in codec.encode(getattr(state, name)).items()
-    }
+    return {name if "." in name else f"{name}.": array for name, array in _CODEC.encode(state).items()}
 
 
 def _decode(arrays: Mapping[str, np.ndarray]) -> UnitState:
-    groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _PARTS}
-    for key, array in arrays.items():
-        name, _, part = key.partition(".")
-        groups[name][part] = array
-    return UnitState(**{name: codec.decode(groups[name]) for name, codec in _PARTS.items()})
+    state: UnitState = _CODEC.decode({name.removesuffix("."): array for name, array in arrays.items()})
+    return state
 
 
 UNIT_STATE_CODEC = Codec(_encode, _decode)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf, sin, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class PoseEstimate:
     """An estimate of the pose X_AB of a frame B in a frame A, or the statement that there is none.
 
@@ -36,11 +34,8 @@ class PoseEstimate:
 
     def __post_init__(self) -> None:
         for name, shape in (("matrix", (3, 4)), ("covariance", (6, 6))):
-            array = np.array(getattr(self, name), dtype=float)
-            if array.shape != shape:
-                raise ValueError(f"the {name} of a PoseEstimate has the shape {shape}, not {array.shape}")
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"the {name} of a PoseEstimate has the shape {shape}, not {getattr(self, name).shape}")
 
     @staticmethod
     def of(X_AB: RigidTransform, covariance: ArrayLike, *, time: float) -> PoseEstimate:
@@ -68,9 +63,6 @@ class PoseEstimate:
             return self
         turn = np.kron(np.eye(2), X_WA.rotation().matrix())
         return PoseEstimate.of(X_WA @ self.X, turn @ self.covariance @ turn.T, time=self.time)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> PoseEstimate:
-        return self
 
 
 def cross_matrix(v: ArrayLike) -> Array:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable, set_read_only
 from vtbdrake.components.perception.estimate import (
     PoseEstimate,
     cross_matrix,
@@ -40,7 +40,7 @@ _CELL_PIXELS = 8  # In the texture.
 _PROPERTY = ("markers", "size")
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class MarkerBoard:
     """The positions of the markers on a rigid body T.
 
@@ -60,17 +60,14 @@ class MarkerBoard:
     corners: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        ids, poses = np.array(self.ids, dtype=np.int64), np.array(self.poses, dtype=float)
+        ids, poses = np.array(self.ids, dtype=np.int64), self.poses
         if ids.ndim != 1 or not len(ids) or poses.shape != (len(ids), 3, 4):
             raise ValueError(f"a MarkerBoard has ids (n,) and poses (n, 3, 4), not {ids.shape} and {poses.shape}")
         if len(set(ids.tolist())) < len(ids) or ids.min() < 0 or ids.max() >= FAMILY_SIZE:
             raise ValueError(f"the ids of markers differ and lie in 0 to {FAMILY_SIZE - 1}; found {ids.tolist()}")
         if not 0.0 < self.size < np.inf:
             raise ValueError(f"the size of markers is a positive length in m, not {self.size}")
-        corners = _on(poses, self.size)
-        for name, array in (("ids", ids), ("poses", poses), ("corners", corners)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        set_read_only(self, ids=ids, corners=_on(poses, self.size))
 
     @staticmethod
     def of(poses: Mapping[int, RigidTransform], *, size: float) -> MarkerBoard:
@@ -83,9 +80,6 @@ class MarkerBoard:
         """Return the place of each id on this board, -1 for those that it does not have."""
         match = np.asarray(ids)[:, None] == self.ids
         return np.where(match.any(axis=1), match.argmax(axis=1), -1)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> MarkerBoard:
-        return self
 
 
 def _on(poses: Array, size: float) -> Array:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.settings import check_settings, setting
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class Faces:
     """The surface of a rigid body T as m rectangles.
 
@@ -29,14 +28,11 @@ class Faces:
     half_sizes: Array
 
     def __post_init__(self) -> None:
-        poses, half_sizes = np.array(self.poses, dtype=float), np.array(self.half_sizes, dtype=float)
+        poses, half_sizes = self.poses, self.half_sizes
         if poses.ndim != 3 or poses.shape[1:] != (3, 4) or half_sizes.shape != (len(poses), 2) or not len(poses):
             raise ValueError(f"Faces have poses (m, 3, 4) and half_sizes (m, 2), not {poses.shape}, {half_sizes.shape}")
         if not (half_sizes > 0.0).all():
             raise ValueError(f"the edges of faces have positive lengths, not {half_sizes.min()}")
-        for name, array in (("poses", poses), ("half_sizes", half_sizes)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
 
     @staticmethod
     def of_boxes(boxes: Iterable[tuple[RigidTransform, ArrayLike]]) -> Faces:
@@ -121,9 +117,6 @@ class Faces:
                     edges.append((pose[:, 3], pose[:, k], offset, s / 12.0**0.5))
         centres, directions, offsets, deviations = zip(*edges, strict=True) if edges else ((), (), (), ())
         return np.reshape(centres, (-1, 3)), np.reshape(directions, (-1, 3)), np.array(offsets), np.array(deviations)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Faces:
-        return self
 
 
 def deskew(points: ArrayLike, times: ArrayLike, *, origin: ArrayLike, velocity: ArrayLike, rate: ArrayLike) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
+from vtbdrake.arrays import immutable
 from vtbdrake.components.environment.haze import HAZE, hazed
 from vtbdrake.components.environment.light import LIGHT
 from vtbdrake.components.rendering import (
@@ -51,18 +51,12 @@ _PIXEL_CHANNEL, _DROPOUT_CHANNEL = 0, 2
 _BRACKET = (4.0, 16.0, 64.0)
 
 
-@dataclass(frozen=True, eq=False)
+@immutable
 class ImagesInTransit:
     """The images that a camera has taken and not shown yet, newest first, read-only."""
 
     color: NDArray[np.uint8]  # shape (n, h, w, 4)
     depth: NDArray[np.float32]  # shape (n, h, w); without a depth image (n, 0, 0)
-
-    def __deepcopy__(self, memo: object) -> ImagesInTransit:
-        return self
-
-    def __post_init__(self) -> None:
-        self.color.flags.writeable = self.depth.flags.writeable = False
 
 
 class Camera(AddressedSystem):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.arrays import immutable
 from vtbdrake.components.sensors.noise import normal_noise, random_stream, uniform_noise
 from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
@@ -63,7 +64,7 @@ class ErrorModel:
         return replace(self, noise=0.0, drift=0.0, dropout=0.0, outlier_probability=0.0)
 
 
-@dataclass(frozen=True)
+@immutable
 class _Settings:
     """The parameters of an `ErrorStage`, as they are used. None: there is no such error."""
 
@@ -79,10 +80,6 @@ class _Settings:
     dropout: float = 0.0
     outlier_probability: float = 0.0
     outlier_size: float = 0.0
-
-    def __deepcopy__(self, memo: object) -> _Settings:
-        # Clones of a Context share it.
-        return self
 
 
 def _unless_zero(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -201,10 +198,10 @@ class ErrorStage:
         key: Mapping[str, int],
     ) -> NDArray[np.float64]:
         n, q = self._n, settings.quantization
-        memory = self._memory.view(context)
+        memory = self._memory.mutable(state)
         walk = memory.walk
         if settings.drift is not None:
-            walk = walk + settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
+            walk += settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
         if settings.outlier_probability and (
             uniform_noise(channel=_OUTLIER_CHANNEL, **key) < settings.outlier_probability
         ):
@@ -216,14 +213,12 @@ class ErrorStage:
         if q is not None:
             steps = np.where(q > 0.0, q, 1.0)
             y = np.where(q > 0.0, np.round(y / steps) * steps, y)
-        newest = y
-        if settings.latency:
-            y = memory.in_transit[settings.latency - 1]
+        if self._longest:
+            in_transit, newest = memory.in_transit, y
+            if settings.latency:
+                y = in_transit[settings.latency - 1].copy()
+            in_transit[1:] = in_transit[:-1]
+            in_transit[0] = newest
         if settings.dropout and uniform_noise(channel=_DROPOUT_CHANNEL, **key) < settings.dropout:
             y = context.get_discrete_state(self._output).value()
-        if self._longest or settings.drift is not None:
-            following = self._memory.mutable(state)
-            following.walk = walk
-            if self._longest:
-                following.in_transit = np.concatenate((newest[np.newaxis], memory.in_transit[:-1]))
         return y

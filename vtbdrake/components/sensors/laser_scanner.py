@@ -20,7 +20,7 @@ from pydrake.systems.framework import (
     State,
 )
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
@@ -100,7 +100,7 @@ class LaserScannerConfig:
 _FIELDS = tuple(field.name for field in fields(LaserScannerConfig))
 
 
-@dataclass(frozen=True)
+@immutable
 class _Settings:
     """The parameters as they are used."""
 
@@ -108,18 +108,12 @@ class _Settings:
     config: LaserScannerConfig
     errors: ErrorModel
 
-    def __deepcopy__(self, memo: object) -> _Settings:
-        return self
 
-
-@dataclass(frozen=True)
+@immutable
 class ScanInProgress:
     """The returns of the present scan so far, by slice: arrays of direction (3), range (m) and time since its start."""
 
     slices: tuple[Array, ...] = ()
-
-    def __deepcopy__(self, memo: object) -> ScanInProgress:
-        return self
 
     def returns(self) -> Array:
         """Return all returns so far, shape (n, 5)."""
