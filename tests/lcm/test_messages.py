@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vtbdrake.lcm.maps import Field
@@ -137,6 +137,20 @@ def test_only_bytes_are_decoded() -> None:
 @pytest.mark.parametrize("code", EVERY)
 @settings(max_examples=100)
 @given(entries=st.lists(st.floats(-1e40, 1e40) | st.floats(-200.0, 200.0) | st.floats(), min_size=2, max_size=2))
+# The ends of the integers' ranges, and what lies next to them.
+@example(entries=[-(2.0**63), 2.0**63 - 1024.0])
+@example(entries=[0.0, 2.0**63])
+@example(entries=[1.5 * 2.0**63, 0.0])
+@example(entries=[0.0, -(2.0**63) - 2048.0])
+@example(entries=[-(2.0**31), 2.0**31 - 1.0])
+@example(entries=[2.0**31, 0.0])
+@example(entries=[0.0, -(2.0**31) - 1.0])
+@example(entries=[-(2.0**15), 2.0**15 - 1.0])
+@example(entries=[2.0**15, 0.0])
+@example(entries=[0.0, -(2.0**15) - 1.0])
+@example(entries=[-(2.0**7), 2.0**7 - 1.0])
+@example(entries=[2.0**7, 0.0])
+@example(entries=[0.0, -(2.0**7) - 1.0])
 def test_numbers_are_encoded_as_struct_writes_them(code: str, entries: list[float]) -> None:
     layout = [Field("utime", "int64_t"), Field("b", TYPES[code]), Field("a", TYPES[code])]
     encoder = MessageEncoder(HEAD, layout, {"a": ["a", "b"]}, "utime", example=message(code, [0, 0]))
