@@ -193,6 +193,12 @@ def test_bias_across_the_vertical_is_learned_on_the_way():
     np.testing.assert_allclose([roll, pitch], drive.angles[548 * 20, :2], atol=2e-3)
 
 
+def test_turning_on_the_spot_is_no_bias():
+    samples = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 0.0], (751, 1))
+    samples[251:, 2] = 0.1  # rad/s about the vertical, from 5 to 15 s
+    assert motion_of(samples)[5] == pytest.approx(1.0, abs=5e-3)
+
+
 def test_settling_on_the_springs_is_no_bias():
     """A roll of 20 mrad fades at 6 mrad/s while the carrier stands still."""
     times = T * np.arange(100)
