@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.measure import Benchmark
 from vtbdrake.cli.output import number, table
-from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
+from vtbdrake_diagrams.tables import Crash, Registry, run, selected_names, write_json
 
 # Name -> function () -> Benchmark or list of them; the first bears the name, the others are printed beside it.
 BENCHMARKS: Registry = {
@@ -67,7 +67,7 @@ def benchmark_all(
         ValueError: A name is unknown.
     """
     results: list[Benchmark | Crash] = []
-    for name in chosen(registry, only):
+    for name in selected_names(registry, only):
         begin = time.monotonic()
         outcome = run(registry, name)
         echo(f"{name}: measured in {time.monotonic() - begin:.0f} s")

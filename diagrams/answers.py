@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from vtbdrake.cli.output import number, table
-from vtbdrake_diagrams.tables import Crash, Registry, chosen, run, write_json
+from vtbdrake_diagrams.tables import Crash, Registry, run, selected_names, write_json
 
 # Application -> payload(full) -> Answer
 APPLICATIONS: Registry = {
@@ -80,7 +80,7 @@ def answer_all(
         ValueError: A name is unknown.
     """
     answers: list[Answer | Crash] = []
-    for name in chosen(registry, only):
+    for name in selected_names(registry, only):
         echo(f"{name} ...")
         begin = time.perf_counter()
         answer = run(registry, name, full)

@@ -32,7 +32,7 @@ class Crash:
         return error_text(self.error)
 
 
-def chosen(registry: Registry, only: Sequence[str]) -> list[str]:
+def selected_names(registry: Registry, only: Sequence[str]) -> list[str]:
     """Return the names to run, in the order of the registry; all of them if ``only`` is empty.
 
     Raises:
@@ -57,8 +57,8 @@ def _function(entry: str | Callable[..., Any]) -> Callable[..., Any]:
     if not isinstance(entry, str):
         return entry
     module, _, function = entry.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
-    return found
+    loaded: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return loaded
 
 
 def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -258,8 +258,8 @@ def _reset_guards(loop: Runtime) -> None:
 def _sensor_faults(loop: Runtime) -> list[str]:
     return [
         reason
-        for name, seen in loop.bridge.sensed.items()
-        for reason in loop.guards.sensor_faults(name, loop.clock.now(), seen)
+        for name, value in loop.bridge.sensed.items()
+        for reason in loop.guards.sensor_faults(name, loop.clock.now(), value)
     ]
 
 

@@ -159,13 +159,13 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
 
     ``perceived`` is the size of the state of ``env``.
     """
-    chosen = LAWS[law]
+    control_law = LAWS[law]
     z = casadi.SX.sym("measured", sum(SENSOR_SIGNALS.values()))
     q, v = z[:JOINTS], z[JOINTS : 2 * JOINTS]
-    wanted, seen = casadi.SX.sym("wanted"), casadi.SX.sym("perceived", perceived)
-    wrench = seen[:6]
+    command, environment = casadi.SX.sym("wanted"), casadi.SX.sym("perceived", perceived)
+    wrench = environment[:6]
     gains: Declared = {
-        **chosen.parameters,
+        **control_law.parameters,
         **parameters(model.arm),
         # At most from one end of the range to the other within a period.
         "torque_rate": (model.arm.torque_rates, "N m/s", (0.0, 2.0 * np.array(model.arm.torques) / period)),
@@ -177,15 +177,15 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
         "clock": (0.0, "s"),
         "start": (model.arm.home, "rad"),
         "reference": (model.arm.home, "rad"),
-        **chosen.state,
+        **control_law.state,
     }
     x = _symbols(state)
-    r = reference(wanted, q, x, p, period=period)
-    torque, remembered = chosen.torque(model, q, v, wrench, r, x, p, period)
+    r = reference(command, q, x, p, period=period)
+    torque, remembered = control_law.torque(model, q, v, wrench, r, x, p, period)
     reach = period * p["torque_rate"]
     torque = clamp(torque, x["torque"] - reach, x["torque"] + reach)
     following = {"torque": torque, **r.state, **remembered}
-    inputs = {"measured": z, "perceived": seen, "wanted": wanted}
+    inputs = {"measured": z, "perceived": environment, "wanted": command}
     return _system(
         "impl",
         following,

@@ -83,12 +83,12 @@ class Reference:
 
 
 def reference(
-    wanted: Expression, q: Expression, state: dict[str, Expression], p: dict[str, Expression], *, period: float
+    command: Expression, q: Expression, state: dict[str, Expression], p: dict[str, Expression], *, period: float
 ) -> Reference:
     """Return the reference of the motion that is under way.
 
     Args:
-        wanted: The commanded motion.
+        command: The commanded motion.
         q: The measured joint positions, shape (7,), in rad.
         state: The ``motion`` under way, its ``clock`` (s), the joint positions ``start`` where it began, and the
             ``reference`` of the law at the last instant, shape (7,).
@@ -96,13 +96,13 @@ def reference(
         period: The sample period, in seconds.
     """
     before = state["motion"]
-    follow = wanted < Motion.FOLLOW + 0.5
+    follow = command < Motion.FOLLOW + 0.5
     released = before < Motion.FOLLOW + 0.5
     away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-6
     durations = [0, away * p["home_duration"], p["swing_duration"], p["press_duration"], p["circle_duration"]]
     # The last instant of a motion, at which it has arrived, is the first of the next one.
     begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) + period / 2)
-    motion = casadi.if_else(begins, casadi.if_else(released, Motion.HOME, casadi.floor(wanted + 0.5)), before)
+    motion = casadi.if_else(begins, casadi.if_else(released, Motion.HOME, casadi.floor(command + 0.5)), before)
     motion = casadi.if_else(follow, Motion.FOLLOW, motion)
     clock = casadi.if_else(casadi.logic_or(follow, released), 0, casadi.if_else(begins, period, state["clock"]))
     at = casadi.if_else(casadi.logic_or(follow, released), q, state["reference"])

@@ -93,14 +93,14 @@ class Track:
     Attributes:
         motion: The motion under way, shape (n,).
         clock: The time since its begin, in s, (n,).
-        wanted: The reference of the tip, (n, 3), in m, in the world.
+        reference: The reference of the tip, (n, 3), in m, in the world.
         tip: The position of the tip by the measured joint positions, (n, 3), in m.
         force: The force of the environment on the tip, as the DPS perceives it, (n, 3), in N.
     """
 
     motion: NDArray[np.float64]
     clock: NDArray[np.float64]
-    wanted: NDArray[np.float64]
+    reference: NDArray[np.float64]
     tip: NDArray[np.float64]
     force: NDArray[np.float64]
 
@@ -111,20 +111,22 @@ class Track:
         positions = _positions(values, period)
         columns = [samples["impl.motion"], clock, samples["impl.start"], samples["env.joint_position"]]
         both = [positions(*row) for row in zip(*columns, strict=True)]
-        wanted, tip = (np.array([pair[k].full().ravel() for pair in both]).reshape(-1, 3) for k in range(2))
-        return cls(samples["impl.motion"], clock, wanted, tip, samples["env.contact_wrench"].reshape(-1, 6)[:, 3:])
+        reference_tip, tip = (np.array([pair[k].full().ravel() for pair in both]).reshape(-1, 3) for k in range(2))
+        return cls(
+            samples["impl.motion"], clock, reference_tip, tip, samples["env.contact_wrench"].reshape(-1, 6)[:, 3:]
+        )
 
     def errors(self, motions: Sequence[int] = FREE) -> NDArray[np.float64]:
         """Return the distances of the tip from its reference during some motions, shape (k,), in m."""
         during = np.isin(self.motion, motions)
-        found: NDArray[np.float64] = np.linalg.norm(self.tip[during] - self.wanted[during], axis=1)
-        return found
+        tip_errors: NDArray[np.float64] = np.linalg.norm(self.tip[during] - self.reference[during], axis=1)
+        return tip_errors
 
     def contact(self, law: LawAlongX, scenario: ManipulatorScenario) -> Contact:
         """Return the force during the press, and the prediction from law and wall."""
         during = self.motion == Motion.PRESS
-        clock, wanted = self.clock[during], self.wanted[during, 0]
-        return Contact(clock, law.force(clock, wanted, scenario), -self.force[during, 0])
+        clock, along_x = self.clock[during], self.reference[during, 0]
+        return Contact(clock, law.force(clock, along_x, scenario), -self.force[during, 0])
 
 
 @dataclass(frozen=True)
@@ -146,22 +148,22 @@ class LawAlongX:
     @classmethod
     def of(cls, target: AddressedDiagram) -> LawAlongX:
         """Return the behaviour for the default gains of a target."""
-        context, known = target.default_context(), target.variables()
+        context, variables = target.default_context(), target.variables()
         values = {
-            name: float(target.read(context, f"dps.impl.{name}")[3]) if f"dps.impl.{name}" in known else 0.0
+            name: float(target.read(context, f"dps.impl.{name}")[3]) if f"dps.impl.{name}" in variables else 0.0
             for name in ("inertia", "damping", "stiffness")
         }
         return cls(**values)
 
     def force(
-        self, clock: NDArray[np.float64], wanted: NDArray[np.float64], scenario: ManipulatorScenario
+        self, clock: NDArray[np.float64], along_x: NDArray[np.float64], scenario: ManipulatorScenario
     ) -> NDArray[np.float64]:
-        """Return the force on the wall while the reference of the tip moves as ``wanted``, shape (n,), in N.
+        """Return the force on the wall while the reference of the tip moves as ``along_x``, shape (n,), in N.
 
         Without inertia that of two springs in series; else of the mass against the wall, which pushes back by Hunt and
         Crossley's k d (1 + c d').
         """
-        beyond = wanted - (scenario.wall_distance - Arm().ball_radius)
+        beyond = along_x - (scenario.wall_distance - Arm().ball_radius)
         k, c = scenario.wall_stiffness, scenario.wall_dissipation
         if self.inertia == 0.0:
             series: NDArray[np.float64] = self.stiffness * k / (self.stiffness + k) * np.maximum(beyond, 0.0)
@@ -245,7 +247,7 @@ def _positions(values: dict[str, Any], period: float) -> Any:
         "q": casadi.SX.sym("q", JOINTS),
     }
     state = {**{name: symbols[name] for name in ("motion", "clock", "start")}, "reference": symbols["start"]}
-    given = {name: casadi.SX(np.atleast_1d(value)) for name, value in values.items()}
-    r = reference(symbols["motion"], symbols["q"], state, given, period=period)
-    wanted, tip = model.tip(r.q).p + r.dp, model.tip(symbols["q"]).p
-    return function("positions", symbols, {"wanted": wanted, "tip": tip})
+    parameters = {name: casadi.SX(np.atleast_1d(value)) for name, value in values.items()}
+    r = reference(symbols["motion"], symbols["q"], state, parameters, period=period)
+    reference_tip, tip = model.tip(r.q).p + r.dp, model.tip(symbols["q"]).p
+    return function("positions", symbols, {"reference": reference_tip, "tip": tip})

@@ -46,7 +46,7 @@ def payload(full: bool) -> Answer:
     closed = isfinite(simulated.lower) and isfinite(simulated.upper)
     agrees = closed and simulated.lower - LOCKED_STEP <= static <= simulated.upper + LOCKED_STEP
     # The slower gait is beside the question: it shows where the order of the worlds comes from.
-    asked = [boundary for name, boundary in boundaries.items() if "stride" not in ENVIRONMENTS[name]]
+    compared = [boundary for name, boundary in boundaries.items() if "stride" not in ENVIRONMENTS[name]]
     environments = "; ".join(f"{name} {_range(boundary)}" for name, boundary in boundaries.items())
     feet = "; ".join(f"{name} {limit:.1f} kg" for name, limit in statics(payload_problem().testbed).items())
     return Answer(
@@ -56,7 +56,7 @@ def payload(full: bool) -> Answer:
         unit="kg",
         interval=(moon.lower, moon.upper),
         paper=PAPER,
-        holds=agrees and all(isfinite(b.lower) and isfinite(b.upper) for b in asked),
+        holds=agrees and all(isfinite(b.lower) and isfinite(b.upper) for b in compared),
         note=(
             "Stable in every rollout up to the first mass, and in none from some start phase at the second; undecided "
             f"between: {environments}. {len(moon.by_condition)} start phases on the moon, "
@@ -95,20 +95,20 @@ def heading(full: bool) -> Answer:
     reasons = {case.seed: _reasons(case) for case in cases if full or case is cases[0] or case.climb is None}
     answered = [case.climb for case in cases if case.climb is not None]
     climbs = [case.climb for case in [*cases, *searched] if case.climb is not None]
-    explained = all(all(found.values()) for found in reasons.values())
+    explained = all(all(texts.values()) for texts in reasons.values())
     warned = any(case.decision.poor for case in [*cases, *searched])
     notes = [
         "; ".join(_climb(case) for case in cases),
-        f"headings that do not pass: {'; '.join(_reasons_text(seed, found) for seed, found in reasons.items())}",
+        f"headings that do not pass: {'; '.join(_reasons_text(seed, texts) for seed, texts in reasons.items())}",
     ]
     if full:
         notes.append(f"continuous search: {'; '.join(_climb(case) for case in searched)}")
-    chosen = np.degrees(cases[0].decision.values.get(crater.HEADING, np.nan))
+    heading_deg = np.degrees(cases[0].decision.values.get(crater.HEADING, np.nan))
     reached = sum(climb.reached for climb in answered)
     return Answer(
         id="R1",
         question="Which heading takes the robot from the bottom of a crater to its rim?",
-        answer=f"{chosen:.0f} deg in crater 0; {reached} of {len(answered)} chosen headings reach the rim",
+        answer=f"{heading_deg:.0f} deg in crater 0; {reached} of {len(answered)} chosen headings reach the rim",
         unit="",
         interval=None,
         paper=crater.PAPER,
@@ -119,16 +119,16 @@ def heading(full: bool) -> Answer:
 
 def _climb(case: crater.Case) -> str:
     passable = [f"{np.degrees(angle):.0f}" for angle, passes in sorted(case.passable.items()) if passes]
-    seen = f"crater {case.seed}: passable {', '.join(passable) or 'none'}"
+    text = f"crater {case.seed}: passable {', '.join(passable) or 'none'}"
     if case.decision.poor:
-        seen += f" (POOR: {'; '.join(case.decision.warnings)})"
+        text += f" (POOR: {'; '.join(case.decision.warnings)})"
     if case.climb is None:
-        return seen
-    chosen, climb = np.degrees(case.climb.heading), case.climb
+        return text
+    heading_deg, climb = np.degrees(case.climb.heading), case.climb
     end = (
         f"reached the rim in {climb.duration:.0f} s" if climb.reached else f"ended {climb.distance:.0f} m from the axis"
     )
-    return f"{seen}; {chosen:.0f} deg {end}"
+    return f"{text}; {heading_deg:.0f} deg {end}"
 
 
 def _reasons(case: crater.Case) -> dict[float, list[str]]:
@@ -138,5 +138,5 @@ def _reasons(case: crater.Case) -> dict[float, list[str]]:
 
 
 def _reasons_text(seed: int, reasons: dict[float, list[str]]) -> str:
-    texts = [f"{np.degrees(angle):.0f} deg {' or '.join(found) or 'UNEXPLAINED'}" for angle, found in reasons.items()]
+    texts = [f"{np.degrees(angle):.0f} deg {' or '.join(names) or 'UNEXPLAINED'}" for angle, names in reasons.items()]
     return f"crater {seed}: {', '.join(texts) or 'none'}"

@@ -233,7 +233,7 @@ def explain(
     tries = len(reasons) * len(COUNTERFACTUALS)
     with make_executor(executor, testbed=problem.testbed, rollouts=tries) as workers:
         for size in range(1, len(COUNTERFACTUALS) + 1):
-            open_ = [heading for heading, found in reasons.items() if not found]
+            open_ = [heading for heading, explanations in reasons.items() if not explanations]
             keys = [(names, heading) for names in combinations(COUNTERFACTUALS, size) for heading in open_]
             points = [{HEADING: heading, **_changed(names)} for names, heading in keys]
             results = run_rollouts(workers, problem.task, points, description="counterfactuals")

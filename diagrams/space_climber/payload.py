@@ -112,12 +112,12 @@ def static_limit(testbed: VirtualTestbed, *, legs: Sequence[str] = LEGS, ahead: 
 
 def _front_edge(feet: np.ndarray, y: float) -> float:
     """Return the largest x at ``y`` in the convex hull of the feet, shape (n, 2)."""
-    found = [
+    crossings = [
         a[0] + (y - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
         for a, b in itertools.permutations(feet, 2)
         if a[1] <= y <= b[1] and a[1] < b[1]
     ]
-    return float(max(found))
+    return float(max(crossings))
 
 
 def statics(testbed: VirtualTestbed) -> dict[str, float]:

@@ -186,7 +186,7 @@ class Crater:
             return ()
         rng = np.random.default_rng([self.seed, 2])
         smallest, largest = np.array(BOULDER_HEIGHT) ** -BOULDER_EXPONENT
-        found = []
+        scattered = []
         for _ in range(FIELDS):
             azimuth, distance = rng.uniform(-SECTOR, SECTOR), rng.uniform(*FIELD_DISTANCE)
             radius = rng.uniform(*FIELD_RADIUS)
@@ -197,11 +197,11 @@ class Crater:
             height = rng.uniform(largest, smallest, size=count) ** (-1.0 / BOULDER_EXPONENT)
             size = height[:, None] * np.column_stack([rng.uniform(1.5, 3.0, size=(count, 2)), np.full(count, 2.0)])
             rpy = rng.uniform([-0.3, -0.3, -np.pi], [0.3, 0.3, np.pi], size=(count, 3))
-            found += [
+            scattered += [
                 Boulder(*row[:2], tuple(row[2:5]), tuple(row[5:]))
                 for row in np.column_stack([x, y, size, rpy]).tolist()
             ]
-        return tuple(found)
+        return tuple(scattered)
 
     @cached_property
     def mesh(self) -> tuple[Array, NDArray[np.int64]]:

@@ -86,10 +86,10 @@ def read_archive(
         with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
             _check_entries(archive)
             header = json.loads(archive.read(_HEADER))
-            found = header.pop("kind"), header.pop("version")
-            if found != (kind, version):
+            written_as = header.pop("kind"), header.pop("version")
+            if written_as != (kind, version):
                 raise ArchiveError(
-                    f"{path} is not a {kind} of version {version}, but a {found[0]} of version {found[1]}"
+                    f"{path} is not a {kind} of version {version}, but a {written_as[0]} of version {written_as[1]}"
                 )
             names = [name for name in archive.namelist() if name != _HEADER]
             # A zip does not say how many entries it has; older files do not, either.

@@ -280,33 +280,33 @@ class DelayState(AbstractState):
 
     def read(self, context: Context) -> dict[str, np.ndarray]:
         """Return the delayed values as arrays, by ``<index>/<name>``; the oldest has the index 0."""
-        own = self._system.CreateDefaultContext()
-        own.SetStateAndParametersFrom(context)
-        self._feed(own, own.get_abstract_state(0).get_value())
+        context_copy = self._system.CreateDefaultContext()
+        context_copy.SetStateAndParametersFrom(context)
+        self._feed(context_copy, context_copy.get_abstract_state(0).get_value())
         arrays: dict[str, np.ndarray] = {}
         for index in self._codecs:
-            parts = self._encode(index, self._system.get_output_port().Eval(own))
+            parts = self._encode(index, self._system.get_output_port().Eval(context_copy))
             # The next step overwrites the array.
             arrays |= {name: np.array(array) for name, array in parts.items()}
-            self._step(own)
+            self._step(context_copy)
         return arrays
 
     def writer(self, arrays: Arrays) -> Callable[[Context], None]:
-        own = self._system.CreateDefaultContext()
+        context_copy = self._system.CreateDefaultContext()
         for index in self._codecs:
-            self._feed(own, self._decode(index, arrays))
-            self._step(own)
-        return lambda context: context.SetStateAndParametersFrom(own)
+            self._feed(context_copy, self._decode(index, arrays))
+            self._step(context_copy)
+        return lambda context: context.SetStateAndParametersFrom(context_copy)
 
-    def _feed(self, own: Context, value: object) -> None:
+    def _feed(self, context_copy: Context, value: object) -> None:
         port = self._system.get_input_port()
         wrapped = port.Allocate()
         wrapped.set_value(value)
-        port.FixValue(own, wrapped)
+        port.FixValue(context_copy, wrapped)
 
-    def _step(self, own: Context) -> None:
-        own.SetTime(0.0)  # The first time at which the input is sampled.
-        Simulator(self._system, own).AdvancePendingEvents()
+    def _step(self, context_copy: Context) -> None:
+        context_copy.SetTime(0.0)  # The first time at which the input is sampled.
+        Simulator(self._system, context_copy).AdvancePendingEvents()
 
 
 def abstract_state(path: str, system: System, context: Context) -> AbstractState:

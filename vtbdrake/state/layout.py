@@ -100,14 +100,14 @@ class StateLayout:
         """
         numbers = np.empty(self.size)
         for system, groups in self._groups:
-            own = system.GetMyContextFromRoot(context)
+            leaf_context = system.GetMyContextFromRoot(context)
             for group, index, place in groups:
                 if group == CONTINUOUS:
-                    numbers[place] = own.get_continuous_state_vector().CopyToVector()
+                    numbers[place] = leaf_context.get_continuous_state_vector().CopyToVector()
                 elif group == DISCRETE:
-                    numbers[place] = own.get_discrete_state(index).value()
+                    numbers[place] = leaf_context.get_discrete_state(index).value()
                 else:
-                    numbers[place] = own.get_numeric_parameter(index).value()
+                    numbers[place] = leaf_context.get_numeric_parameter(index).value()
         numbers.flags.writeable = False
         abstract = {
             f"{path}/{name}": np.array(array)
@@ -126,9 +126,9 @@ class StateLayout:
         self.check(contents)
         writers = [(system, codecs.writer(_of(path, contents.abstract))) for path, system, codecs in self._abstract]
         for system, groups in self._groups:
-            own = system.GetMyMutableContextFromRoot(context)
+            leaf_context = system.GetMyMutableContextFromRoot(context)
             for group, index, place in groups:
-                write_group(own, group, index, contents.numbers[place])
+                write_group(leaf_context, group, index, contents.numbers[place])
         for system, write in writers:
             write(system.GetMyMutableContextFromRoot(context))
 
@@ -144,13 +144,13 @@ class StateLayout:
             raise LayoutError(f"the contents are {self.size} numbers, not an array of shape {contents.numbers.shape}")
 
 
-def difference(found: tuple[str, ...], expected: tuple[str, ...]) -> str:
+def difference(names: tuple[str, ...], expected: tuple[str, ...]) -> str:
     """Return the first differences between the names of two layouts as text; empty if there are none."""
-    missing = [name for name in expected if name not in found]
-    foreign = [name for name in found if name not in expected]
+    missing = [name for name in expected if name not in names]
+    foreign = [name for name in names if name not in expected]
     parts = [f"it lacks {missing[0]}"] if missing else []
     parts += [f"it has {foreign[0]}, which is not part of this testbed"] if foreign else []
-    if not parts and found != expected:
+    if not parts and names != expected:
         parts = ["its systems are in another order"]
     return "; ".join(parts)
 

@@ -259,8 +259,8 @@ def is_camera(system: System) -> TypeGuard[RgbdSensor]:
 
 
 def _is_a(system: System, module: str, name: str) -> bool:
-    found: Any = sys.modules.get(module)
-    return found is not None and isinstance(system, getattr(found, name))
+    loaded: Any = sys.modules.get(module)
+    return loaded is not None and isinstance(system, getattr(loaded, name))
 
 
 def collect(

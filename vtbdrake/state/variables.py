@@ -245,8 +245,8 @@ class Variables(Mapping[str, Variable]):
 
     def complement(self, addresses: Sequence[str]) -> list[str]:
         """Return the addresses of all that is held constant when ``addresses`` are varied, equation (9)."""
-        chosen = {self[address].address.partition("[")[0] for address in addresses}
-        return [v.address for v in self._listed.values() if not v.derived and v.address not in chosen]
+        varied_addresses = {self[address].address.partition("[")[0] for address in addresses}
+        return [v.address for v in self._listed.values() if not v.derived and v.address not in varied_addresses]
 
     def table(self, context: Context, *, pattern: str = "") -> str:
         """Return a table of the variables whose address contains ``pattern``, as text."""
@@ -293,8 +293,8 @@ def overlap(addresses: Iterable[str], others: Iterable[str]) -> tuple[str, str] 
 def _entry(variable: Variable, index: int) -> Variable:
     size = int(np.prod(variable.shape, dtype=int))
     if not variable.shape or index >= size:
-        what = f"has {size} entries" if variable.shape else "is a scalar"
-        raise AddressError(f"there is no {variable.address}[{index}]: {variable.address} {what}")
+        extent = f"has {size} entries" if variable.shape else "is a scalar"
+        raise AddressError(f"there is no {variable.address}[{index}]: {variable.address} {extent}")
 
     def read(context: Context) -> float:
         return float(np.ravel(variable.get(context))[index])

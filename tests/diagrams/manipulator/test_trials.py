@@ -33,16 +33,16 @@ def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
     x = circle.clock[during] / DURATIONS["dps.impl.circle_duration"]
     angle = 2 * np.pi * x**3 * (10 - 15 * x + 6 * x**2)
     radius = 0.1
-    start = circle.wanted[0]
+    start = circle.reference[0]
     expected = start + radius * np.column_stack([0 * angle, np.sin(angle), 1 - np.cos(angle)])
-    np.testing.assert_allclose(circle.wanted[during], expected, atol=1e-6)
+    np.testing.assert_allclose(circle.reference[during], expected, atol=1e-6)
     assert during.sum() > 400
 
 
 def test_errors_are_the_distances_from_it(circle: Track) -> None:
     errors = circle.errors((Motion.CIRCLE,))
     assert 1e-5 < errors.max() < 0.002
-    nearest = np.linalg.norm(circle.tip - circle.wanted, axis=1)[circle.motion == Motion.CIRCLE]
+    nearest = np.linalg.norm(circle.tip - circle.reference, axis=1)[circle.motion == Motion.CIRCLE]
     np.testing.assert_array_equal(errors, nearest)
 
 
