@@ -8,7 +8,7 @@ import numpy as np
 from tests.cli.program import ACROBOT, ANGLE, DAMPING, PENDULUM, RATE, run
 from tests.testbeds import PendulumScenario
 from vtbdrake import Parameter, Problem, Quality
-from vtbdrake.cli.problem import magnitude
+from vtbdrake.cli.problem import largest, magnitude, smallest
 from vtbdrake.optimization import Sweep
 
 
@@ -83,3 +83,9 @@ def test_boundary_for_all_and_for_each_condition() -> None:
     ]
     lower, upper = expected.by_condition[1]
     assert lines[2] == f"  condition 1 ({DAMPING} = 0.5): safe up to {lower:.6g} rad, not at {upper:.6g} rad"
+
+
+def test_qualities_of_an_array_are_those_of_an_entry():
+    for value in (np.array([2.0, -3.0, 1.0]), np.array([[2.0, -3.0], [1.0, 0.0]])):
+        assert [f(value) for f in (magnitude, largest, smallest)] == [3.0, 2.0, -3.0]
+    assert [f(-0.5) for f in (magnitude, largest, smallest)] == [0.5, -0.5, -0.5]
