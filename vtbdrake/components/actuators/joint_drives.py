@@ -135,18 +135,18 @@ class JointDrives(AddressedSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
-        settings, memory = self._settings.array(context), self._memory.array(context)
-        u, x = self._command.Eval(context), self._state_port.Eval(context)
-        delayed = u
-        if self._max_delay and (delay := round(self._settings.view(context).delay)):
-            delayed = self._memory.view(context).in_transit[delay - 1]
-        # The torques that follow, then the motors' and the references.
-        y = self._kernel.value((settings, memory[: 2 * n], delayed, x))
-        self._torque.mutable_array(state)[:] = y[:n]
-        self._memory.mutable_array(state)[: 2 * n] = y[n:]
+        settings, memory = self._settings.array(context), self._memory.mutable_array(state)
+        delayed = u = self._command.Eval(context)
         if self._max_delay:
-            in_transit = self._memory.view(context).in_transit
-            self._memory.mutable(state).in_transit = np.concatenate((u[np.newaxis], in_transit[:-1]))
+            in_transit = self._memory.vector.view(memory).in_transit
+            if delay := round(self._settings.vector.view(settings).delay):
+                delayed = in_transit[delay - 1].copy()
+            in_transit[1:] = in_transit[:-1]
+            in_transit[0] = u
+        # The torques, then what the motors and their references have become.
+        y = self._kernel.value((settings, memory[: 2 * n], delayed, self._state_port.Eval(context)))
+        self._torque.mutable_array(state)[:] = y[:n]
+        memory[: 2 * n] = y[n:]
 
 
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
