@@ -11,24 +11,8 @@ pytestmark = pytest.mark.one_python
 ROOT = Path(__file__).resolve().parents[1]
 
 # Words that stand where a type or a role should, as whole names. In a line or two they may be the best ones.
-VAGUE = set(
-    [
-        "found",
-        "known",
-        "one",
-        "own",
-        "given",
-        "chosen",
-        "kept",
-        "seen",
-        "what",
-        "others",
-        "asked",
-        "wanted",
-        "told",
-        "held",
-    ]
-)
+VAGUE = {"found", "known", "one", "own", "given", "chosen", "kept"}
+VAGUE |= {"seen", "what", "others", "asked", "wanted", "told", "held"}
 BUDGET = 60
 
 
