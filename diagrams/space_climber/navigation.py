@@ -132,23 +132,28 @@ class Navigator(AddressedSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T, settings, memory = self._period, self._settings.view(context), self._memory.mutable(state)
         u = _INPUT.view(self._input.Eval(context))
-        heading, walks = u.heading, u.walk > 0.0
-        v = np.array(horizontal(u.visual_odometry.tolist(), u.roll, u.pitch, u.yaw))
-        memory.position += T * v
+        heading, walk, roll, pitch = u.heading, u.walk, u.roll, u.pitch
+        # Numbers, which are faster than arrays of two.
+        leg_x, leg_y, last_x, last_y = *u.position.tolist(), *memory.last_step.tolist()
+        x, y, slip_x, slip_y = *memory.position.tolist(), *memory.slip.tolist()
+        vx, vy = horizontal(u.visual_odometry.tolist(), roll, pitch, u.yaw)
+        x, y = x + T * vx, y + T * vy
         share = 1.0 - exp(-T / settings.slip_time) if settings.slip_time > 0.0 else 1.0
-        memory.slip += share * ((u.position - memory.last_step) / T - v - memory.slip)
-        memory.slipping = hypot(*memory.slip.tolist()) > settings.slip_limit
-        if max(abs(u.roll), abs(u.pitch)) > settings.tip_angle:
+        slip_x += share * ((leg_x - last_x) / T - vx - slip_x)
+        slip_y += share * ((leg_y - last_y) / T - vy - slip_y)
+        tip_angle, limit = settings.tip_angle, settings.course_limit
+        if abs(roll) > tip_angle or abs(pitch) > tip_angle:
             memory.tipped = 1.0
-        if walks and not (memory.under_way and heading == memory.heading):
-            memory.origin = memory.position
-        ahead, aside = (memory.position - memory.origin).tolist()
-        across = cos(heading) * aside - sin(heading) * ahead
-        limit = settings.course_limit
-        correction = min(max(settings.course_gain * across, -limit), limit) if walks else 0.0
-        memory.under_way, memory.heading, memory.last_step = walks, heading, u.position
+        if walk > 0.0 and not (memory.under_way and heading == memory.heading):
+            memory.origin = x, y
+        x0, y0 = memory.origin.tolist()
+        aside = cos(heading) * (y - y0) - sin(heading) * (x - x0)
+        correction = min(max(settings.course_gain * aside, -limit), limit) if walk > 0.0 else 0.0
+        memory.position, memory.slip, memory.last_step = (x, y), (slip_x, slip_y), u.position
+        memory.slipping = hypot(slip_x, slip_y) > settings.slip_limit
+        memory.under_way, memory.heading = walk > 0.0, heading
         self._course.mutable(state).course = wrap(heading - correction)
-        self._walk.mutable(state).walk = 0.0 if memory.tipped else u.walk
+        self._walk.mutable(state).walk = 0.0 if memory.tipped else walk
 
 
 def horizontal(v_B: list[float], roll: float, pitch: float, yaw: float) -> tuple[float, float]:

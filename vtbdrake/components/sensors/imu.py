@@ -103,7 +103,7 @@ class Imu(SampledSensor):
             self._motion(context),
             orientation=self._orientation,
             velocity=self._velocity,
-            mount=self._settings.view(context).mount,
+            mount=self._settings.array(context),
             g_W=self._g_W,
             memory=memory,
             period=self._period,
