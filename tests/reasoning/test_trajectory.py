@@ -121,6 +121,13 @@ def test_limited_is_the_nearest_that_keeps_all_limits(order: str, limits: dict[s
     assert np.linalg.norm(moved, axis=0) == pytest.approx(np.linalg.norm(least, axis=0), rel=0.12)
 
 
+@pytest.mark.parametrize("order", ["cubic", "bspline"])
+def test_limit_far_away_moves_nothing(order: str) -> None:
+    knots = np.random.default_rng(3).uniform(-3.0, 3.0, size=(9, 2))
+    near, far = (trajectory(order, rate=rate, acceleration=10.0).limited(knots) for rate in (inf, 1e6))
+    np.testing.assert_allclose(far, near, atol=1e-4)
+
+
 @pytest.mark.parametrize("order", ORDERS)
 def test_shifted_plan_continues_the_plan_in_use(order: str) -> None:
     plan = trajectory(order)

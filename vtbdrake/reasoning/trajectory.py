@@ -17,6 +17,8 @@ from vtbdrake.state import Variables
 
 # Rows that are this small beside the largest one are rounding errors of zero.
 _NEGLIGIBLE = 1e-12
+# A limit this many times as far away as the largest violation is not reached.
+_FAR = 1e3
 # Relative: limits that are exceeded by less count as kept, and the projection aims below those of rates by this.
 _ROUNDING, _ACCURACY = 1e-9, 1e-5
 _LIMITS = ("lower", "upper", "rate", "acceleration")
@@ -277,7 +279,12 @@ def _shortest(rows: Array, room: Array) -> Array:
     length = np.linalg.norm(rows, axis=1)
     bound = length > _NEGLIGIBLE * length.max()
     rows, room = rows[bound] / length[bound, None], room[bound] / length[bound]
-    scale = np.abs(room).max()
+    # The largest violation, about the length of x. The solver's accuracy is relative to the largest number, so that
+    # limits far away are taken as nearer than they are.
+    scale = -room.min()
+    if not scale > 0.0:
+        return np.zeros(rows.shape[1])
+    room = np.minimum(room, _FAR * scale)
     program = MathematicalProgram()
     x = program.NewContinuousVariables(rows.shape[1])
     program.AddQuadraticErrorCost(1.0, np.zeros(len(x)), x)
