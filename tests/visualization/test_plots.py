@@ -166,7 +166,7 @@ def test_landscape_is_the_worst_h_with_the_best_point(conditions: int) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("sim.sys.payload.mass [kg]", "sim.env.ground.friction")
 
 
-@pytest.mark.filterwarnings("ignore:invalid value encountered in minimum")
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("failed", [(), (1, 4)])
 def test_failed_points_of_a_landscape_are_crosses(failed: tuple[int, ...]) -> None:
     points = [(m, f) for m in (0.0, 30.0, 60.0) for f in (0.2, 0.8)]

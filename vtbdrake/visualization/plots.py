@@ -236,8 +236,9 @@ def worst(sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
     where = where.reshape(-1)
     cost = sweep.minimize[0]
     h = np.full(len(points), -np.inf if cost else np.inf)
-    # Unlike fmin, minimum keeps a NaN.
-    (np.maximum if cost else np.minimum).at(h, where, sweep.h)
+    # Unlike fmin, minimum keeps a NaN, though with a warning.
+    with np.errstate(invalid="ignore"):
+        (np.maximum if cost else np.minimum).at(h, where, sweep.h)
     h[np.bincount(where, minlength=len(points)) < len(sweep.conditions)] = np.nan
     return points, h
 
