@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Words that stand where a type or a role should, as whole names. In a line or two they may be the best ones.
 VAGUE = {"found", "known", "one", "own", "given", "chosen", "kept"}
 VAGUE |= {"seen", "what", "others", "asked", "wanted", "told", "held"}
-BUDGET = 60
+BUDGET = 20
 
 
 def bound_names(tree: ast.AST) -> Iterator[tuple[int, str]]:

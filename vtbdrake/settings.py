@@ -76,13 +76,13 @@ class Setting:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The ends of the range, infinite where it is open."""
+        """Return the ends of the range, infinite where it is open."""
         lower, upper = self.gt if self.ge is None else self.ge, self.lt if self.le is None else self.le
         return -inf if lower is None else float(lower), inf if upper is None else float(upper)
 
     @property
     def range(self) -> str:
-        """The range in words, with the unit, such as "from 0 to 3 m/s"; empty without both."""
+        """Return the range in words, with the unit, such as "from 0 to 3 m/s"; empty without both."""
         above, least, below, most = map(_text, (self.gt, self.ge, self.lt, self.le))
         if least and (below or most):
             words = f"from {least} to {f'below {below}' if below else most}"
@@ -137,7 +137,7 @@ class _Type(NamedTuple):
 
     @property
     def is_sized(self) -> bool:
-        """Whether the type tells the number of entries."""
+        """Return whether the type tells the number of entries."""
         return self.name == "tuple" and bool(self.entries) and "..." not in self.entries
 
     def entry(self, index: int) -> str:
@@ -176,7 +176,7 @@ def _parsed(text: str) -> tuple[_Type, ...]:
     )
 
 
-def _known(types: tuple[_Type, ...]) -> tuple[_Type, ...]:
+def _checkable(types: tuple[_Type, ...]) -> tuple[_Type, ...]:
     """Return the types, or none if one of them is not among `_TYPES`: the values can be anything then."""
     return types if all(each.name in _TYPES for each in types) else ()
 
@@ -224,7 +224,7 @@ def check_value(
     if field_types(value) and not isinstance(value, type):
         check_settings(value, name=name, error=error)
         return
-    types = _known(_alternatives(annotation))
+    types = _checkable(_alternatives(annotation))
     if hasattr(value, "tolist"):
         if not (types or limits):  # An array of data.
             return
@@ -301,7 +301,7 @@ def _schema(annotation: Any, limits: Setting, default: Any) -> dict[str, Any]:
 
 
 def _type_schema(annotation: Any, limits: Setting) -> dict[str, Any]:
-    types = _known(_alternatives(annotation))
+    types = _checkable(_alternatives(annotation))
     names = list(dict.fromkeys(_TYPES[each.name][2] for each in types))
     described: dict[str, Any] = {"type": names[0] if len(names) == 1 else names} if names else {}
     bounds = {
