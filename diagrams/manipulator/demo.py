@@ -111,7 +111,8 @@ class Demo:
 
     def _shadow(self, simulated: Runtime) -> Runtime:
         loop = self._deployment().runtime(self.testbed, self.bridge, context=simulated.context)
-        self._switch(loop, "shadow")
+        loop.run(until=lambda: not loop.prepare("shadow").reasons, seconds=10.0)
+        loop.switch("shadow")
         loop.run(seconds=1.0)
         command = loop.actuator_command("joint_torque")
         print(f"shadow  real sensors feed the DPS, which commands the simulated arm: {_torque(command)}")
@@ -122,22 +123,13 @@ class Demo:
         alone = DpsAlone(self.scenario)
         context = alone.continue_from(self.testbed, shadowed.context)
         loop = self._deployment().runtime(alone, self.bridge, context=context, watchers=(self.attendant,))
-        self._switch(loop, "real")
+        loop.take_over()
         return loop
 
     def _deployment(self) -> Deployment:
         """Return a new deployment, because its fallback has a state."""
         deployment = self.scenario.deployment()
         return replace(deployment, guards={**deployment.guards, "max_missed": MAX_MISSED})
-
-    def _switch(self, loop: Runtime, mode: str) -> None:
-        """Switch, with some attempts if a message is late."""
-        for _ in range(100):
-            self.bridge.poll(0.1)
-            preparation = loop.prepare(mode)
-            if not preparation.reasons:
-                break
-        loop.perform(preparation)
 
     def _on_the_machine(self, loop: Runtime) -> Track:
         self.attendant.loop = loop
