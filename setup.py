@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: every .pyx of both packages is compiled, and lcm-gen makes modules of every .lcm."""
+"""The part of the build that pyproject.toml cannot declare: the modules of every .pyx and of every .lcm."""
 
 import subprocess
 import sys

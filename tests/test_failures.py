@@ -1,4 +1,4 @@
-"""What counts as a failure, and its text, which names the last line of the user's code that led to it."""
+"""Failures are what Drake and users raise; their text names the last line of the user's code that led to them."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What an `LruDict` drops, against a list that is kept in the order of use."""
+"""An `LruDict` drops what a list in the order of use drops."""
 
 import random
 

@@ -38,7 +38,7 @@ def way_to_rest(w: float, a: float) -> float:
 
 
 def longest_step(d: float, a: float, most: float = 5e-3) -> float:
-    """By bisection: the longest step, up to ``most``, after which there is a rest within d."""
+    """Return by bisection the longest step, up to ``most``, after which there is a rest within d."""
     low, high = 0.0, min(d, most)
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -479,7 +479,7 @@ def test_steps_are_the_longest_allowed_at_any_times(seed: int, acceleration: flo
 
 
 def longest_step_of_share(d: float, a: float, r: float) -> float:
-    """By bisection: the longest step w of a whole period, of which a share r is taken, with a rest within d."""
+    """Return by bisection the longest step w of a whole period, of which a share r is taken, with a rest within d."""
     low, high = 0.0, d / r
     for _ in range(80):
         middle = 0.5 * (low + high)

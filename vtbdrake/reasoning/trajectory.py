@@ -215,8 +215,8 @@ class Trajectory:
     def _slowed(self, w: Array, j: int) -> Array:
         """Return the knots of entry ``j``, drawn together towards the first one until the limits of rates are kept.
 
-        The accuracy of the projection is relative to the largest number in it, which may be a range far above what a
-        small rate allows.
+        The accuracy of the projection is relative to the largest violation, which may be far above what a small rate
+        allows.
         """
         factor = 1.0
         for derivative, limit in enumerate(self._limits[2:, j], 1):

@@ -1,1 +1,1 @@
-"""What a running localization unit looks like: the driver's display, and the picture of the documentation."""
+"""Pictures of a running localization unit: the driver's display, and the picture of the documentation."""

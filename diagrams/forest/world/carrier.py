@@ -170,7 +170,7 @@ def standing_pose(
 
 
 class _Contact(NamedTuple):
-    """What the ground does to the four wheels."""
+    """The forces of the ground on the four wheels."""
 
     # The tyres' deflections at the end of the step, (4, 2) in m.
     deflections: Array

@@ -60,7 +60,7 @@ class TrackState:
 
     @property
     def is_tracking(self) -> bool:
-        """Whether there is a pose."""
+        """Return whether there is a pose."""
         return bool(self.mean.size)
 
     @property

@@ -27,7 +27,7 @@ from vtbdrake.settings import check_settings, setting
 
 @dataclass(frozen=True)
 class LifeCycleConfig:
-    """When objects are confirmed, revised and retired. The defaults are assumed, not taken from data."""
+    """The settings by which objects are confirmed, revised and retired; defaults are assumed, not taken from data."""
 
     gate: float = setting(
         0.997,
