@@ -146,20 +146,22 @@ def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | N
     """
     if is_camera(system):
         yield from _camera_pose(path, system)
-    elements = list(_elements(system) if declared is None else declared)
+    declared = getattr(system, "variables", None) if declared is None else tuple(declared)
+    if declared is not None and not declared:
+        return
+    groups = tuple(_numeric_groups(system.CreateDefaultContext()))
+    sizes = {(group.kind, group.number): group.size for group in groups}
+    elements = tuple(_unnamed_elements(system, groups) if declared is None else declared)
     names = Counter((element.group, element.index) for element in elements)
     for element in elements:
         address = f"{path}.{element.name}" if element.name else path
-        yield _numeric(address, system, element, alone=names[element.group, element.index] == 1)
+        group = element.group, element.index
+        yield _numeric(address, system, element, alone=names[group] == 1, available=sizes.get(group, 0))
 
 
-def _elements(system: System) -> Iterator[Element]:
-    declared = getattr(system, "variables", None)
-    if declared is not None:
-        yield from declared
-        return
-    context = system.CreateDefaultContext()
-    for kind, index, size in _numeric_groups(context):
+def _unnamed_elements(system: System, groups: Iterable[Group]) -> Iterator[Element]:
+    """Yield the whole groups of a system that declares no variables."""
+    for kind, index, size in groups:
         # The parameter of a constant source is its output value.
         is_value = kind == PARAMETER and isinstance(system, ConstantVectorSource)
         name = "continuous_state" if kind == CONTINUOUS else f"{_GROUP_NAMES[kind]}_{index}"
@@ -185,10 +187,9 @@ def write_group(context: Context, group: str, index: int, value: np.ndarray) -> 
         context.get_mutable_numeric_parameter(index).SetFromVector(value)
 
 
-def _numeric(address: str, system: System, element: Element, *, alone: bool) -> Variable:
+def _numeric(address: str, system: System, element: Element, *, alone: bool, available: int) -> Variable:
+    """Return the variable of an element, which is ``alone`` or not in its group of ``available`` entries."""
     size = int(np.prod(element.shape, dtype=int))
-    sizes = {(kind, index): size for kind, index, size in _numeric_groups(system.CreateDefaultContext())}
-    available = sizes.get((element.group, element.index), 0)
     if element.start + size > available:
         raise ValueError(
             f"{address} is declared as entries {element.start} to {element.start + size - 1} of {element.group} "
