@@ -92,7 +92,7 @@ class TrackedTarget:
 
     @property
     def valid(self) -> bool:
-        """Whether the tracker follows the target."""
+        """Return whether the tracker follows the target."""
         return bool(self.status[0])
 
     def deviation(self) -> tuple[float, float]:

@@ -54,7 +54,7 @@ class OverLcm:
 
     @property
     def agrees(self) -> bool:
-        """Whether the poses are the same."""
+        """Return whether the poses are the same."""
         return self.is_tracking and self.difference < LARGEST_DIFFERENCE
 
 

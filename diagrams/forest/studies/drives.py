@@ -122,7 +122,7 @@ class Track:
 
     @property
     def is_localized(self) -> NDArray[np.bool_]:
-        """Whether the unit claims a pose, shape (n,)."""
+        """Return whether the unit claims a pose, shape (n,)."""
         return self.status == TRACKING
 
     @property
@@ -280,7 +280,7 @@ class Score:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether the mean NEES at independent places lies within its bounds."""
+        """Return whether the mean NEES at independent places lies within its bounds."""
         return self.bounds[0] <= self.independent_nees <= self.bounds[1]
 
 

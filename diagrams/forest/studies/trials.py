@@ -71,7 +71,7 @@ class Case:
 
     @property
     def is_judged(self) -> bool:
-        """Whether the share of places recognized has a goal in this case."""
+        """Return whether the share of places recognized has a goal in this case."""
         return self.stand == "natural" and self.place == "inside"
 
 

@@ -60,7 +60,7 @@ class Quantity:
 
     @property
     def is_measured(self) -> bool:
-        """Whether this is a number with a deviation, which can be compared and fused with another one."""
+        """Return whether this is a number with a deviation, which can be compared and fused with another one."""
         return self.deviation > 0.0
 
 
@@ -138,7 +138,7 @@ class WorldObject:
 
     @property
     def is_known(self) -> bool:
-        """Whether the object is believed to be there: neither tentative nor retired."""
+        """Return whether the object is believed to be there: neither tentative nor retired."""
         return self.status in (CONFIRMED, REVISED)
 
     def number(self, attribute: str, *, unit: str) -> float:
