@@ -19,6 +19,7 @@ from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface, copies, unit_sphere
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
+from vtbdrake.settings import check_settings, setting
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 from vtbdrake_diagrams.forest.world.stand import MapErrors, surveyed
@@ -32,39 +33,23 @@ _ELONGATION, _FLATNESS = (1.0, 1.2), (0.8, 1.2)
 
 @dataclass(frozen=True)
 class RockField:
-    """Rocks on a plain from (0, 0) to (length, width), which do not touch. The same seed gives the same rocks.
+    """Rocks on a plain from (0, 0) to (length, width), which do not touch. The same seed gives the same rocks."""
 
-    Attributes:
-        seed: Determines rocks, tracks and maps.
-        length: Extent along x in m.
-        width: Extent along y in m.
-        abundance: The share k of the ground that rocks of all sizes cover.
-        least_diameter: The diameter in m of the smallest rocks; smaller ones are left out.
-        largest_diameter: The diameter in m of the largest rocks.
-        track_width: Width of the tracks in m, which are free of rocks; 0 for a plain without tracks.
-        track_spacing: Distance of the tracks in m, see `strip_roads`.
-    """
-
-    seed: int = 0
-    length: float = 100.0
-    width: float = 100.0
-    abundance: float = 0.05
-    least_diameter: float = 0.3
-    largest_diameter: float = 2.0
-    track_width: float = 0.0
-    track_spacing: float = 28.0
+    seed: int = setting(0, "Determines rocks, tracks and maps.", ge=0)
+    length: float = setting(100.0, "Extent along x.", unit="m", gt=0)
+    width: float = setting(100.0, "Extent along y.", unit="m", gt=0)
+    abundance: float = setting(0.05, "Share k of the ground that rocks of all sizes cover.", ge=0.005, le=0.3)
+    least_diameter: float = setting(0.3, "Diameter of the smallest rocks that are not left out.", unit="m", ge=0.1)
+    largest_diameter: float = setting(2.0, "Diameter of the largest rocks.", unit="m", le=5)
+    track_width: float = setting(0.0, "Width of the tracks, which have no rocks; 0: no tracks.", unit="m", ge=0, le=8)
+    track_spacing: float = setting(28.0, "Distance of the tracks.", unit="m", gt=0)
 
     def __post_init__(self) -> None:
-        if not (self.length > 0.0 and self.width > 0.0):
-            raise ValueError("length and width of a plain are positive")
-        if not 0.005 <= self.abundance <= 0.3:
-            raise ValueError(f"rocks cover between 0.5 and 30 % of a plain, not {100.0 * self.abundance:g} %")
-        if not 0.1 <= self.least_diameter < self.largest_diameter <= 5.0:
+        check_settings(self)
+        if not self.least_diameter < self.largest_diameter:
             raise ValueError(
-                f"rocks have diameters from 0.1 to 5 m, not from {self.least_diameter} to {self.largest_diameter} m"
+                f"rocks have diameters from {self.least_diameter} to {self.largest_diameter} m: no such range"
             )
-        if not 0.0 <= self.track_width <= 8.0:
-            raise ValueError(f"tracks are at most 8 m wide (0: no tracks), not {self.track_width:g} m")
 
     def density(self) -> float:
         """Return the number of rocks per m^2, before tracks are cleared."""

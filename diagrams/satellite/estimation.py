@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.casadi_system.kernel import Kernel
-from vtbdrake.components.perception.tracking import pose_of_state
+from vtbdrake.components.perception.target_tracker import pose_of_state
 from vtbdrake.state import AddressedSystem, Quantity
 
 BASE = 14

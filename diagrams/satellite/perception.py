@@ -23,7 +23,7 @@ from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetectorConfig, detect_markers, pose_from_markers
 from vtbdrake.components.perception.registration import Faces, RegistrationConfig, deskew, misfit, register_points
-from vtbdrake.components.perception.tracking import (
+from vtbdrake.components.perception.target_tracker import (
     STATE_SIZE,
     STATUS_SIZE,
     MotionModel,

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, State
 
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.components.perception.tracking import pose_of_state
+from vtbdrake.components.perception.target_tracker import pose_of_state
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import AddressedSystem, Quantity

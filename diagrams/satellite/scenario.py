@@ -14,7 +14,7 @@ from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
 
 from vtbdrake.components.environment.light import LightConfig
-from vtbdrake.components.perception.tracking import pose_of_state
+from vtbdrake.components.perception.target_tracker import pose_of_state
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.control.fallback import Hold

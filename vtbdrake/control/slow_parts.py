@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.clock import Clock, Throttle
-from vtbdrake.control.slow_worker import Report, supervise
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import ChangeKind
+from vtbdrake.control.supervisor import Report, supervise
 from vtbdrake.failures import error_text
 from vtbdrake.pickling import dumps
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory

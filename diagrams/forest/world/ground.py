@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface
+from vtbdrake.settings import check_settings, setting
 
 # Wave lengths in m of hills and of bumps, and the numbers of their waves.
 _HILLS, _BUMPS = (40.0, 150.0), (2.5, 8.0)
@@ -34,23 +35,18 @@ class Ground:
     with random directions and phases, and wave lengths 2 pi / |k_i| of 40 to 150 m (hills) and 2.5 to 8 m (bumps). The
     waves of a kind have equal amplitudes a_i, so that the height has the given standard deviation. All of it is
     assumed: no survey of forest ground was used.
-
-    Attributes:
-        seed: Determines the waves.
-        relief: Standard deviation of the height of hills in m.
-        bumps: Standard deviation of the height of bumps in m.
     """
 
-    seed: int = 0
-    relief: float = 0.8
-    bumps: float = 0.04
+    seed: int = setting(0, "Determines the waves.", ge=0)
+    relief: float = setting(
+        0.8, "Standard deviation of the height of hills.", unit="m", ge=0, le=2, remedy="a carrier must drive there"
+    )
+    bumps: float = setting(
+        0.04, "Standard deviation of the height of bumps.", unit="m", ge=0, le=0.08, remedy="a carrier must drive there"
+    )
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.relief <= 2.0 and 0.0 <= self.bumps <= 0.08):
-            raise ValueError(
-                f"relief is within [0, 2] m and bumps within [0, 0.08] m, so that a carrier can drive there, not "
-                f"{self.relief:g} and {self.bumps:g}"
-            )
+        check_settings(self)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Return the height of the ground in m; x and y are in m, of any shapes that broadcast."""

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp, inf, pi
+from math import exp, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
+from vtbdrake.settings import check_settings, setting
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 
 HECTARE = 1e4
@@ -51,29 +52,17 @@ _WAVES = 400
 class MapErrors:
     """The errors of a map of trees.
 
-    Attributes:
-        position: Standard deviation of the positions in m, per axis.
-        missing: The share of the trees that are missing on the map.
-        wrong: The share of the map's entries that are no trees, from 0 to below 1.
-        diameter: Standard deviation of the diameters as a share of the diameter.
-        correlation: Length L in m over which errors of position are correlated, as exp(-r² / (2 L²)) at the distance r;
-            0 for independent errors.
+    Errors of position have the correlation exp(-r² / (2 L²)) at the distance r, with the length L of ``correlation``.
     """
 
-    position: float
-    missing: float = 0.0
-    wrong: float = 0.0
-    diameter: float = 0.05
-    correlation: float = 0.0
+    position: float = setting(doc="Standard deviation of the positions, per axis.", unit="m", ge=0)
+    missing: float = setting(0.0, "Share of the trees that are missing on the map.", ge=0, le=1)
+    wrong: float = setting(0.0, "Share of the map's entries that are no trees.", ge=0, lt=1)
+    diameter: float = setting(0.05, "Standard deviation of the diameters as a share of the diameter.", ge=0)
+    correlation: float = setting(0.0, "Length L of the correlation; 0: errors are independent.", unit="m", ge=0)
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.missing <= 1.0 or not 0.0 <= self.wrong < 1.0:
-            raise ValueError(f"missing and wrong are shares from 0 to 1, not {self.missing} and {self.wrong}")
-        if not all(0.0 <= value < inf for value in (self.position, self.diameter, self.correlation)):
-            raise ValueError(
-                "position, diameter and correlation of a map's errors are finite and at least 0, not "
-                f"{self.position}, {self.diameter} and {self.correlation}"
-            )
+        check_settings(self)
 
 
 # The diameters of the accurate map are assumed to have a standard deviation of 5 %.
@@ -88,58 +77,39 @@ MAPS = {"exact": MapErrors(position=0.0, diameter=0.0), "accurate": ACCURATE, "r
 class Stand:
     """A rectangular stand on flat ground from (0, 0) to (length, width). The same seed gives the same stand.
 
-    Diameters follow a Weibull distribution that is cut off at the least and the largest diameter. Positions are those
-    of a hard-core process: trees are placed at random one after the other, and a place too close to an earlier tree is
-    given up. In a ``natural`` stand all places are equally likely. In a ``clustered`` one, they lie in discs around
-    points that are placed at random: a Matérn cluster process (Matérn, "Spatial Variation", 1960) with a hard core. In
-    a ``plantation``, trees stand in rows along x, 2.5 m apart, nearly where they were planted. A ``windthrown`` stand
-    was a natural one of the same seed, before a storm felled all trees in three round gaps per hectare, 50 m wide.
-
-    Attributes:
-        seed: Determines trees, roads and maps.
-        length: Extent along x in m.
-        width: Extent along y in m.
-        density: Trees per hectare, before roads are cleared and storms.
-        spacing: The least distance of two trees in m; a plantation has its own.
-        diameter_scale: Scale of the Weibull distribution of trunk diameters in m.
-        diameter_shape: Shape of this distribution; 1 is an exponential distribution, 3.6 nearly a normal one.
-        least_diameter: The least trunk diameter in m.
-        largest_diameter: The largest trunk diameter in m.
-        kind: ``natural``, ``clustered``, ``plantation`` or ``windthrown``.
-        road_width: Width of the strip roads in m, which are free of trees; 0 for a stand without roads.
-        road_spacing: Distance of the strip roads in m, see `strip_roads`.
+    Diameters follow a Weibull distribution (with the shape 1 it is exponential, with 3.6 nearly normal) that is cut off
+    at the least and the largest diameter. Positions are those of a hard-core process: trees are placed at random one
+    after the other, and a place too close to an earlier tree is given up. In a ``natural`` stand all places are equally
+    likely. In a ``clustered`` one, they lie in discs around points that are placed at random: a Matérn cluster process
+    (Matérn, "Spatial Variation", 1960) with a hard core. In a ``plantation``, trees stand in rows along x, 2.5 m apart,
+    nearly where they were planted. A ``windthrown`` stand was a natural one of the same seed, before a storm felled all
+    trees in three round gaps per hectare, 50 m wide.
     """
 
-    seed: int = 0
-    length: float = 100.0
-    width: float = 100.0
-    density: float = 800.0
-    spacing: float = 1.0
-    diameter_scale: float = 0.2
-    diameter_shape: float = 2.5
-    least_diameter: float = 0.06
-    largest_diameter: float = 0.41
-    kind: str = "natural"
-    road_width: float = 0.0
-    road_spacing: float = 28.0
+    seed: int = setting(0, "Determines trees, roads and maps.", ge=0)
+    length: float = setting(100.0, "Extent along x.", unit="m", gt=0)
+    width: float = setting(100.0, "Extent along y.", unit="m", gt=0)
+    density: float = setting(800.0, "Trees before roads are cleared and storms.", unit="1/ha", gt=0)
+    spacing: float = setting(1.0, "Least distance of two trees; a plantation has its own.", unit="m", ge=0)
+    diameter_scale: float = setting(0.2, "Scale of the distribution of trunk diameters.", unit="m", gt=0)
+    diameter_shape: float = setting(2.5, "Shape of the distribution of trunk diameters.", gt=0)
+    least_diameter: float = setting(0.06, "Least trunk diameter.", unit="m", gt=0)
+    largest_diameter: float = setting(0.41, "Largest trunk diameter.", unit="m", gt=0)
+    kind: str = setting("natural", "How trees are distributed.", choices=KINDS)
+    road_width: float = setting(
+        0.0, "Width of the strip roads, which have no trees; 0: no roads.", unit="m", ge=0, le=8
+    )
+    road_spacing: float = setting(28.0, "Distance of the strip roads.", unit="m", gt=0)
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"a stand is {', '.join(KINDS)}, not {self.kind!r}")
-        if not 0.0 <= self.road_width <= 8.0:
-            raise ValueError(f"strip roads are at most 8 m wide (0: no roads), not {self.road_width:g} m")
-        for name in ("length", "width", "density", "diameter_scale", "diameter_shape"):
-            if not 0.0 < getattr(self, name) < inf:
-                raise ValueError(f"{name} of a stand is positive and finite, not {getattr(self, name)!r}")
-        if not 0.0 < self.least_diameter < self.largest_diameter:
+        check_settings(self)
+        if not self.least_diameter < self.largest_diameter:
             raise ValueError(
                 f"diameters lie between {self.least_diameter} and {self.largest_diameter} m: no such range"
             )
         if self.kind == "plantation":
             return
         coverage = self.density / HECTARE * pi * self.spacing**2 / 4.0
-        if not self.spacing >= 0.0:
-            raise ValueError(f"trees are at least 0 m apart, not {self.spacing!r} m")
         if coverage > _LARGEST_COVERAGE:
             largest = 2.0 * (_LARGEST_COVERAGE * HECTARE / self.density / pi) ** 0.5
             raise ValueError(

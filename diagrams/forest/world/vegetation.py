@@ -13,6 +13,7 @@ import numpy as np
 from vtbdrake.arrays import Array
 from vtbdrake.components.meshes import Surface, copies, unit_cone, unit_sphere
 from vtbdrake.components.world_model import WorldModel
+from vtbdrake.settings import check_settings, setting
 from vtbdrake_diagrams.forest.world.ground import Ground
 
 BREAST_HEIGHT = 1.3
@@ -36,28 +37,15 @@ _BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]
 
 @dataclass(frozen=True)
 class Vegetation:
-    """The lean of trunks, and the amount of clutter.
+    """The lean of trunks, and the amount of clutter."""
 
-    Attributes:
-        seed: Determines directions and places.
-        lean: Standard deviation of the inclination of trunks in rad, per axis.
-        undergrowth: Bushes per hectare.
-        branches: Dead branches of a tree below its crown, on average.
-    """
-
-    seed: int = 0
-    lean: float = 0.01
-    undergrowth: float = 300.0
-    branches: float = 6.0
+    seed: int = setting(0, "Determines directions and places.", ge=0)
+    lean: float = setting(0.01, "Standard deviation of the inclination of trunks, per axis.", unit="rad", ge=0, le=0.2)
+    undergrowth: float = setting(300.0, "Bushes per hectare.", unit="1/ha", ge=0, le=5000)
+    branches: float = setting(6.0, "Dead branches of a tree below its crown, on average.", ge=0, le=50)
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.undergrowth <= 5000.0 and 0.0 <= self.branches <= 50.0):
-            raise ValueError(
-                "undergrowth is within [0, 5000] bushes per hectare and branches within [0, 50] per tree, not "
-                f"{self.undergrowth:g} and {self.branches:g}"
-            )
-        if not 0.0 <= self.lean <= 0.2:
-            raise ValueError(f"trunks lean by a standard deviation within [0, 0.2] rad, not {self.lean:g} rad")
+        check_settings(self)
 
     def leans(self, trees: WorldModel) -> Array:
         """Return the lean of each trunk in x and y, in m per m of height, (n, 2)."""

@@ -24,7 +24,7 @@ from scipy.stats import binom
 
 import vtbdrake as vtb
 from vtbdrake.arrays import Array
-from vtbdrake.components.perception.tracking import TargetTracker
+from vtbdrake.components.perception.target_tracker import TargetTracker
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScannerConfig, connect_laser_scanner
 from vtbdrake.rollout import Executor, ProcessExecutor

@@ -309,7 +309,7 @@ def test_drift_grows_as_a_random_walk_does():
 @pytest.mark.parametrize("name", ["along", "across", "heading", "turn"])
 def test_drift_is_finite_and_not_negative(name):
     for bad in (-1.0, np.inf, np.nan):
-        with pytest.raises(ValueError, match=f"{name} of a drift is a finite deviation"):
+        with pytest.raises(ValueError, match=f"DriftModel.{name} must be a finite number of at least 0 "):
             DriftModel(**{name: bad})
 
 

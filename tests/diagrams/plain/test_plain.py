@@ -88,8 +88,8 @@ def test_carrier_drives_on_mars() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"abundance": 0.5}, "between 0.5 and 30 % of a plain, not 50 %"),
-        ({"least_diameter": 3.0}, "not from 3.0 to 2.0 m"),
+        ({"abundance": 0.5}, "abundance must be a number from 0.005 to 0.3, not 0.5"),
+        ({"least_diameter": 3.0}, "from 3.0 to 2.0 m: no such range"),
         ({"track_width": 1.0}, "the carrier is 1.5 m wide"),
     ],
 )

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.registration import RegistrationConfig
-from vtbdrake.components.perception.tracking import STATE_SIZE, body_state
+from vtbdrake.components.perception.target_tracker import STATE_SIZE, body_state
 from vtbdrake.scan import Scan
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, pose_at

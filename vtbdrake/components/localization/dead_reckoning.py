@@ -7,7 +7,7 @@ the scanner.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from math import atan2, ceil, cos, hypot, inf, sin, sqrt
 
@@ -19,6 +19,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 from vtbdrake.arrays import Array
 from vtbdrake.components.localization.planar import rotation
 from vtbdrake.scan import Scan
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, NamedVector, Quantity
 from vtbdrake.state.declarations import NamedView
 
@@ -54,25 +55,15 @@ class DriftModel:
     ``along`` and ``across`` are calibrated with the simulated carrier of `vtbdrake_diagrams.forest`, which slips on
     slopes; the others are assumed. The scale error of the wheels and the bias of the gyros, which last longer, are not
     part of this model: a `Tracker` estimates them.
-
-    Attributes:
-        along: Standard deviation along the path, in m per root metre.
-        across: Standard deviation sideways by slip, in m per root metre.
-        heading: Standard deviation of the heading, in rad per root second.
-        turn: Standard deviation of the heading in turns, in rad per root radian.
     """
 
-    along: float = 0.04
-    across: float = 0.03
-    heading: float = 0.001
-    turn: float = 0.01
+    along: float = setting(0.04, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)
+    across: float = setting(0.03, "Standard deviation sideways by slip.", unit="m/sqrt(m)", ge=0)
+    heading: float = setting(0.001, "Standard deviation of the heading.", unit="rad/sqrt(s)", ge=0)
+    turn: float = setting(0.01, "Standard deviation of the heading in turns.", unit="rad/sqrt(rad)", ge=0)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not 0.0 <= getattr(self, field.name) < inf:
-                raise ValueError(
-                    f"{field.name} of a drift is a finite deviation of at least 0, not {getattr(self, field.name)!r}"
-                )
+        check_settings(self)
 
     def covariance(self, motion: ArrayLike, duration: float) -> Array:
         """Return the covariance (3, 3) of a motion X_AB by dead reckoning, in the order x, y (in A, m), heading (rad).

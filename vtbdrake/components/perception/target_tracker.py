@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import ceil, inf
 
 import numpy as np
@@ -21,6 +21,7 @@ from vtbdrake.components.perception.estimate import (
     rotation_matrix,
     rotation_vector,
 )
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_to_array
 
@@ -81,22 +82,22 @@ class MotionModel:
     does between estimates that are dt apart: (I_max - I_min) / I_mid ω^2 sqrt(dt), 0.0012 rad/s^1.5 for principal
     moments of 1, 0.6 and 0.4 at 3 deg/s, five times a second.
 
-    Attributes:
-        rate_noise: Square root of the spectral density of the angular acceleration, in rad/s^1.5.
-        velocity_noise: Square root of the spectral density of the acceleration, in m/s^1.5.
-        first_rate: Initial standard deviation of the angular velocity, in rad/s.
-        first_velocity: Initial standard deviation of the velocity, in m/s.
-        inertia: [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of the body about its centre of mass, in T; only ratios matter.
+    The inertia is that of the body about its centre of mass, in T, of which only ratios matter.
     """
 
-    rate_noise: float = 1e-3
-    velocity_noise: float = 1e-3
-    first_rate: float = 0.1
-    first_velocity: float = 0.1
-    inertia: list[float] = field(default_factory=lambda: list(SPHERE))
+    rate_noise: float = setting(
+        1e-3, "Square root of the spectral density of the angular acceleration.", unit="rad/s^1.5", ge=0
+    )
+    velocity_noise: float = setting(
+        1e-3, "Square root of the spectral density of the acceleration.", unit="m/s^1.5", ge=0
+    )
+    first_rate: float = setting(0.1, "Initial standard deviation of the angular velocity.", unit="rad/s", gt=0)
+    first_velocity: float = setting(0.1, "Initial standard deviation of the velocity.", unit="m/s", gt=0)
+    inertia: list[float] = setting(doc="[Ixx, Iyy, Izz, Ixy, Ixz, Iyz].", default_factory=lambda: list(SPHERE))
 
     def check(self) -> None:
-        """Raise ValueError if the inertia is not that of a body."""
+        """Raise ValueError if a setting is out of range, or the inertia is not that of a body."""
+        check_settings(self)
         if len(self.inertia) != 6 or not RotationalInertia(*self.inertia).CouldBePhysicallyValid():
             raise ValueError(
                 "MotionModel.inertia must be [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of a body: positive, no principal moment "

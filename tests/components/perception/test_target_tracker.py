@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from vtbdrake.components.perception.estimate import PoseEstimate, cross_matrix, rotation_matrix, rotation_vector
-from vtbdrake.components.perception.tracking import SPHERE, MotionModel, TargetTracker, Track, pose_of_state
+from vtbdrake.components.perception.target_tracker import SPHERE, MotionModel, TargetTracker, Track, pose_of_state
 from vtbdrake.state import AddressedSystem
 
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.01, 0.01, 0.03]) ** 2
