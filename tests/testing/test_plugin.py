@@ -1,0 +1,30 @@
+"""The plugin: a test per scenario and check, and nothing of Drake before a test asks for it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.testbeds import PendulumScenario
+from vtbdrake.testing import parametrize_with_checks
+
+pytestmark = pytest.mark.one_python
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@parametrize_with_checks([PendulumScenario()], horizon=0.05)
+def test_every_check_is_a_test(scenario, check):
+    check(scenario)
+
+
+def test_plugin_loads_nothing_of_drake():
+    code = "import sys, vtbdrake.testing.plugin; print([m for m in sys.modules if m.partition('.')[0] == 'pydrake'])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_unknown_check_is_refused_with_the_nearest():
+    with pytest.raises(ValueError, match="no check 'check_build'.*check_builds"):
+        parametrize_with_checks([PendulumScenario()], expected_failed_checks={"check_build": "misspelt"})
