@@ -21,6 +21,7 @@ FAILED = 1
 _COMMANDS = {
     "boundary": "problem:boundary",
     "diagram": "testbed:diagram",
+    "doctor": "doctor:doctor",
     "export": "log:export",
     "get": "live:get",
     "hub": "hub:hub",

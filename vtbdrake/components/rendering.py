@@ -8,6 +8,7 @@ and a Context without cameras has no renderer.
 from __future__ import annotations
 
 import copy
+import json
 import os
 import subprocess
 import sys
@@ -40,15 +41,35 @@ FULL_SCALE = 255.0
 _WITH_INSIDE = {"Box", "Capsule", "Cylinder", "Ellipsoid", "Sphere"}
 
 _PROBE = """
-from pydrake.geometry import (ClippingRange, ColorRenderCamera, MakeRenderEngineVtk, RenderCameraCore,
-                              RenderEngineVtkParams, SceneGraph)
+from pydrake.geometry import (ClippingRange, ColorRenderCamera, GeometryInstance, MakeRenderEngineVtk,
+                              PerceptionProperties, RenderCameraCore, RenderEngineVtkParams, Rgba, SceneGraph, Sphere)
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 scene_graph = SceneGraph()
 scene_graph.AddRenderer("probe", MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
-core = RenderCameraCore("probe", CameraInfo(8, 8, 1.0), ClippingRange(0.1, 1.0), RigidTransform())
+source = scene_graph.RegisterSource("probe")
+for k in range(20):
+    ball = GeometryInstance(RigidTransform([0.2 * (k % 5) - 0.4, 0.2 * (k // 5) - 0.3, 1.0]), Sphere(0.08), f"{k}")
+    ball.set_perception_properties(PerceptionProperties())
+    ball.mutable_perception_properties().AddProperty("phong", "diffuse", Rgba(0.5, 0.6, 0.7, 1.0))
+    scene_graph.RegisterAnchoredGeometry(source, ball)
+core = RenderCameraCore("probe", CameraInfo(640, 480, 1.0), ClippingRange(0.1, 10.0), RigidTransform())
 query = scene_graph.get_query_output_port().Eval(scene_graph.CreateDefaultContext())
-query.RenderColorImage(ColorRenderCamera(core, False), scene_graph.world_frame_id(), RigidTransform())
+def render():
+    query.RenderColorImage(ColorRenderCamera(core, False), scene_graph.world_frame_id(), RigidTransform())
+render()
+"""
+# The context of the probe's renderer is current, so that OpenGL tells whose it is.
+_MEASURE = """
+import ctypes, json, time
+get_address = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
+get_address.restype = ctypes.c_void_p
+name = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_uint)(get_address(b"glGetString"))(0x1F01)  # GL_RENDERER
+count, begin = 0, time.perf_counter()
+while (seconds := time.perf_counter() - begin) < 0.3:
+    render()
+    count += 1
+print(json.dumps({"renderer": (name or b"unknown").decode(), "images_per_second": count / seconds}))
 """
 
 
@@ -67,7 +88,35 @@ def check_rendering() -> None:
     """
     if os.environ.get(_CHECKED) == "EGL":
         return
-    command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}{_PROBE}"]
+    _run_probe(_PROBE)
+    os.environ[_CHECKED] = "EGL"
+
+
+@dataclass(frozen=True)
+class RenderingSpeed:
+    """How fast this machine renders colour images of 640 x 480 pixels, of 20 balls without shadows."""
+
+    renderer: str  # what OpenGL calls its back end: a graphics card, or llvmpipe, which computes on the processor
+    images_per_second: float
+
+    @property
+    def in_software(self) -> bool:
+        """Return whether the processor renders, and no graphics card."""
+        return self.renderer.startswith(("llvmpipe", "softpipe", "swrast"))
+
+
+def measure_rendering() -> RenderingSpeed:
+    """Measure in another process, within a second, how fast images can be rendered without a display.
+
+    Raises:
+        RenderingError: There is no working EGL; the message names the packages to install.
+    """
+    return RenderingSpeed(**json.loads(_run_probe(_PROBE + _MEASURE)))
+
+
+def _run_probe(program: str) -> str:
+    """Return what a program prints that renders in another process."""
+    command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}{program}"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False)
         reason = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
@@ -79,7 +128,7 @@ def check_rendering() -> None:
             "this machine cannot render images: install Mesa's EGL and its drivers (on Debian: apt-get install libegl1 "
             f"libgl1-mesa-dri), or use a scenario without cameras ({reason})"
         )
-    os.environ[_CHECKED] = "EGL"
+    return done.stdout
 
 
 @dataclass(frozen=True)

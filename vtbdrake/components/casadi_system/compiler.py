@@ -48,12 +48,12 @@ def compiled(function: casadi.Function) -> casadi.Function:
         raise ValueError(
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
-    command = (*shlex.split(os.environ.get("CC") or "cc"), *_FLAGS)
+    command = _command()
     recipe = "\n".join((source, *command, platform.system(), platform.machine()))
     library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
     with _ONE_AT_A_TIME:
         if not library.exists():
-            _compile(source, command, library)
+            compile_library(source, library)
     return casadi.external(function.name(), str(library))
 
 
@@ -71,7 +71,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vtbdrake" / "casadi"
 
 
-def _compile(source: str, command: tuple[str, ...], library: Path) -> None:
+def _command() -> tuple[str, ...]:
+    return (*shlex.split(os.environ.get("CC") or "cc"), *_FLAGS)
+
+
+def compile_library(source: str, library: Path) -> None:
+    """Compile C code to a shared library, which is written whole or not at all.
+
+    Raises:
+        CompilerError: The compiler is missing or fails.
+    """
+    command = _command()
     if shutil.which(command[0]) is None:
         raise CompilerError(
             f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc), name "
