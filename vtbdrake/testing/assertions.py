@@ -1,0 +1,429 @@
+"""Assertions about motions, logs and loops: each names the first offending time and address, and writes a plot."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from math import ceil, inf, log
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vtbdrake.argument_checks import as_addresses
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.statistics import QUANTITIES, LoopStatistics
+from vtbdrake.control.stepping import ChangeKind
+from vtbdrake.control.switching import checked_continuity
+from vtbdrake.failures import error_text
+from vtbdrake.machine import MachineStatistics
+from vtbdrake.recording.log_reader import ControlLog, read_log
+from vtbdrake.recording.replay import Target
+from vtbdrake.recording.replay import replay as replay_log
+from vtbdrake.testbed.switch import Position
+from vtbdrake.testing.failure import fail
+from vtbdrake.testing.trace import ENERGY, Source, Trace, TraceError, trace_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def assert_bounded(
+    source: Source, address: str, *, lower: ArrayLike = -inf, upper: ArrayLike = inf, after: float = 0.0
+) -> None:
+    """Assert that a value stays within bounds. NaN is out of any bounds.
+
+    Args:
+        source: A trace, a rollout or a log, see `trace_of`.
+        address: Address of the value.
+        lower: The lower bound in the value's unit, a scalar or an array of its shape.
+        upper: The upper bound, likewise.
+        after: Time in seconds, from the first sample on, before which nothing is asserted.
+
+    Raises:
+        AssertionError: It leaves its bounds.
+        ValueError: There are no bounds, or there is no sample.
+    """
+    __tracebackhide__ = True
+    if np.all(np.equal(lower, -inf)) and np.all(np.equal(upper, inf)):
+        raise ValueError(f"give lower= or upper= of {address}: nothing is asserted without bounds")
+    trace = trace_of(source, address)
+    values = trace[address]
+    asserted = _from(trace, after)
+    wrong = ~((values >= np.asarray(lower)) & (values <= np.asarray(upper)))
+    place = _first(wrong, asserted)
+    if place is None:
+        return
+    value, (low, high) = values[place], (_entry(bound, values, place) for bound in (lower, upper))
+    limit = f"at least {low:.6g}" if value < low else f"at most {high:.6g}" if value > high else "a number"
+    fail(
+        f"{_named(address, place)} leaves its bounds at {_when(trace, place)}: {value:.6g}{_unit(trace, address)} "
+        f"instead of {limit}",
+        name="bounded",
+        draw=lambda axes: _draw(axes, trace, address, place, levels=(low, high)),
+    )
+
+
+def assert_settles(source: Source, address: str, *, to: ArrayLike, within: float, tolerance: ArrayLike) -> None:
+    """Assert that a value has come close to a target by some time, and stays there.
+
+    Args:
+        source: A trace, a rollout or a log, see `trace_of`.
+        address: Address of the value.
+        to: The target, a scalar or an array of the value's shape.
+        within: Time in seconds, from the first sample on, from which the value has to be there.
+        tolerance: The largest difference, a scalar or an array.
+
+    Raises:
+        AssertionError: It is elsewhere at some later time.
+        ValueError: The source ends before.
+    """
+    __tracebackhide__ = True
+    trace = trace_of(source, address)
+    values = trace[address]
+    asserted = _from(trace, within)
+    wrong = ~(np.abs(values - np.asarray(to)) <= np.asarray(tolerance))
+    place = _first(wrong, asserted)
+    if place is None:
+        return
+    target, margin = _entry(to, values, place), _entry(tolerance, values, place)
+    fail(
+        f"{_named(address, place)} has not settled at {_when(trace, place)}: {values[place]:.6g}"
+        f"{_unit(trace, address)} instead of {target:.6g} +- {margin:.6g} from {within:g} s on",
+        name="settles",
+        draw=lambda axes: _draw(axes, trace, address, place, levels=(target - margin, target + margin)),
+    )
+
+
+def assert_energy_never_rises(source: Source, address: str = ENERGY, *, tolerance: float = 0.0) -> None:
+    """Assert that an energy never rises above a level to which it has fallen before.
+
+    Args:
+        source: A trace, a rollout or a log, see `trace_of`; `simulate` records the `ENERGY` of the plant.
+        address: Address of the energy, a scalar.
+        tolerance: The largest rise in J. An integrator makes some: measure it in a motion that conserves energy. What
+            bodies in compliant contact store is no part of the plant's energy.
+
+    Raises:
+        AssertionError: It rises.
+    """
+    __tracebackhide__ = True
+    trace = trace_of(source, address)
+    energy = trace[address].reshape(len(trace.times), -1)
+    if energy.shape[1] != 1:
+        raise TraceError(f"an energy is one number, but {address} has {energy.shape[1]}")
+    energy = energy[:, 0]
+    least = np.minimum.accumulate(energy)
+    place = _first(~(energy - least <= tolerance), np.ones(len(energy), bool))
+    if place is None:
+        return
+    before = int(np.argmin(energy[: place[0] + 1]))
+    fail(
+        f"{address} rises: {energy[place]:.6g} J at {_when(trace, place)}, after {least[place]:.6g} J at t = "
+        f"{trace.times[before]:.6g} s; a rise of {tolerance:g} J is allowed",
+        name="energy",
+        draw=lambda axes: _draw(axes, trace, address, place, levels=(float(least[place]) + tolerance,)),
+    )
+
+
+def assert_same_motion(
+    source: Source,
+    reference: Source,
+    addresses: str | Sequence[str],
+    *,
+    tolerance: float | Mapping[str, ArrayLike] = 0.0,
+) -> None:
+    """Assert that two motions are the same, by default to the last bit.
+
+    Args:
+        source: A trace, a rollout or a log, see `trace_of`.
+        reference: What it should be, with the same sample times.
+        addresses: The addresses that are compared.
+        tolerance: The largest difference; or by address, where the others must be the same to the last bit.
+
+    Raises:
+        AssertionError: They differ.
+        TraceError: They are not sampled at the same times.
+    """
+    __tracebackhide__ = True
+    addresses = as_addresses("what is compared", addresses)
+    trace, other = trace_of(source, addresses), trace_of(reference, addresses)
+    count = min(len(trace.times), len(other.times))
+    if not np.allclose(trace.times[:count], other.times[:count], rtol=0.0, atol=1e-9):
+        raise TraceError("two motions are compared at the same times, but these have other sample times")
+    firsts: list[tuple[tuple[int, ...], str]] = []
+    for address in addresses:
+        a, b = trace[address][:count], other[address][:count]
+        if a.shape != b.shape:
+            raise TraceError(f"{address} has the shape {a.shape[1:]} in one motion, and {b.shape[1:]} in the other")
+        allowed = tolerance.get(address, 0.0) if isinstance(tolerance, Mapping) else tolerance
+        same = (np.abs(a - b) <= np.asarray(allowed)) | (a == b) | (np.isnan(a) & np.isnan(b))
+        if (place := _first(~same, np.ones(count, bool))) is not None:
+            firsts.append((place, address))
+    if firsts:
+        place, address = min(firsts)
+        a, b = trace[address][place], other[address][place]
+        fail(
+            f"{_named(address, place)} differs first at {_when(trace, place)}: {a!r} instead of {b!r}, a difference of "
+            f"{abs(a - b):.3g}{_unit(trace, address)}",
+            name="same_motion",
+            draw=lambda axes: _draw(axes, trace, address, place, reference=other),
+        )
+    if len(trace.times) != len(other.times):
+        ends = f"{trace.times[-1]:.6g} s, and the other at {other.times[-1]:.6g} s"
+        fail(f"the motions are the same as far as both go, but one ends at t = {ends}", name="same_motion")
+
+
+def assert_continuous_at_switch(
+    log: ControlLog | str | os.PathLike[str], *, at_most: Mapping[str, ArrayLike] | None = None
+) -> None:
+    """Assert that no command jumped where switches were thrown while the loop was recorded.
+
+    Where an actuator signal goes to real, its first sent command is compared with the sensor signal that tells what
+    acts there, see ``continuity`` of the scenario's `Deployment`. Where another switch is thrown while it is on real,
+    it is compared with the command before.
+
+    Args:
+        log: A log, or the path of its file.
+        at_most: The largest difference by actuator signal, a scalar or one per entry. By default, the largest one of
+            the deployment where a signal goes to real; else what the rate of the signal allows in a period.
+
+    Raises:
+        AssertionError: A command jumped.
+        ValueError: The log has no switch, or an actuator signal has no largest difference.
+    """
+    __tracebackhide__ = True
+    log = log if isinstance(log, ControlLog) else read_log(log)
+    switches = [(i, change.values) for i, change in log.changes if change.kind == ChangeKind.SWITCH]
+    if not switches:
+        raise ValueError(f"{log.path} has no switch: nothing is asserted")
+    scenario = log.scenario
+    interface, deployment = scenario.interface(), scenario.deployment()
+    continuity = checked_continuity(interface, deployment.continuity, period=log.header.period)
+    limits = {name: np.asarray(limit, float) for name, limit in (at_most or {}).items()}
+    for i, positions in switches:
+        for signal in interface.act:
+            if not signal.is_vector:
+                continue
+            name, sent = signal.name, log.sent[signal.name]
+            step = np.asarray(signal.rate) * log.header.period
+            if i > 0 and np.isfinite(sent[i - 1]).all():
+                reference, source = sent[i - 1], "the command before"
+                limit = limits.get(name, step if np.isfinite(step).all() else None)
+            elif name in continuity and positions.get(f"act.{name}", Position.SIM) != Position.SIM:
+                sensor, largest = continuity[name]
+                reference, source = log.fed[sensor][i], f"sense.{sensor}"
+                limit = limits.get(name, largest + np.where(np.isfinite(step), step, 0.0))
+            else:
+                continue  # It stays on sim, or it may jump, as the deployment says.
+            if limit is None:
+                raise ValueError(f"the rate of {name} is not limited: give at_most={{{name!r}: largest difference}}")
+            if np.isnan(sent[i]).all():
+                continue  # Nothing was sent.
+            gap = np.abs(sent[i] - reference)
+            if (wrong := np.flatnonzero(~(gap <= limit * (1.0 + 1e-9)))).size:
+                k = int(wrong[0])
+                most = float(np.broadcast_to(limit, gap.shape)[k])
+                trace = trace_of(log, f"sent.{name}")
+                fail(
+                    f"sent.{name}[{k}] jumps where a switch is thrown, at {_when(trace, (i,))}: {sent[i][k]:.6g} is "
+                    f"{gap[k]:.3g} {signal.unit} away from {source}; {most:.3g} is allowed",
+                    name="continuous_at_switch",
+                    draw=partial(_draw, trace=trace, address=f"sent.{name}", place=(i, k)),
+                )
+
+
+def assert_succeeds(
+    trials: Iterable[bool] | Callable[[int], object], *, rate: float, confidence: float = 0.95, count: int | None = None
+) -> None:
+    """Assert that trials succeed at some rate at least, with some confidence.
+
+    The rate is at least the lower limit of Clopper and Pearson's one-sided interval. That all of n trials succeed shows
+    a rate r with the confidence c only if n >= log(1 - c) / log(r): 29 trials for 0.9 with 95 %.
+
+    Args:
+        trials: The outcomes, True for success; or a function of the number of the trial (its seed, say), which fails by
+            an AssertionError or by returning False.
+        rate: The rate that has to be shown, between 0 and 1.
+        confidence: The confidence, between 0 and 1.
+        count: Number of calls of the function; by default twice the number of trials that all have to succeed.
+
+    Raises:
+        AssertionError: The rate is not shown.
+        ValueError: Not even success in all trials would show it.
+    """
+    __tracebackhide__ = True
+    from scipy.stats import binomtest
+
+    if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0):
+        raise ValueError(f"a rate and a confidence lie between 0 and 1, not at {rate} and {confidence}")
+    least = ceil(log(1.0 - confidence) / log(rate) - 1e-9)
+    reasons: dict[int, str] = {}
+    outcomes = []
+    if callable(trials):
+        for number in range(2 * least if count is None else count):
+            try:
+                outcomes.append(trials(number) is not False)
+            except AssertionError as error:
+                outcomes.append(False)
+                reasons.setdefault(number, error_text(error))
+    else:
+        outcomes = [bool(outcome) for outcome in trials]
+    if len(outcomes) < least:
+        raise ValueError(
+            f"{len(outcomes)} trials cannot show a rate of {rate:g} with {confidence:.4g} confidence, even if all "
+            f"succeed: {least} are needed"
+        )
+    successes = sum(outcomes)
+    shown = binomtest(successes, len(outcomes), alternative="greater").proportion_ci(confidence, "exact").low
+    if shown >= rate:
+        return
+    failed = [number for number, outcome in enumerate(outcomes) if not outcome]
+    first = f", such as number {failed[0]}" if failed else ""
+    because = f": {reasons[failed[0]]}" if failed and failed[0] in reasons else ""
+    fail(
+        f"{successes} of {len(outcomes)} trials succeed: that shows a rate of {shown:.3f} with {confidence:.4g} "
+        f"confidence, not {rate:g}; {len(failed)} fail{first}{because}",
+        name="succeeds",
+    )
+
+
+def assert_replays(log: ControlLog | str | os.PathLike[str], *, target: Target | None = None) -> None:
+    """Assert that the DPS of today does in a replay what is in a log, bit for bit: a log is a golden test.
+
+    Args:
+        log: A log, or the path of its file.
+        target: See `replay`; by default the recorded one.
+
+    Raises:
+        AssertionError: A command, the time or a digest of the state differs, or the log is not whole.
+        LogError: The file is no log, or its scenario has changed since.
+    """
+    __tracebackhide__ = True
+    log = log if isinstance(log, ControlLog) else read_log(log)
+    report = replay_log(log, target)
+    if report.identical:
+        return
+    versions = "".join(f"\n{line}" for line in report.versions)
+    difference = report.first_difference
+    if difference is None:
+        fail(f"{log.path} is not replayed as a whole: {report.ended}{versions}", name="replays")
+    draw = None
+    if difference.subject in log.actuation:
+        address = f"act.{difference.subject}"
+        recorded = trace_of(log, address)
+        replayed = Trace(report.times, {address: report.actuation[difference.subject]}, recorded.units)
+        at = int(np.flatnonzero(log.numbers == difference.cycle)[0])
+
+        def draw_difference(axes: Axes) -> None:
+            _draw(axes, replayed, address, (at, 0), reference=recorded)
+
+        draw = draw_difference
+    fail(f"{log.path} replays differently: {difference}{versions}", name="replays", draw=draw)
+
+
+def assert_cycle_budget(
+    source: Runtime | LoopStatistics | MachineStatistics,
+    *,
+    at_most: float,
+    percentile: float = 99.0,
+    of: str = "cycle",
+    against: Runtime | LoopStatistics | MachineStatistics | None = None,
+) -> None:
+    """Assert that the cycles of a loop take at most some share of their period.
+
+    Args:
+        source: A loop, or its statistics.
+        at_most: The largest ratio of a cycle's time to the period.
+        percentile: The share of the cycles that has to keep it, in percent.
+        of: What is measured: ``cycle``, ``step`` (of the DPS alone) or ``lateness``.
+        against: Another loop, measured beside it on the same computer: the ratio is to its percentile, instead of to
+            the period. Such a ratio does not depend on how fast the computer is today.
+
+    Raises:
+        AssertionError: They take longer.
+        ValueError: There are no cycles.
+    """
+    __tracebackhide__ = True
+    if of not in QUANTITIES:
+        raise ValueError(f"a loop's statistics have {', '.join(QUANTITIES)}, not {of!r}")
+    statistics = _statistics(source)
+    measured = statistics.histograms[of].percentile(percentile)
+    reference = statistics.period if against is None else _statistics(against).histograms[of].percentile(percentile)
+    name = "its period" if against is None else "the other loop's"
+    ratio = measured / reference
+    if not ratio <= at_most:
+        fail(
+            f"{percentile:g} % of the loop's {statistics.cycles} cycles have a {of} of up to {1e6 * measured:.0f} us, "
+            f"{ratio:.3g} times {name} of {1e6 * reference:.0f} us; {at_most:g} times is allowed\n{statistics}",
+            name="cycle_budget",
+        )
+
+
+def _statistics(source: Runtime | LoopStatistics | MachineStatistics) -> LoopStatistics:
+    statistics = source.statistics if isinstance(source, Runtime) else source
+    statistics = statistics.loop if isinstance(statistics, MachineStatistics) else statistics
+    if not statistics.cycles:
+        raise ValueError("the loop has run no cycle: nothing is asserted")
+    return statistics
+
+
+def _from(trace: Trace, after: float) -> np.ndarray:
+    """Return which samples lie at least ``after`` seconds behind the first one, shape (n,)."""
+    if not len(trace.times) or trace.times[-1] - trace.times[0] < after - 1e-9:
+        length = trace.times[-1] - trace.times[0] if len(trace.times) else 0.0
+        raise TraceError(f"there are {length:g} s only, and no sample after {after:g} s: nothing is asserted")
+    return trace.times - trace.times[0] >= after - 1e-9
+
+
+def _first(wrong: np.ndarray, asserted: np.ndarray) -> tuple[int, ...] | None:
+    """Return the index of the first sample and entry that is wrong, or None."""
+    wrong = wrong & asserted.reshape(-1, *[1] * (wrong.ndim - 1))
+    place = np.argwhere(wrong)
+    return tuple(place[0].tolist()) if len(place) else None
+
+
+def _entry(bound: ArrayLike, values: np.ndarray, place: tuple[int, ...]) -> float:
+    return float(np.broadcast_to(bound, values.shape[1:])[place[1:]])
+
+
+def _named(address: str, place: tuple[int, ...]) -> str:
+    return f"{address}[{', '.join(map(str, place[1:]))}]" if len(place) > 1 else address
+
+
+def _when(trace: Trace, place: tuple[int, ...]) -> str:
+    return f"t = {trace.times[place[0]]:.6g} s"
+
+
+def _unit(trace: Trace, address: str) -> str:
+    unit = trace.units.get(address, "1")
+    return "" if unit in ("", "1") or "," in unit else f" {unit}"
+
+
+def _draw(
+    axes: Axes,
+    trace: Trace,
+    address: str,
+    place: tuple[int, ...],
+    levels: Iterable[float] = (),
+    reference: Trace | None = None,
+) -> None:
+    """Draw the entry that is wrong over time, what was expected, and the first offending time."""
+    from vtbdrake.visualization.plots import FAILED, THRESHOLD, label
+
+    entry: Any = (slice(None), *place[1:])
+    name = _named(address, place)
+    if reference is not None:
+        axes.plot(reference.times, reference[address][entry], color=THRESHOLD, ls=(0, (4, 2)), label="expected")
+    axes.plot(trace.times, trace[address][entry], lw=1.4, label=name)
+    for level in levels:
+        if np.isfinite(level):
+            axes.axhline(level, color=THRESHOLD, lw=1, ls=(0, (4, 2)))
+    value: Any = trace[address][entry][place[0]]
+    axes.axvline(trace.times[place[0]], color=FAILED, lw=0.8)
+    axes.plot(trace.times[place[0]], value, "x", color=FAILED, ms=8, mew=2)
+    axes.set(xlabel="time t [s]", ylabel=label(name, trace.units.get(address, "")))
+    axes.set_title(f"first at {_when(trace, place)}")
+    if reference is not None:
+        axes.legend(fontsize="small")
