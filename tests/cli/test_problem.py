@@ -8,8 +8,8 @@ import numpy as np
 from tests.cli.program import ACROBOT, ANGLE, DAMPING, PENDULUM, RATE, run
 from tests.testbeds import PendulumScenario
 from vtbdrake import Parameter, Problem, Quality
-from vtbdrake.cli.problem import largest, magnitude, smallest
 from vtbdrake.optimization import Sweep
+from vtbdrake.rollout.named_function import largest, magnitude, smallest
 
 
 def stated(**more: Any) -> Problem:

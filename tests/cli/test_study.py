@@ -8,7 +8,7 @@ import pytest
 from tests.cli.program import ANGLE, DAMPING, PENDULUM, RATE, error_of, run
 from tests.testbeds import PendulumScenario
 from vtbdrake import Choice, Constraint, CVaR, Parameter, Problem, Quality, Study
-from vtbdrake.cli.problem import largest, magnitude
+from vtbdrake.rollout.named_function import largest, magnitude
 
 BEGIN = [PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--vary", f"{RATE}=-3:3", "--quality", ANGLE]
 BEGIN += ["--sample-period", 0.1, "--minimize", "--condition", f"{DAMPING}=0.1", "--condition", f"{DAMPING}=0.2"]

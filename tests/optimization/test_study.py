@@ -336,6 +336,39 @@ def test_points_given_by_another_process_are_evaluated_and_told(tmp_path):
         assert table(again) == first
 
 
+def _damping_study(dampings, path, **settings):
+    problem = pendulum_problem(parameters=[], conditions=[{DAMPING: damping} for damping in dampings])
+    return problem.study(path, solver="grid", **settings)
+
+
+def test_a_grid_without_parameters_is_the_scenario_under_all_conditions(tmp_path):
+    with _damping_study([0.1, 0.4], tmp_path / "a.db") as study:
+        study.run(rollouts=2, executor="serial", progress=False)
+        assert study.reason == "solver" and study.message.startswith("grid is finished")
+        values = [study.rollouts[(), condition].value for condition in (0, 1)]
+        assert study.best.value == max(values)  # A cost: the worst condition.
+    for damping, value in zip([0.1, 0.4], values, strict=True):
+        assert value == pendulum_problem(conditions=[{DAMPING: damping}]).rollout([0.0, 0.0]).value
+
+
+def test_further_conditions_keep_the_rollouts_of_a_study(tmp_path):
+    path = tmp_path / "a.db"
+    _damping_study([0.1, 0.4], path).run(rollouts=2, executor="serial", progress=False).close()
+    with pytest.raises(StudyError, match="another problem"):
+        _damping_study([0.1, 0.4, 0.05], path)
+    for others in ([0.4, 0.1, 0.05], [0.1], [0.1, 0.05]):
+        with pytest.raises(StudyError, match="another problem"):
+            _damping_study(others, path, more_conditions=True)
+    with Study.open(path) as study:
+        first = study.finished
+    with _damping_study([0.1, 0.4, 0.05], path, more_conditions=True) as study:
+        study.run(rollouts=3, executor="serial", progress=False)
+        assert {key: study.finished[key] for key in first} == first and len(study) == 3
+        whole = _damping_study([0.1, 0.4, 0.05], None).run(rollouts=3, executor="serial", progress=False)
+        assert table(study) == table(whole)
+    _damping_study([0.1, 0.4, 0.05], path, more_conditions=True).close()  # Nothing is new.
+
+
 def test_a_study_can_be_read_while_it_runs(tmp_path):
     path = tmp_path / "a.db"
     process = subprocess.Popen(

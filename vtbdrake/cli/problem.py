@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from collections import Counter
@@ -38,11 +37,11 @@ from vtbdrake.optimization.boundary import why_no_boundary
 from vtbdrake.optimization.parameter import Dimension, point_text
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.executor import NAMES
+from vtbdrake.rollout.named_function import FUNCTION, largest, magnitude, named_function, smallest
 from vtbdrake.state.variables import with_unit
 from vtbdrake.testbed import Scenario
 
-_FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-_CALL = re.compile(rf"({_FUNCTION.pattern})\((.*)\)")
+_CALL = re.compile(rf"({FUNCTION.pattern})\((.*)\)")
 
 
 def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -94,21 +93,6 @@ _file_options = grouped(
 )
 
 
-def magnitude(value: float | np.ndarray) -> float:
-    """Return abs(value); of an array, the largest entry."""
-    return float(np.max(np.abs(value)))
-
-
-def largest(value: float | np.ndarray) -> float:
-    """Return the value; of an array, its largest entry."""
-    return float(np.max(value))
-
-
-def smallest(value: float | np.ndarray) -> float:
-    """Return the value; of an array, its smallest entry."""
-    return float(np.min(value))
-
-
 def make_problem(
     scenario: Scenario,
     parameters: Sequence[Dimension],
@@ -143,13 +127,13 @@ def make_problem(
 
 
 def _quality(text: str, of: Sequence[str]) -> Quality:
-    if not _FUNCTION.fullmatch(text):
+    if not FUNCTION.fullmatch(text):
         if of:
             raise click.UsageError(f"--of belongs to a quality module:function; {text} is an address")
         return Quality(magnitude, of=text)
     if not of:
         raise click.UsageError(f"--quality {text} needs its arguments: add --of ADDRESS for each")
-    return Quality(_function(text), of=of)
+    return Quality(named_function(text), of=of)
 
 
 def make_constraint(text: str, *, limit: str) -> Constraint:
@@ -168,22 +152,10 @@ def make_constraint(text: str, *, limit: str) -> Constraint:
     call = _CALL.fullmatch(subject)
     if call is not None:
         of = [address.strip() for address in call[2].split(",") if address.strip()]
-        return Constraint(_function(call[1]), of=of, **limits)
-    if not subject or _FUNCTION.fullmatch(subject):
+        return Constraint(named_function(call[1]), of=of, **limits)
+    if not subject or FUNCTION.fullmatch(subject):
         raise click.BadParameter(f"expected {form}, not {text!r}")
     return Constraint(largest if limit == "at_most" else smallest, of=subject, **limits)
-
-
-def _function(text: str) -> Callable[..., Any]:
-    module_name, _, name = text.partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise click.UsageError(f"cannot import {module_name} of the quality {text}: {error}") from error
-    function = getattr(module, name, None)
-    if not callable(function):
-        raise click.UsageError(f"{module_name} has no function {name!r}")
-    return function
 
 
 @click.command()

@@ -176,6 +176,13 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
     return phrases
 
 
+def adds_conditions(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> bool:
+    """Return whether two described problems differ in nothing but further conditions behind theirs, and in code."""
+    count = len(theirs["conditions"])
+    same, first = {**theirs, "conditions": ours["conditions"]}, ours["conditions"][:count]
+    return not differences(same, ours) and first == theirs["conditions"] and len(ours["conditions"]) > count
+
+
 def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
     """Return the differences in code of two otherwise equal described problems, each as a phrase."""
     if theirs.get("python") != ours["python"]:

@@ -470,6 +470,7 @@ class Problem:
         options: Mapping[str, Any] | None = None,
         parallel: int | None = None,
         allow_changed_code: bool = False,
+        more_conditions: bool = False,
     ) -> Study:
         """Begin a study of the problem, or resume the one in a file.
 
@@ -489,6 +490,8 @@ class Problem:
                 but those in which a quality function failed run again. What a function looks up by a computed name
                 (``getattr``, ``eval``), a file that it reads, and global state of installed packages are not seen;
                 objects that cannot be read are named in a warning, and in `Study.summary`.
+            more_conditions: Whether the problem may have further conditions behind those of the file. Its rollouts
+                stay; its points are evaluated again, by the rollouts that are missing.
 
         Raises:
             StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed,
@@ -504,4 +507,5 @@ class Problem:
             options=options,
             parallel=parallel,
             allow_changed_code=allow_changed_code,
+            more_conditions=more_conditions,
         )

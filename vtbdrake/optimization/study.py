@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any, Self
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.failures import safe_text
 from vtbdrake.lazy import extra_module
-from vtbdrake.optimization.identity import code_changes, describe, differences, dimensions, plain, revision, versions
+from vtbdrake.optimization.identity import (
+    adds_conditions,
+    code_changes,
+    describe,
+    differences,
+    dimensions,
+    plain,
+    revision,
+    versions,
+)
 from vtbdrake.optimization.parameter import Dimension, checked_point, point_text
 from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers import Solver, make_solver
@@ -84,6 +93,7 @@ class Study:
         options: Mapping[str, Any] | None = None,
         parallel: int | None = None,
         allow_changed_code: bool = False,
+        more_conditions: bool = False,
     ) -> Self:
         """Begin or resume the study of a problem; see `Problem.study`."""
         if options is not None and not isinstance(options, Mapping):
@@ -108,7 +118,8 @@ class Study:
         study = cls(StudyFile(path, meta=meta), problem)
         try:
             changed = differences(study._meta["problem"], meta["problem"])
-            if changed:
+            extended = more_conditions and adds_conditions(study._meta["problem"], meta["problem"])
+            if changed and not extended:
                 raise StudyError(
                     f"{path} is a study of another problem ({'; '.join(changed)}): give another file, or restore the "
                     "problem"
@@ -129,7 +140,9 @@ class Study:
                 _log.warning("%s", blind)
             if code:
                 study._file.change_code(meta["problem"], code, versions=meta["versions"], revision=meta["revision"])
-                study._meta = study._file.meta
+            if extended:
+                study._file.add_conditions(meta["problem"])
+            study._meta = study._file.meta
         except BaseException:
             study.close()
             raise

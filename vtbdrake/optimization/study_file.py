@@ -331,6 +331,18 @@ class StudyFile:
             change = {"at": _now(), "what": list(parts), "versions": dict(versions), "revision": revision}
             self._set({"problem": problem, "changes": [*self.meta.get("changes", []), change]})
 
+    def add_conditions(self, problem: Mapping[str, Any]) -> None:
+        """Note that the problem has further conditions, and forget the trials, whose values were those of fewer.
+
+        Raises:
+            StudyError: Another process runs the study.
+        """
+        with _claim(self.path), self._transaction():
+            self._withdraw()
+            for table in ("trials", "gradients"):
+                self._db.execute(f"DELETE FROM {table}")
+            self._set({"problem": problem})
+
     def trials(self) -> list[Trial]:
         """Return all trials in the order of the study."""
         return self._trials(self._rows("trials", "ORDER BY batch, position"), first=0)

@@ -59,7 +59,7 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
 
 def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
     """Write a YAML file that `load_scenario` reads."""
-    _resolve_types(type(scenario))
+    resolve_types(type(scenario))
     Path(path).write_text(yaml_dump_typed(scenario, child_name=scenario.name()))
 
 
@@ -96,6 +96,28 @@ def is_imported(name: str) -> bool:
     return name.partition(":")[0] in sys.modules
 
 
+def compose_yaml(path: Path, *, kind: str = "scenario") -> yaml.Node | None:
+    """Return the nodes of a file of YAML, in which no key occurs twice; None if it is empty.
+
+    Args:
+        path: The file.
+        kind: A word for the file in messages.
+
+    Raises:
+        ScenarioError: The file does not exist, is too large, or is not YAML.
+    """
+    if not path.exists():
+        raise ScenarioError(f"there is no {kind} file {path}")
+    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
+        raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
+    try:
+        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ScenarioError(f"{path} is not YAML: {error}") from error
+    _check_nodes(document, path)
+    return document
+
+
 def _load_yaml(path: Path, named: str, key: str) -> Scenario:
     """Return the scenario of a file.
 
@@ -104,14 +126,7 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         named: The class that the user has named; empty if only the file names it.
         key: The top-level key of the scenario; empty if there is only one.
     """
-    if not path.exists():
-        raise ScenarioError(f"there is no scenario file {path}")
-    if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
-        raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
-    try:
-        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path} is not YAML: {error}") from error
+    document = compose_yaml(path)
     if not isinstance(document, yaml.MappingNode) or (
         not key and (len(document.value) != 1 or isinstance(document.value[0][1], yaml.ScalarNode))
     ):
@@ -119,7 +134,6 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
             f"{path} must have one key, package.module:Class, with the scenario's fields below it, or name the key "
             f"as package.module:Class@{path}#KEY"
         )
-    _check_nodes(document, path)
     contents = {str(node.value): content for node, content in document.value}
     if key and key not in contents:
         raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(contents) or 'none'}")
@@ -133,10 +147,10 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         )
     try:
         schema = scenario_class(named or name)
-        _resolve_types(schema)
+        resolve_types(schema)
         content = contents[name]
         _use_new_keys(content, schema)
-        _refuse_unknown(content, schema)
+        refuse_unknown(content, schema)
         return yaml_load_typed(schema=schema, data=yaml.serialize(content))
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         if isinstance(error, ScenarioError):
@@ -152,14 +166,15 @@ def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
         key.value = renamed.get(key.value, key.value)
 
 
-def _resolve_types(schema: type) -> None:
+def resolve_types(schema: type) -> None:
+    """Replace the names of the types of a dataclass by types, also in the dataclasses of its fields."""
     # Drake's reader needs types; `from __future__ import annotations` leaves their names.
     hints = get_type_hints(schema)
     for item in fields(schema):
         item.type = hints[item.name]
         for part in _parts(item.type):
             if isinstance(part, type) and is_dataclass(part):
-                _resolve_types(part)
+                resolve_types(part)
 
 
 def _parts(hint: Any) -> Iterator[Any]:
@@ -169,7 +184,7 @@ def _parts(hint: Any) -> Iterator[Any]:
         yield from _parts(argument)
 
 
-def _check_nodes(document: yaml.Node, path: Path) -> None:
+def _check_nodes(document: yaml.Node | None, path: Path) -> None:
     """Refuse keys that occur twice, and aliases that expand to very many nodes."""
     waiting, count = [document], 0
     while waiting:
@@ -188,14 +203,23 @@ def _check_nodes(document: yaml.Node, path: Path) -> None:
             waiting += node.value
 
 
-def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
-    """Refuse keys that are no field of the expected class."""
+def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
+    """Refuse keys that are no field of the expected class.
+
+    Args:
+        node: The content of a file.
+        hint: The expected type, of which `resolve_types` has made the dataclasses ready.
+        name: The name of the field that has this content.
+
+    Raises:
+        ScenarioError: There is such a key.
+    """
     alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
     inside = Union[inside] if inside else Any  # noqa: UP007
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _refuse_unknown(item, inside, name)
+            refuse_unknown(item, inside, name)
         return
     if not isinstance(node, yaml.MappingNode):
         return
@@ -206,12 +230,12 @@ def _refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
     for key, value in node.value:
         below = f"{name}.{key.value}".lstrip(".")
         if expected is None:  # A dict, say.
-            _refuse_unknown(value, inside, below)
+            refuse_unknown(value, inside, below)
         elif key.value == "<<":  # Keys merged from elsewhere in the file.
             for merged in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-                _refuse_unknown(merged, expected, name)
+                refuse_unknown(merged, expected, name)
         elif key.value in types:
-            _refuse_unknown(value, types[key.value], below)
+            refuse_unknown(value, types[key.value], below)
         else:
             near = difflib.get_close_matches(key.value, types, n=1, cutoff=0.5)
             hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(types)}"

@@ -93,6 +93,8 @@ def make_solver(
             near = difflib.get_close_matches(option, allowed, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise SolverError(f"{canonical} has no option {option!r}{hint}; it has {allowed}")
+    if not space and factory.needs_parameters:
+        raise SolverError("there is no parameter to vary; give at least one, or take grid, which evaluates one point")
     search = Search(
         space=tuple(space),
         objectives=objectives,

@@ -56,6 +56,8 @@ class Design(Solver):
 class Grid(Design):
     """All combinations of equally spaced values, both ends included; of integers and choices, all values.
 
+    Without parameters there is one combination, the scenario as it is, under all conditions.
+
     Args:
         search: What is searched.
         name: Name in the catalogue.
@@ -65,6 +67,8 @@ class Grid(Design):
     Raises:
         SolverError: The grid is larger than the budget, or ``points`` does not fit the parameters.
     """
+
+    needs_parameters = False
 
     def __init__(
         self, search: Search, *, name: str, points: int | Sequence[int] | Mapping[str, int] | None = None

@@ -140,8 +140,6 @@ class Search:
     parallel: int | None = None
 
     def __post_init__(self) -> None:
-        if not self.space:
-            raise SolverError("there is no parameter to vary; give at least one")
         for name, lowest in (("objectives", 1), ("constraints", 0)):
             if getattr(self, name) < lowest:
                 raise SolverError(f"the number of {name} is at least {lowest}, not {getattr(self, name)}")
@@ -271,12 +269,14 @@ class Solver(ABC):
         search: The search to perform.
         wants_gradient: Whether the solver needs `Evaluation.gradient`.
         takes_start: Whether the solver starts at a point (`Search.start`).
+        needs_parameters: Whether there must be a parameter to vary.
         success: Whether the solver ended by its own criterion (converged, or its design is complete); None before.
         message: How the solver ended.
     """
 
     wants_gradient: bool = False
     takes_start: bool = True
+    needs_parameters: bool = True
 
     def __init__(self, search: Search, *, name: str) -> None:
         self.name = name

@@ -1,0 +1,49 @@
+"""Functions of qualities and constraints that a command line or a file names as ``module:function``."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+# The name of a function.
+FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+
+def magnitude(value: float | np.ndarray) -> float:
+    """Return abs(value); of an array, the largest entry."""
+    return float(np.max(np.abs(value)))
+
+
+def largest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its largest entry."""
+    return float(np.max(value))
+
+
+def smallest(value: float | np.ndarray) -> float:
+    """Return the value; of an array, its smallest entry."""
+    return float(np.min(value))
+
+
+def named_function(text: str) -> Callable[..., Any]:
+    """Return the function ``module:function``; its module is imported, which runs its code.
+
+    Raises:
+        ValueError: There is no such function, or its module cannot be imported.
+    """
+    if not FUNCTION.fullmatch(text):
+        raise ValueError(f"a function is named package.module:function, not {text!r}")
+    module_name, _, name = text.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"cannot import {module_name} of the function {text}: {error}") from error
+    except Exception as error:
+        raise ValueError(f"cannot import {module_name} of the function {text}: {error!r}") from error
+    function = getattr(module, name, None)
+    if not callable(function):
+        raise ValueError(f"{module_name} has no function {name!r}")
+    return function
