@@ -19,13 +19,14 @@ STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
-.PHONY: help python setup demo demo-control test check answers bench clean stale
+.PHONY: help python setup demo demo-control test check docs answers bench clean stale
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
 	@echo "make demo-control                  an arm, from the simulation to the machine, at 1 kHz; the machine killed, and back"
 	@echo "make test [ARGS='-k name']         the tests"
 	@echo "make check                         ruff and mypy"
+	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
 	@echo "make bench [ONLY=name]             every benchmark; writes benchmarks/results.json"
 	@echo "make setup                         only the environment that the others need"
@@ -56,6 +57,11 @@ check: $(STAMP)
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
 
+# Warnings are errors: a link that leads nowhere, a page that is not in docs/index.md.
+docs: $(STAMP)
+	$(RUN) -m sphinx --quiet --fail-on-warning --keep-going -c docs . build/docs
+	@echo "build/docs/index.html"
+
 answers: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)
 
@@ -68,7 +74,7 @@ $(STAMP): pyproject.toml setup.py $(wildcard constraints/*.txt) tools/setup.sh $
 stale:
 
 clean:
-	rm -rf .venv .venv-* build dist *.egg-info out answers.json benchmarks/results.json
+	rm -rf .venv .venv-* build dist docs/_api *.egg-info out answers.json benchmarks/results.json
 	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find vtbdrake \( -name '*.so' -o -name 'lcmt_vtb_*.py' \) -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -71,6 +71,12 @@ def test_links_and_paths_of_a_page_exist(page: Path) -> None:
     assert not missing, f"{page.name} names what is not there: {missing}"
 
 
+def test_index_lists_every_page() -> None:
+    index = ROOT / "docs" / "index.md"
+    links = {(index.parent / link).resolve() for link in re.findall(r"\]\(([^)#:]+\.md)\)", index.read_text("utf-8"))}
+    assert links == {*PAGES} - {index, ROOT / "README.md"}
+
+
 def test_architecture_names_every_module_and_folder() -> None:
     text = (ROOT / "ARCHITECTURE.md").read_text("utf-8")
     package = sorted((ROOT / "vtbdrake").iterdir())
