@@ -24,6 +24,7 @@ from vtbdrake.reasoning.trajectory import Trajectory as Trajectory
 from vtbdrake.recording.log_reader import read_log as read_log
 from vtbdrake.recording.recorder import Recorder as Recorder
 from vtbdrake.recording.replay import replay as replay
+from vtbdrake.recording.table_reader import read_table as read_table
 from vtbdrake.rollout import Constraint as Constraint
 from vtbdrake.rollout import Pruning as Pruning
 from vtbdrake.rollout import Quality as Quality

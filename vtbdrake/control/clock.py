@@ -63,6 +63,24 @@ class WallClock(Clock):
         return now
 
 
+class ScaledClock(Clock):
+    """A wall clock that runs ``speed`` times as fast as the time, or as slowly: for recordings, never for machines."""
+
+    def __init__(self, speed: float) -> None:
+        if not 0.0 < speed < inf:
+            raise ValueError(
+                f"the speed of a clock is positive and finite, not {speed}: SimulatedClock() does not wait"
+            )
+        self._speed = speed
+        self._clock = WallClock()
+
+    def now(self) -> float:
+        return self._speed * self._clock.now()
+
+    def wait_until(self, t: float, meanwhile: Callable[[], object] | None = None) -> float:
+        return self._speed * self._clock.wait_until(t / self._speed, meanwhile)
+
+
 class SimulatedClock(Clock):
     """A clock that only advances when it is waited for, so that runs are repeatable. It never calls ``meanwhile``.
 

@@ -23,6 +23,7 @@ from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
+from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_codec import find_events, whole_cycles
 from vtbdrake.recording.log_format import (
     CHANGE,
@@ -189,6 +190,22 @@ class ControlLog:
             LogError: The scenario cannot be found, or has changed since.
         """
         return self.header.make_scenario()
+
+    @property
+    def signals(self) -> Log:
+        """Return the vector signals, with the times of the DPS when values were fed and commands were sent."""
+        # A cycle begins with what is fed, and ends a period later with what is sent. Before the DPS is stepped, its
+        # time stands still.
+        fed_at = self.times - self.header.period
+
+        def series(times: np.ndarray, values: np.ndarray, present: np.ndarray) -> Series:
+            rows = np.flatnonzero(present)
+            return Series.with_last_of_equal_times(times[rows], values[rows])
+
+        sense = {name: (fed_at, values, self.sources[name] != 0) for name, values in self.fed.items()}
+        act = {name: (self.times, values, np.isfinite(values).all(axis=1)) for name, values in self.sent.items()}
+        sensed, sent = ({n: series(*parts) for n, parts in side.items() if parts[2].any()} for side in (sense, act))
+        return Log(str(self.path), sensed, sent, [self.incomplete] if self.incomplete else [])
 
     @property
     def channels(self) -> tuple[str, ...]:

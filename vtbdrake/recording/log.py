@@ -1,0 +1,137 @@
+"""Recorded signals, whoever recorded them: the newest log of the own loop, or a table of a stranger's robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vtbdrake.arrays import Array, immutable
+from vtbdrake.recording.log_format import LogError
+
+
+class Uniformity(NamedTuple):
+    """How regular the times of a series are, in seconds.
+
+    Attributes:
+        period: The median time between two samples.
+        jitter: The median of the absolute differences from the period.
+        longest: The longest time between two samples.
+    """
+
+    period: float
+    jitter: float
+    longest: float
+
+
+@immutable
+class Series:
+    """The samples of one vector signal.
+
+    Attributes:
+        times: When each sample was taken or each command began to act, (n,), increasing, in s.
+        values: The samples, (n, size).
+    """
+
+    times: Array
+    values: Array
+
+    def __post_init__(self) -> None:
+        if self.times.ndim != 1 or self.values.ndim != 2 or len(self.times) != len(self.values):
+            raise LogError(
+                f"a series has n times and n samples of some entries, not arrays of shape {self.times.shape} and "
+                f"{self.values.shape}"
+            )
+        if not len(self.times):
+            raise LogError("a series without samples")
+        if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0.0).any():
+            raise LogError("the times of a series are finite and increase from sample to sample")
+
+    @classmethod
+    def with_last_of_equal_times(cls, times: Array, values: Array) -> Series:
+        """Return the samples, of several with the same time the last; times must not decrease."""
+        last = np.append(np.diff(times) > 0.0, True)
+        return cls(times[last], values[last])
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def uniformity(self) -> Uniformity:
+        """Return how regular the times are; NaN for a single sample."""
+        steps = np.diff(self.times)
+        if not steps.size:
+            return Uniformity(np.nan, np.nan, np.nan)
+        period = float(np.median(steps))
+        return Uniformity(period, float(np.median(abs(steps - period))), float(steps.max()))
+
+    def at(self, times: ArrayLike) -> Array:
+        """Return the newest sample at each of the times (m,), (m, size); NaN before the first."""
+        indices = np.searchsorted(self.times, np.asarray(times, dtype=float), side="right") - 1
+        held: Array = np.where((indices >= 0)[:, np.newaxis], self.values[np.maximum(indices, 0)], np.nan)
+        return held
+
+    def between(self, start: float, end: float) -> Series:
+        """Return the samples from ``start`` to below ``end``, in s; a LogError if there is none."""
+        part = slice(*np.searchsorted(self.times, [start, end]).tolist())
+        if part.start >= part.stop:
+            raise LogError(
+                f"no sample from {start:g} to {end:g} s: they lie from {self.times[0]:g} to {self.times[-1]:g} s"
+            )
+        return Series(self.times[part], self.values[part])
+
+
+class Log:
+    """Recorded signals, each with its own times, in seconds on a clock that they share.
+
+    Args:
+        source: The file, for messages.
+        sense: Samples of sensors, by signal.
+        act: Commands of actuators that acted on the machine, by signal.
+        remarks: What was noticed while the file was read: gaps, repeated times, rows that were left out.
+
+    Raises:
+        LogError: There is no signal.
+    """
+
+    def __init__(
+        self, source: str, sense: Mapping[str, Series], act: Mapping[str, Series], remarks: Sequence[str] = ()
+    ) -> None:
+        if not (sense or act):
+            raise LogError(f"{source}: a log has at least one signal")
+        self.source = source
+        self.sense = dict(sense)
+        self.act = dict(act)
+        self.remarks = tuple(remarks)
+
+    def __str__(self) -> str:
+        lines = [self.source]
+        for side, signals in (("sense", self.sense), ("act", self.act)):
+            for name, series in signals.items():
+                period, jitter, longest = series.uniformity
+                lines.append(
+                    f"{side}.{name}: {len(series)} samples of {series.values.shape[1]} entries from "
+                    f"{series.times[0]:.6g} to {series.times[-1]:.6g} s, every {1e3 * period:.4g} ms "
+                    f"(+- {1e3 * jitter:.2g}, longest {1e3 * longest:.4g})"
+                )
+        return "\n".join([*lines, *self.remarks])
+
+    @property
+    def start(self) -> float:
+        """Return the time of the first sample of any signal, in s."""
+        return min(float(series.times[0]) for series in (*self.sense.values(), *self.act.values()))
+
+    @property
+    def end(self) -> float:
+        """Return the time of the last sample of any signal, in s."""
+        return max(float(series.times[-1]) for series in (*self.sense.values(), *self.act.values()))
+
+    def between(self, start: float, end: float) -> Log:
+        """Return the part from ``start`` to below ``end``, in s; a LogError if a signal has no sample there."""
+
+        def cut(signals: Mapping[str, Series]) -> dict[str, Series]:
+            return {name: series.between(start, end) for name, series in signals.items()}
+
+        return Log(self.source, cut(self.sense), cut(self.act), self.remarks)

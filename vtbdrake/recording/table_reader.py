@@ -1,0 +1,283 @@
+"""Reading what another program has recorded: tables of numbers, whose columns become signals."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.argument_checks import suggestion
+from vtbdrake.arrays import Array
+from vtbdrake.lazy import extra_module
+from vtbdrake.recording.log import Log, Series
+from vtbdrake.recording.log_format import LogError
+
+Table = Mapping[str, Any]
+"""Columns by name: arrays (n,), or (n, k) for k entries."""
+
+UNITS: Mapping[str, float] = {
+    "deg": pi / 180.0, "deg/s": pi / 180.0, "rpm": pi / 30.0,
+    "mm": 1e-3, "cm": 1e-2, "km/h": 1.0 / 3.6, "mm/s": 1e-3, "g": 9.80665,
+    "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
+    "mN m": 1e-3, "kN": 1e3, "gauss": 1e-4,
+}  # fmt: skip
+"""Factor to SI units, of units that are no SI units; "g" is standard gravity."""
+
+GAP = 5.0
+"""Number of median periods from which on the time between two samples is called a gap."""
+
+
+def read_table(
+    source: str | os.PathLike[str] | Table,
+    *,
+    sense: Mapping[str, str | Sequence[str]],
+    act: Mapping[str, str | Sequence[str]] | None = None,
+    time: str | float = "time",
+    times: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> Log:
+    """Return the signals in a table that somebody else has recorded.
+
+    For example::
+
+        log = read_table("trajectory.csv", sense={"joint_position": ["pos_meas1", "pos_meas2"]},
+                         act={"torque": ["tau_meas1", "tau_meas2"]}, units={"joint_position": "deg"})
+
+    A row in which an entry of a signal is NaN or empty is no sample of that signal. Of rows with the same time, the
+    last counts. What was left out is said in `Log.remarks`, gaps too.
+
+    Args:
+        source: A file: text (.csv, .dat, .txt; separated by commas, semicolons, tabs or blanks), .npz, .parquet, or
+            .mcap with JSON messages, whose columns are ``topic.field`` and ``topic.log_time``. For any other format,
+            the columns themselves. Without a line of names, the columns of a text are "0", "1", ...
+        sense: For each sensor signal, its column, or the columns of its entries. ``name[2]`` is the third entry of a
+            column that has several.
+        act: The same for the actuator signals.
+        time: The column of the times, in an .mcap that of each topic; or the period in s, if the table has no times.
+        times: The column of the times of the signals that have others, by signal.
+        units: Units that are none of SI (`UNITS`): of a signal by its name, of times by their column.
+
+    Raises:
+        OSError: The file cannot be read.
+        LogError: A column is missing, has another length than its times or is no number; a time is not finite or runs
+            backwards; the format or a unit is unknown.
+        ModuleNotFoundError: The library for the format is not installed.
+    """
+    act, times, units = act or {}, times or {}, units or {}
+    name = "the table" if isinstance(source, Mapping) else os.fspath(source)
+    table = source if isinstance(source, Mapping) else _read_file(Path(source))
+    if both := sense.keys() & act.keys():
+        raise LogError(f"{', '.join(sorted(both))} cannot be both, a sensor signal and an actuator signal")
+    _check_keys(times, {*sense, *act}, "times")
+    _check_keys(units, {*sense, *act, *times.values(), str(time)}, "a unit")
+    remarks: list[str] = []
+
+    def read(signals: Mapping[str, str | Sequence[str]]) -> dict[str, Series]:
+        series = {}
+        for signal, columns in signals.items():
+            each = [columns] if isinstance(columns, str) else columns
+            entries = np.hstack([_column(table, column, name) for column in each])
+            stamps = times.get(signal, time)
+            if isinstance(stamps, str):
+                at = _column(table, _time_column(table, stamps, each[0]), name)[:, 0] * _factor(units.get(stamps))
+            else:
+                at = stamps * np.arange(len(entries), dtype=float)
+            series[signal] = _series(f"{name}: {signal}", at, entries * _factor(units.get(signal)), remarks)
+        return series
+
+    return Log(name, read(sense), read(act), remarks)
+
+
+def _check_keys(mapping: Mapping[str, Any], names: set[str], noun: str) -> None:
+    for key in mapping:
+        if key not in names:
+            raise LogError(f"{noun} for {key!r}, which is no signal{suggestion(key, names)}")
+
+
+def _factor(unit: str | None) -> float:
+    if unit is None:
+        return 1.0
+    if unit not in UNITS:
+        raise LogError(f"unknown unit {unit!r}: one of {', '.join(UNITS)}, or none for SI")
+    return UNITS[unit]
+
+
+def _column(table: Table, name: str, source: str) -> Array:
+    """Return a column, (n, k)."""
+    base, bracket, index = name.partition("[")
+    if name in table:
+        column = table[name]
+    elif bracket and base in table and index.endswith("]") and index[:-1].isdigit():
+        column = np.asarray(table[base])
+        if column.ndim != 2 or int(index[:-1]) >= column.shape[1]:
+            raise LogError(f"{source}: no {name}: {base} has the shape {column.shape}")
+        column = column[:, int(index[:-1])]
+    else:
+        shown = ", ".join(list(table)[:20]) + (", ..." if len(table) > 20 else "")
+        raise LogError(f"{source} has no column {name!r}{suggestion(name, table)}; it has: {shown or 'none'}")
+    try:
+        values: Array = np.asarray(column, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise LogError(f"{source}: the column {name} is not of numbers: {error}") from None
+    if values.ndim not in (1, 2):
+        raise LogError(f"{source}: the column {name} has the shape {values.shape}, not (n,) or (n, k)")
+    return values.reshape(len(values), -1)
+
+
+def _time_column(table: Table, name: str, column: str) -> str:
+    """Return the name of a column of times; in an .mcap, of the topic that ``column`` is of."""
+    of_topic = f"{column.rpartition('.')[0]}.{name}"
+    return of_topic if name not in table and of_topic in table else name
+
+
+def _series(label: str, times: Array, values: Array, remarks: list[str]) -> Series:
+    if len(times) != len(values):
+        raise LogError(f"{label} has {len(values)} rows, its times {len(times)}")
+    if not np.isfinite(times).all():
+        row = int(np.flatnonzero(~np.isfinite(times))[0])
+        raise LogError(f"{label}: the time of row {row} is {times[row]}")
+    if (backwards := np.flatnonzero(np.diff(times) < 0.0)).size:
+        row = backwards[0]
+        raise LogError(
+            f"{label}: time runs backwards, first from row {row} ({times[row]:.9g} s) to row {row + 1} "
+            f"({times[row + 1]:.9g} s), {backwards.size} times in all: split the recording there, or sort it if only "
+            "the order of its rows is wrong"
+        )
+    whole = np.asarray(np.isfinite(values).all(axis=1))
+    if not whole.any():
+        raise LogError(f"{label} has no row that is whole")
+    if not whole.all():
+        remarks.append(f"{label}: {int((~whole).sum())} of {len(whole)} rows are not whole")
+        times, values = times[whole], values[whole]
+    series = Series.with_last_of_equal_times(times, values)
+    if len(series) < len(times):
+        remarks.append(f"{label}: {len(times) - len(series)} of {len(times)} times are repeated; the last row counts")
+    period = series.uniformity.period
+    gaps = np.flatnonzero(np.diff(series.times) > GAP * period)
+    if gaps.size:
+        first = gaps[0]
+        remarks.append(
+            f"{label}: {gaps.size} gaps of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first from "
+            f"{series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
+        )
+    still: list[int] = np.flatnonzero((series.values == series.values[0]).all(axis=0)).tolist()
+    if still and len(series) > 1:
+        remarks.append(f"{label}: entries that never change: {', '.join(map(str, still))}")
+    return series
+
+
+# -- formats
+
+
+def _read_file(path: Path) -> Table:
+    suffix = path.suffix.lower()
+    if suffix not in READERS:
+        raise LogError(
+            f"{path}: a table ends in {', '.join(READERS)}. Read another format with its library, and give the "
+            'columns: read_table({"time": t, "q": q}, ...)'
+        )
+    if path.is_dir():
+        raise LogError(f"{path} is a folder, not a file")
+    return READERS[suffix](path)
+
+
+def _read_text(path: Path) -> Table:
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline()
+        separator = next((mark for mark in ",;\t" if mark in head), None)
+        if separator is None:
+            names = head.split()
+            rows = [line.split() for line in file if line.strip()]
+        else:
+            names = [name.strip().strip('"') for name in next(csv.reader([head], delimiter=separator))]
+            rows = [row for row in csv.reader(file, delimiter=separator) if row]
+    if not names or not rows:
+        raise LogError(f"{path} is no table: it has fewer than two lines")
+    if all(_is_number(name) for name in names):
+        rows, names = [names, *rows], [str(k) for k in range(len(names))]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise LogError(f"{path} has two columns {twice!r}")
+    short = [number for number, row in enumerate(rows) if len(row) < len(names)]
+    if short == [len(rows) - 1]:
+        rows.pop()  # The recording was cut off in the middle of a row.
+    elif short:
+        raise LogError(f"{path}: row {short[0]} has {len(rows[short[0]])} columns, not {len(names)}")
+    columns = list(zip(*rows, strict=False))  # A separator may end each row.
+    return {name: _numbers(column) for name, column in zip(names, columns, strict=False)}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(column: Sequence[str]) -> NDArray[Any]:
+    """Return a column as floats, NaN where it is empty; as texts, if it has others than numbers."""
+    texts = np.array(column)
+    texts[np.char.strip(texts) == ""] = "nan"
+    try:
+        return texts.astype(float)
+    except ValueError:
+        return texts
+
+
+def _read_npz(path: Path) -> Table:
+    try:
+        with np.load(path) as arrays:
+            return dict(arrays)
+    except (ValueError, EOFError, KeyError) as error:
+        raise LogError(f"{path} is not an .npz of arrays without pickles: {error}") from error
+
+
+def _read_parquet(path: Path) -> Table:
+    parquet = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording")
+    table = parquet.read_table(path)
+    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+
+
+def _read_mcap(path: Path) -> Table:
+    reader = extra_module("mcap.reader", purpose="MCAP", extra="recording")
+    rows: dict[str, list[Mapping[str, Any]]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in reader.make_reader(file).iter_messages():
+            if channel.message_encoding != "json":
+                raise LogError(f"{path}: the messages of {channel.topic} are {channel.message_encoding}, not JSON")
+            content = {name: value for name, value in json.loads(message.data).items() if _is_data(value)}
+            rows.setdefault(channel.topic, []).append({**content, "log_time": 1e-9 * message.log_time})
+    table: dict[str, Any] = {}
+    for topic, messages in rows.items():
+        for field in messages[0]:
+            entries = [message.get(field) for message in messages]
+            table[f"{topic}.{field}"] = np.array(_without_null(entries))
+    return table
+
+
+def _is_data(value: Any) -> bool:
+    return isinstance(value, int | float | list | None) and not isinstance(value, bool)
+
+
+def _without_null(value: Any) -> Any:
+    """Return JSON's numbers with NaN for null."""
+    if isinstance(value, list):
+        return [_without_null(entry) for entry in value]
+    return np.nan if value is None else value
+
+
+READERS: Mapping[str, Callable[[Path], Table]] = {
+    **dict.fromkeys((".csv", ".dat", ".txt"), _read_text),
+    ".npz": _read_npz,
+    ".parquet": _read_parquet,
+    ".mcap": _read_mcap,
+}
+"""Readers by the suffix of the file."""
