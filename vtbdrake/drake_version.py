@@ -17,8 +17,8 @@ def warn_if_untested(version: str) -> None:
     """Warn if a version of Drake is not one of `TESTED_DRAKE`, apart from its last number."""
     if version.rpartition(".")[0] not in {tested.rpartition(".")[0] for tested in TESTED_DRAKE}:
         warnings.warn(
-            f"drake {version} is installed, and vtbdrake is tested with {' and '.join(TESTED_DRAKE)}: if something fails, "
-            f"try pip install drake=={TESTED_DRAKE[-1]} ({TESTED_DRAKE[0]} for Python 3.11)",
+            f"drake {version} is installed, and vtbdrake is tested with {' and '.join(TESTED_DRAKE)}: if something "
+            f"fails, try pip install drake=={TESTED_DRAKE[-1]} ({TESTED_DRAKE[0]} for Python 3.11)",
             UntestedDrakeWarning,
             stacklevel=2,
         )
