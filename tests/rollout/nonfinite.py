@@ -6,8 +6,16 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, LinearSystem, Multiplexer
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    LinearSystem,
+    Multiplexer,
+    PassThrough,
+    TrajectorySource,
+    ZeroOrderHold,
+)
+from pydrake.trajectories import PiecewisePolynomial
 
 from vtbdrake.testbed import Interface, Scenario, Signal
 
@@ -46,6 +54,22 @@ class FailingLaw(LeafSystem):
         output.SetFromVector(self._command(context))
 
 
+def compiled_law(bad, *, sampled):
+    """Return `FailingLaw` made of Drake's own systems, without Python."""
+    builder = DiagramBuilder()
+    state = builder.AddNamedSystem("state", PassThrough(2))
+    after = np.nextafter(0.25, 1.0)
+    plan = PiecewisePolynomial.ZeroOrderHold([0.0, after, 1e6], [[0.0, bad, bad]])
+    output = builder.AddNamedSystem("plan", TrajectorySource(plan)).get_output_port()
+    if sampled:
+        hold = builder.AddNamedSystem("hold", ZeroOrderHold(0.1, 1))
+        builder.Connect(output, hold.get_input_port())
+        output = hold.get_output_port()
+    builder.ExportInput(state.get_input_port(), "state")
+    builder.ExportOutput(output, "force")
+    return builder.Build()
+
+
 @dataclass
 class NonfiniteScenario(Scenario):
     """A mass (a LinearSystem) or a pendulum (a MultibodyPlant) under a force that is not finite any more."""
@@ -53,6 +77,7 @@ class NonfiniteScenario(Scenario):
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     bad: str = "nan"  # as a text: numbers of a scenario are finite
     sampled: bool = True
+    compiled: bool = False  # the DPS consists of systems in C++
     plant: bool = False
     time_step: float = 0.0
     # The force is that of a system of the world, and is not finite from the beginning.
@@ -64,7 +89,8 @@ class NonfiniteScenario(Scenario):
         )
 
     def make_dps(self):
-        return FailingLaw(0.0 if self.in_world else float(self.bad), sampled=self.sampled)
+        law = compiled_law if self.compiled else FailingLaw
+        return law(0.0 if self.in_world else float(self.bad), sampled=self.sampled)
 
     def add_world(self, builder):
         if self.plant:

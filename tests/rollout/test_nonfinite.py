@@ -5,11 +5,14 @@ import re
 import threading
 from math import inf
 
+import numpy as np
 import pytest
-from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LinearSystem
 
 from tests.interruptions import hanging_fails
-from tests.rollout.nonfinite import NonfiniteScenario
+from tests.rollout.nonfinite import NonfiniteScenario, compiled_law
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
@@ -47,20 +50,33 @@ WORLDS = [
 WORLDS += [(scheme, True) for scheme in ("runge_kutta3", "implicit_euler", "radau3", "cenic")]
 
 
+@pytest.mark.parametrize("compiled", [False, True], ids=["python", "compiled"])
 @pytest.mark.parametrize(("scheme", "plant"), WORLDS)
-def test_command_that_is_not_finite_fails_the_rollout_by_name(process, scheme, plant):
+def test_command_that_is_not_finite_fails_the_rollout_by_name(process, scheme, plant, compiled):
     for bad, sampled in itertools.product(("nan", "inf", "-inf"), (True, False)):
-        failed = result(process, scheme, bad=bad, sampled=sampled, plant=plant)
+        failed = result(process, scheme, bad=bad, sampled=sampled, plant=plant, compiled=compiled)
         assert failed.end == "failed"
         assert f"the DPS commands force = [{bad}]" in failed.message
         assert failed.times[-1] == pytest.approx(0.3 if sampled else 0.25)
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["python", "compiled"])
+def test_every_executor_says_the_same(process, compiled):
+    scenario = NonfiniteScenario(SimulatorConfig(integration_scheme="runge_kutta3"), compiled=compiled)
+    task = RolloutTask(scenario, 1.0, Quality(abs, "time"))
+    # First where an endless rollout ends.
+    messages = [[outcome.message for _, outcome in process.run(task, [{}])]]
+    for made in (SerialExecutor(), ThreadExecutor(2)):
+        with made:
+            messages.append([outcome.message for _, outcome in made.run(task, [{}])])
+    assert messages == 3 * [["the DPS commands force = [nan] at t = 0.3 s, which is not finite"]]
 
 
 @pytest.mark.parametrize("fields", [{"plant": True, "time_step": 0.01}, {}])
 def test_command_is_named_where_the_steps_are_fixed(process, fields):
     failed = result(process, "explicit_euler", **fields)
     assert failed.end == "failed"
-    assert failed.message.startswith("the DPS commands force = [nan]; ")
+    assert re.match(r"the DPS commands force = \[nan\] at t = [\d.]+ s, which is not finite; ", failed.message)
 
 
 @pytest.mark.parametrize("scheme", ["runge_kutta3", "implicit_euler", "cenic"])
@@ -73,8 +89,11 @@ def test_world_that_is_not_finite_from_the_beginning_fails(process, scheme, bad)
         assert failed.message == "the time derivatives are not finite at t = 0 s"
 
 
-def test_plain_simulation_is_refused_too():
-    testbed = NonfiniteScenario(SimulatorConfig(integration_scheme="runge_kutta3")).build()
+@pytest.mark.parametrize("compiled", [False, True], ids=["python", "compiled"])
+def test_plain_simulation_is_refused_too(process, compiled):
+    config = SimulatorConfig(integration_scheme="runge_kutta3")
+    assert result(process, "runge_kutta3", compiled=compiled).end == "failed"  # here it would hang
+    testbed = NonfiniteScenario(config, compiled=compiled).build()
     context = testbed.default_context()
     with pytest.raises(SignalError, match=r"the DPS commands force = \[nan\] at t = 0.3 s, which is not finite"):
         testbed.simulator(context).AdvanceTo(1.0)
@@ -100,6 +119,29 @@ def test_guard_is_only_where_a_nan_would_never_end():
     assert guards(SpaceClimberScenario()) == []
     assert guards(NonfiniteScenario(adaptive, plant=True, time_step=0.01)) == []
     assert guards(NonfiniteScenario(SimulatorConfig(integration_scheme="cenic"), plant=True)) == []
+
+
+@pytest.mark.parametrize("scheme", ["runge_kutta3", "radau3"])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_guard_changes_no_bit_of_a_simulation(scheme, sampled):
+    config = SimulatorConfig(integration_scheme=scheme, max_step_size=0.05, accuracy=1e-3)
+    scenario = NonfiniteScenario(config, bad="-1.7", compiled=True, sampled=sampled)
+    simulator = scenario.build().simulator()
+    assert guards(scenario) == ["T_act.force.finite"]
+    builder = DiagramBuilder()
+    system = LinearSystem(np.eye(2, k=1), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1)))
+    mass, law = builder.AddSystem(system), builder.AddSystem(compiled_law(-1.7, sampled=sampled))
+    builder.Connect(mass.get_output_port(), law.get_input_port())
+    builder.Connect(law.get_output_port(), mass.get_input_port())
+    by_hand = Simulator(builder.Build())
+    ApplySimulatorConfig(config, by_hand)
+    states = []
+    for each in (simulator, by_hand):
+        each.get_mutable_context().SetAccuracy(config.accuracy)
+        each.AdvanceTo(1.0)
+        states.append(each.get_context().get_continuous_state_vector().CopyToVector()[:2])
+    assert states[0][1] < -1.0
+    assert np.array_equal(*states)
 
 
 def test_processes_have_a_time_limit_by_default():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import SimulatorConfig
@@ -15,6 +16,7 @@ from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.state.systems import read_group, stateful_leaves
 from vtbdrake.state.variables import VariableError
 from vtbdrake.testbed import ActuatorCommand, Interface, Signal, SignalError, VirtualTestbedBuilder
+from vtbdrake.testbed.switch import finite_command
 
 PERIOD = 0.01
 
@@ -453,8 +455,10 @@ def test_only_vector_commands_are_checked_before_a_continuous_world():
     assert _matrix(testbed.read(context, "sim.act.look.y")) == _matrix(SEEN)
     camera.show(context, RigidTransform([np.nan, 0.0, 0.0]))
     assert np.isnan(testbed.read(context, "sim.act.look.y").translation()[0])
-    with pytest.raises(SignalError, match=r"the DPS commands speed = \[nan +0. +0.\] at t = 0 s"):
+    with pytest.raises(ValueError, match="out of domain"):
         testbed.diagram.EvalTimeDerivatives(context)
+    with pytest.raises(SignalError, match=r"the DPS commands speed = \[nan +0. +0.\] at t = 0 s"):
+        testbed.simulator(context).AdvanceTo(1.0)
 
 
 @pytest.mark.parametrize(("address", "last"), [("T_sense.joint_state", 1.0), ("T_act.torque", 2.0)])
@@ -504,3 +508,23 @@ def test_a_place_that_is_none_is_refused(instance, role, message):
 
     with pytest.raises(ValueError, match=message):
         Misplaced().build()
+
+
+def test_finite_command_passes_every_bit_and_refuses_what_is_not_finite():
+    guard = finite_command(3)
+    context = guard.CreateDefaultContext()
+    port = guard.get_input_port()
+    for values in ([0.0, -0.0, 1.5], [-1.7e308, 5e-324, np.pi], [-np.finfo(float).max, 1e200, -1e-300]):
+        port.FixValue(context, values)
+        assert guard.get_output_port().Eval(context).tobytes() == np.array(values).tobytes()
+    for bad in (np.nan, np.inf, -np.inf):
+        port.FixValue(context, [1.0, 2.0, bad])
+        with pytest.raises(ValueError, match="out of domain"):
+            guard.get_output_port().Eval(context)
+
+
+def test_finite_command_passes_derivatives():
+    guard = finite_command(2).ToAutoDiffXd()
+    context = guard.CreateDefaultContext()
+    guard.get_input_port().FixValue(context, InitializeAutoDiff([0.0, -3.0]).ravel())
+    assert np.array_equal(ExtractGradient(guard.get_output_port().Eval(context)), np.eye(2))

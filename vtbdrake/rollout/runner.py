@@ -288,23 +288,21 @@ class RolloutRunner:
             raise self._with_command(failure) from failure.__cause__
         return status
 
+    def _with_command(self, failure: SimulationError) -> SimulationError:
+        """Return the failure; if the DPS commands what is not finite, with the name of that signal."""
+        named = self.testbed.named_command(self._context, failure)
+        return failure if named is failure else SimulationError(str(named))
+
     def _refuse_nonfinite_derivatives(self) -> None:
         # An integrator with error control would never end its first step. It needs these derivatives anyway.
         if self._controls_error:
-            derivatives = self.testbed.diagram.EvalTimeDerivatives(self._context)
+            try:
+                with _failures_as_outcomes:
+                    derivatives = self.testbed.diagram.EvalTimeDerivatives(self._context)
+            except SimulationError as failure:
+                raise self._with_command(failure) from failure.__cause__
             if not np.isfinite(derivatives.CopyToVector()).all():
                 raise SimulationError("the time derivatives are not finite at t = 0 s")
-
-    def _with_command(self, failure: SimulationError) -> SimulationError:
-        """Return the failure; if the DPS commands what is not finite, with the name of that signal."""
-        dps_context = self.testbed.dps.GetMyContextFromRoot(self._context)
-        for signal in self.testbed.interface.act:
-            with suppress(*FAILURES):
-                port = self.testbed.dps.GetOutputPort(signal.name)
-                command = port.Eval(dps_context) if signal.is_vector else np.zeros(0)
-                if not np.isfinite(command).all() and signal.name not in str(failure):
-                    return SimulationError(f"the DPS commands {signal.name} = {command}; {failure}")
-        return failure
 
     def _refuse_nonfinite(self, t: float) -> None:
         # NaN is allowed in a DPS, for unknown values, but not in the simulated world.

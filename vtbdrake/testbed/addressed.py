@@ -151,13 +151,16 @@ class AddressedDiagram:
                 "the context belongs to a diagram that holds this testbed's: simulate that diagram, by Simulator(...)"
             )
         self.attach(context)
-        kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
-        simulator = kind(self.diagram, context)
+        simulator = self._bare_simulator(context)
         self._give_integrator(simulator)
         simulator.set_target_realtime_rate(self.simulator_config.target_realtime_rate)
         if restored:
             simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         return simulator
+
+    def _bare_simulator(self, context: Context) -> Simulator:
+        kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
+        return kind(self.diagram, context)
 
     def _give_integrator(self, simulator: Simulator) -> None:
         # The config would set the time and the pace, too.

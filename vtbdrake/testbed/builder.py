@@ -251,7 +251,7 @@ class VirtualTestbedBuilder:
         self.finish_world()
         sense_position, act_position = MODES[mode]
         u = {s.name: s.default_vector() for s in self.interface.commands if s.name not in self._commands}
-        guarded = self._guarded_commands(self._dps)
+        guarded = self._guarded_commands()
         switches = Switches(
             self.diagram_builder, self.interface, sense_position, act_position, self._dps, u, guarded=guarded
         )
@@ -275,6 +275,7 @@ class VirtualTestbedBuilder:
             commands=commands,
             scenario=scenario,
             visualized=any(_draws(system) for _, system in leaves(diagram)),
+            guarded=bool(guarded),
         )
 
     def build_diagram(self, name: str) -> Diagram:
@@ -326,23 +327,17 @@ class VirtualTestbedBuilder:
         if self.plant is not None and not self.plant.is_finalized():
             self.plant.Finalize()
 
-    def _guarded_commands(self, dps: System) -> dict[str, bool]:
+    def _guarded_commands(self) -> dict[str, bool]:
         """Return the actuator signals whose commands are checked -> whether they enter a plant, which refuses NaN.
 
         NaN and infinity make the time derivatives of a continuous world useless, and an integrator with error control
-        then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead. Before a plant,
-        systems of Drake turn infinity into NaN. Elsewhere the check is in Python, and only for a DPS that computes in
-        Python itself.
+        then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead.
         """
-        if not controls_error(self.simulator_config):
+        continuous = any(system.num_continuous_states() for system in self.diagram_builder.GetSystems())
+        if not (continuous and controls_error(self.simulator_config)):
             return {}
-        if not any(system.num_continuous_states() for system in self.diagram_builder.GetSystems()):
-            return {}
-        dps_systems = leaves(dps) if isinstance(dps, Diagram) else [("", dps)]
-        in_python = any(is_python(system) for _, system in dps_systems)
         vectors = [signal.name for signal in self.interface.act if signal.is_vector]
-        into_plant = {name: is_plant(self.actuators[name].get_system()) for name in vectors}
-        return {name: plant for name, plant in into_plant.items() if plant or in_python}
+        return {name: is_plant(self.actuators[name].get_system()) for name in vectors}
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
+from pydrake.symbolic import Expression, MakeVectorContinuousVariable, if_then_else, sqrt
+from pydrake.symbolic import Variable as Symbol
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
@@ -21,13 +23,13 @@ from pydrake.systems.framework import (
     System,
     SystemScalarConverter,
 )
-from pydrake.systems.primitives import Adder, ConstantValueSource, Gain, PortSwitch
+from pydrake.systems.primitives import Adder, ConstantValueSource, Gain, PortSwitch, SymbolicVectorSystem
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from vtbdrake.state.declarations import DISCRETE, NO_DICT, AddressedSystem, Codec, Element, weakly
+from vtbdrake.state.declarations import DISCRETE, NO_DICT, AddressedSystem, Codec, Element
 from vtbdrake.state.systems import leaf_variables
 from vtbdrake.state.variables import Variable, VariableError, X
-from vtbdrake.testbed.signal import Interface, Signal, SignalError
+from vtbdrake.testbed.signal import Interface, Signal
 
 
 class Position(StrEnum):
@@ -105,48 +107,15 @@ _POSITION_CODEC = Codec(
 )
 
 
-@TemplateSystem.define("FiniteCommand_")  # type: ignore[untyped-decorator]
-def FiniteCommand_(T: type) -> type:
-    """Make the class `FiniteCommand` for the scalar type ``T``.
+def finite_command(size: int) -> SymbolicVectorSystem:
+    """Return a system that passes a vector, bit for bit, and raises a ValueError where an entry is NaN or infinite.
 
-    A finite command refuses NaN and infinity where an actuator command of a DPS in Python enters a continuous world.
-    Integrators with error control would divide their step by ten for ever. It computes only when the DPS has.
-
-    .. pydrake_system::
-
-        name: FiniteCommand
-        input_ports:
-        - command
-        output_ports:
-        - command
+    It computes y = u if |u| < infinity, else sqrt(-1 - u^2), which has no value. Python is not involved. Its continuous
+    state, a number that is always 0, is there because Drake refuses such a system without one in a continuous Diagram.
     """
-
-    class Impl(LeafSystem_[T]):
-        __slots__ = NO_DICT
-
-        def _construct(self, signal: str, size: int, converter: SystemScalarConverter | None = None) -> None:
-            LeafSystem_[T].__init__(self, converter)
-            self._signal = signal
-            self._command = self.DeclareVectorInputPort("command", size)
-            self._zeros = np.zeros(size)
-            self.DeclareVectorOutputPort("command", size, weakly(self, Impl._calc), {self._command.ticket()})
-            self.variables = ()
-
-        def _construct_copy(self, other: Any, converter: SystemScalarConverter | None = None) -> None:
-            Impl._construct(self, other._signal, other._command.size(), converter=converter)
-
-        def _calc(self, context: Any, output: Any) -> None:
-            command = self._command.Eval(context)
-            # 0 times NaN or infinity is NaN: a third of the time that np.isfinite takes.
-            if T is float and self._zeros.dot(command) != 0.0:
-                time = context.get_time()
-                raise SignalError(f"the DPS commands {self._signal} = {command} at t = {time:g} s, which is not finite")
-            output.SetFromVector(command)
-
-    return Impl
-
-
-FiniteCommand = FiniteCommand_[None]
+    u, z = MakeVectorContinuousVariable(size, "u"), Symbol("z")
+    output = [if_then_else(abs(x) < np.inf, x, sqrt(-1.0 - x**2)) for x in u]
+    return SymbolicVectorSystem(state=[z], dynamics=[Expression(0.0)], input=u, output=output)
 
 
 class Selector:
@@ -301,7 +270,7 @@ class Switches:
             idle = self._idle(name, signal)
             checked = command
             if guarded and signal.name in guarded:
-                checked = self._finite(name, signal, command, plant=guarded[signal.name])
+                checked = self._finite(name, command, plant=guarded[signal.name])
             self.sim_act[signal.name] = self._choose(name, f"{name}.sim", signal, checked, idle, checked)
             if signal.is_vector:
                 none = self._board.GetOutputPort(f"{name}.none")
@@ -316,16 +285,17 @@ class Switches:
         source = ConstantValueSource(Value(signal.idle))
         return self._builder.AddNamedSystem(f"{name}.idle", source).get_output_port()
 
-    def _finite(self, switch: str, signal: Signal, command: OutputPort, *, plant: bool) -> OutputPort:
+    def _finite(self, switch: str, command: OutputPort, *, plant: bool) -> OutputPort:
+        size = command.size()
         if plant:
             # u + 0 u is u, and NaN where u is infinite.
-            zero = self._builder.AddNamedSystem(f"{switch}.zero", Gain(0.0, signal.size))
-            total = self._builder.AddNamedSystem(f"{switch}.finite", Adder(2, signal.size))
+            zero = self._builder.AddNamedSystem(f"{switch}.zero", Gain(0.0, size))
+            total = self._builder.AddNamedSystem(f"{switch}.finite", Adder(2, size))
             self._builder.Connect(command, zero.get_input_port())
             self._builder.Connect(command, total.get_input_port(0))
             self._builder.Connect(zero.get_output_port(), total.get_input_port(1))
             return total.get_output_port()
-        guard = self._builder.AddNamedSystem(f"{switch}.finite", FiniteCommand(signal.name, signal.size))
+        guard = self._builder.AddNamedSystem(f"{switch}.finite", finite_command(size))
         self._builder.Connect(command, guard.get_input_port())
         return guard.get_output_port()
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from math import ceil, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, System
 
 from vtbdrake.argument_checks import as_number
+from vtbdrake.failures import FAILURES
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.signal import SignalError
 from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
 if TYPE_CHECKING:
@@ -158,6 +162,23 @@ def wanted_positions(
     return sides[0], sides[1]
 
 
+class _GuardedSimulator(Simulator):
+    """Drake's Simulator, which names the actuator command that the guard before the world has refused."""
+
+    def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
+        super().__init__(testbed.diagram, context)
+        self._testbed = testbed
+
+    def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        try:
+            return super().AdvanceTo(boundary_time, interruptible)
+        except (ValueError, RuntimeError) as error:  # of the guard, of a plant
+            named = self._testbed.named_command(self.get_context(), error)
+            if named is error:
+                raise
+            raise named from error
+
+
 class VirtualTestbed(AddressedDiagram):
     """A DPS in one Diagram with the simulated world around it, behind switches.
 
@@ -172,6 +193,7 @@ class VirtualTestbed(AddressedDiagram):
             signal.
         belief_rules: How estimates of the DPS set variables of the simulated world.
         visualized: True if the testbed draws into a Meshcat.
+        guarded: True if vector commands that are not finite are refused before they enter the simulated world.
     """
 
     def __init__(
@@ -184,6 +206,7 @@ class VirtualTestbed(AddressedDiagram):
         commands: Sequence[Variable],
         scenario: Scenario | None,
         visualized: bool,
+        guarded: bool,
     ) -> None:
         """Make the testbed of the parts that `VirtualTestbedBuilder.build` has put together."""
         self._sense, self._act = switches.sense, switches.act
@@ -200,6 +223,7 @@ class VirtualTestbed(AddressedDiagram):
         self.plant = parts.plant
         self.scene_graph = parts.scene_graph
         self.visualized = visualized
+        self.guarded = guarded
         self._signals = {signal.name: signal for signal in parts.interface.sense}
         self.simulated_sensors = {name: port.get_system() for name, port in parts.sensors.items()}
         self.simulated_actuators = {name: port.get_system() for name, port in parts.actuators.items()}
@@ -212,6 +236,28 @@ class VirtualTestbed(AddressedDiagram):
         from vtbdrake.visualization.diagram import svg
 
         return svg(self)
+
+    def _bare_simulator(self, context: Context) -> Simulator:
+        return _GuardedSimulator(self, context) if self.guarded else super()._bare_simulator(context)
+
+    def named_command(self, context: Context, error: Exception) -> Exception:
+        """Return why a simulation failed: a command of the DPS that is not finite, by its name, or else ``error``.
+
+        Args:
+            context: The root context where the simulation stands.
+            error: What it raised.
+        """
+        dps_context = self.dps.GetMyContextFromRoot(context)
+        for signal in self.interface.act:
+            with suppress(*FAILURES):
+                command = self.dps.GetOutputPort(signal.name).Eval(dps_context) if signal.is_vector else np.zeros(0)
+                if not np.isfinite(command).all():
+                    reason = "" if self.guarded else f"; {error}"
+                    return SignalError(
+                        f"the DPS commands {signal.name} = {command} at t = {context.get_time():g} s, which is not "
+                        f"finite{reason}"
+                    )
+        return error
 
     # -- switches
 
