@@ -28,6 +28,7 @@ BELOW: dict[str, set[str]] = {
     "monitoring": {"state", "testbed", "control", "lcm"},
     "machine": {"state", "testbed", "control", "lcm"},
     "deployment": {"state", "testbed", "control", "lcm", "recording", "monitoring"},
+    "station": {"state", "testbed", "control", "lcm", "monitoring", "deployment"},
     "components": {"state"},
     "calibration": {"state", "testbed", "rollout", "optimization", "recording"},
 }
@@ -47,9 +48,6 @@ BELOW["settings"] = set()
 BELOW["failures"] = set()
 BELOW["lazy"] = set()
 BELOW["lru"] = set()
-BELOW["drake_version"] = set()
-BELOW["state"].add("drake_version")
-BELOW["child_process"].add("drake_version")
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

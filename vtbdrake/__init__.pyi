@@ -30,6 +30,8 @@ from vtbdrake.rollout import Pruning as Pruning
 from vtbdrake.rollout import Quality as Quality
 from vtbdrake.rollout import RecordedMotion as RecordedMotion
 from vtbdrake.state import Snapshot as Snapshot
+from vtbdrake.station import Station as Station
+from vtbdrake.station import StationCommand as StationCommand
 from vtbdrake.testbed import DpsAlone as DpsAlone
 from vtbdrake.testbed import Interface as Interface
 from vtbdrake.testbed import Scenario as Scenario

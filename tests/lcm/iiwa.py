@@ -28,6 +28,7 @@ from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import HardwareSimScenario, Interface, Signal, VirtualTestbedBuilder
+from vtbdrake_diagrams.station import FILE
 
 PERIOD = 0.005
 """The period in s in which Drake's driver publishes its status, and of the DPS."""
@@ -43,11 +44,12 @@ TORQUE_RATE, ACCELERATION = 500.0, 0.5
 TORQUE, POSITION = "torque_only", "position_only"
 
 _FOLDER = Path(__file__).parent / "models"
+_IIWA = FILE.with_name("models") / "iiwa14.urdf"
 DIRECTIVES = f"""
 directives:
 - add_model:
     name: iiwa
-    file: file://{_FOLDER}/iiwa14.urdf
+    file: file://{_IIWA}
     default_joint_positions: {{ {", ".join(f"iiwa_joint_{k + 1}: [{q}]" for k, q in enumerate(HOME))} }}
 - add_weld: {{ parent: world, child: "iiwa::iiwa_link_0" }}
 - add_model: {{ name: hand, file: "file://{_FOLDER}/hand.urdf" }}

@@ -105,8 +105,10 @@ def test_models_start_at_their_initial_positions(tmp_path):
 @pytest.mark.parametrize(("driver", "warns"), [("ZeroForceDriver", False), ("SchunkWsgDriver", True)])
 def test_a_driver_that_is_not_simulated_is_told(tmp_path, caplog, driver, warns):
     load(tmp_path, DEMO.replace("ZeroForceDriver", driver)).build()
-    told = "the model_drivers of acrobot are not simulated: connect an actuator signal to these models"
-    assert [told] * warns == [record.getMessage() for record in caplog.records if "driver" in record.getMessage()]
+    warning = "the model_drivers of acrobot are not simulated: call add_drivers, or connect an actuator signal to these"
+    assert [f"{warning} models"] * warns == [
+        record.getMessage() for record in caplog.records if "driver" in record.getMessage()
+    ]
 
 
 def test_a_camera_sees_the_world(tmp_path):
@@ -185,5 +187,5 @@ directives:
 def test_driver_of_an_iiwa_that_does_not_fit_is_named():
     scenario = IiwaScenario()
     scenario.model_drivers["iiwa"] = IiwaDriver(hand_model_name="gripper")
-    with pytest.raises(ScenarioError, match="model_drivers.iiwa cannot be added: .*gripper"):
+    with pytest.raises(ScenarioError, match=r"iiwa.hand_model_name: .*'gripper', which no add_model .*: iiwa, hand"):
         scenario.build()

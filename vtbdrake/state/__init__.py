@@ -1,8 +1,5 @@
 """s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
 
-from importlib.metadata import version
-
-from vtbdrake.drake_version import warn_if_untested
 from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.codecs import SnapshotError
 from vtbdrake.state.declarations import (
@@ -31,5 +28,3 @@ __all__ = [
     "Variables",
     "collect",
 ]
-
-warn_if_untested(version("drake"))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Union
+from typing import Any, TypeAlias
 
 import numpy as np
-import pydrake.manipulation
 from pydrake.geometry import (
     MakeRenderEngineGl,
     MakeRenderEngineGltfClient,
@@ -20,6 +19,13 @@ from pydrake.geometry import (
     SceneGraphConfig,
 )
 from pydrake.lcm import DrakeLcmParams
+from pydrake.manipulation import (
+    ApplyDriverConfig,
+    ApplyNamedPositionsAsDefaults,
+    IiwaDriver,
+    SchunkWsgDriver,
+    ZeroForceDriver,
+)
 from pydrake.multibody.parsing import (
     GetScopedFrameByName,
     ModelDirective,
@@ -28,19 +34,19 @@ from pydrake.multibody.parsing import (
     Parser,
     ProcessModelDirectives,
 )
-from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import System
 from pydrake.systems.lcm import ApplyLcmBusConfig
 from pydrake.systems.sensors import CameraConfig, RgbdSensor, RgbdSensorDiscrete
 from pydrake.visualization import VisualizationConfig
 
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.gripper import simulated_gripper
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
+from vtbdrake.testbed.testbed import VirtualTestbed
 
 _log = logging.getLogger(__name__)
-# JointStiffnessDriver is newer than drake 1.51.
-_DRIVERS = ("IiwaDriver", "JointStiffnessDriver", "SchunkWsgDriver", "ZeroForceDriver")
-Driver: Any = Union[tuple(vars(pydrake.manipulation)[n] for n in _DRIVERS if n in dir(pydrake.manipulation))]  # noqa: UP007
+Driver: TypeAlias = IiwaDriver | SchunkWsgDriver | ZeroForceDriver
 
 
 @dataclass
@@ -56,10 +62,12 @@ class HardwareSimScenario(Scenario):
             builder.sim_sensor("image", cameras["oracular_view"].GetOutputPort("color_image"))
             builder.sim_actuator("torque", builder.plant.get_actuation_input_port())
 
-    Some fields are read and kept, but not used: the switches and a bridge replace ``lcm_buses`` and all
-    ``model_drivers`` but the `IiwaDriver` (see `add_drivers`), ``build(meshcat=...)`` replaces ``visualization``, and
-    the horizon of a rollout replaces ``simulation_duration``. The world has the default values, so that ``random_seed``
-    is not used either.
+    `vtbdrake.station.Station` does all of this: it takes signals, drivers and messages from the file, too.
+
+    Some fields are read and kept, but not used: the switches and a bridge replace ``lcm_buses``,
+    ``build(meshcat=...)`` replaces ``visualization``, and the horizon of a rollout replaces ``simulation_duration``.
+    The world has the default values, so that ``random_seed`` is not used either. `add_drivers` adds the
+    ``model_drivers``.
 
     Attributes:
         simulator_config, plant_config, scene_graph_config: As in hardware_sim; the defaults are Drake's.
@@ -82,73 +90,137 @@ class HardwareSimScenario(Scenario):
     def add_models(self, builder: VirtualTestbedBuilder) -> list[ModelInstanceInfo]:
         """Add the plant with the models of the directives at their initial positions, and finalize it.
 
+        ``package://`` finds what Drake finds, the packages of ``ROS_PACKAGE_PATH``, and the package of the scenario's
+        file: the next ``package.xml`` in its folder or above.
+
         Returns:
             The models that the directives have added.
 
         Raises:
             ScenarioError: A directive or an initial position does not fit.
         """
-        # A plant applies zero force by itself; add_drivers adds the iiwas.
-        simulated = ("ZeroForceDriver", "IiwaDriver")
-        unused = [name for name, driver in self.model_drivers.items() if type(driver).__name__ not in simulated]
-        if unused:
-            _log.warning(
-                "the model_drivers of %s are not simulated: connect an actuator signal to these models",
-                ", ".join(unused),
-            )
         plant, _ = builder.add_plant(self.plant_config, self.scene_graph_config)
+        return self._process_directives(plant)
+
+    def _process_directives(self, plant: MultibodyPlant) -> list[ModelInstanceInfo]:
+        """Add the models to a plant at their initial positions, and finalize it."""
+        parser = Parser(plant)
+        packages = parser.package_map()
+        packages.PopulateFromRosPackagePath()
+        folder = self.folder()
+        for parent in [folder, *folder.parents] if folder else []:
+            if (parent / "package.xml").exists():
+                packages.AddPackageXml(str(parent / "package.xml"))
+                break
         try:
-            models = ProcessModelDirectives(ModelDirectives(directives=self.directives), Parser(plant))
+            models = ProcessModelDirectives(ModelDirectives(directives=self.directives), parser)
             plant.Finalize()
-            pydrake.manipulation.ApplyNamedPositionsAsDefaults(self.initial_position, plant)
+            ApplyNamedPositionsAsDefaults(self.initial_position, plant)
         except RuntimeError as error:
-            raise ScenarioError(f"{type(self).__name__}: the models cannot be added: {error}") from error
+            raise ScenarioError(
+                f"{self.where('directives')}: the models cannot be added: {error}{_remedy(str(error))}"
+            ) from error
         return list(models)
 
     def add_drivers(self, builder: VirtualTestbedBuilder, models: Sequence[ModelInstanceInfo]) -> dict[str, System]:
-        """Add the KUKA iiwas of ``model_drivers`` as Drake simulates them with their control cabinets.
+        """Add the ``model_drivers``: arms and grippers as Drake simulates them with their control cabinets.
 
-        A command port, ``position`` or ``torque``, is that of an actuator signal::
+        A command port is that of an actuator signal::
 
             driver = self.add_drivers(builder, self.add_models(builder))["iiwa"]
             builder.sim_actuator("joint_torque", driver.GetInputPort("torque"))
             builder.sim_sensor("joint_position", driver.GetOutputPort("position_measured"))
 
-        The driver compensates gravity, with the hand that its ``hand_model_name`` names. Torques at its output ports
-        have the sign of the plant; maps give messages the sign of an iiwa (`vtbdrake.lcm.iiwa_status`).
+        An `IiwaDriver` becomes a `SimIiwaDriver` with the command ports ``position`` and ``torque`` of its control
+        mode. It compensates gravity, with the hand that its ``hand_model_name`` names. Torques at its output ports have
+        the sign of the plant; maps give messages the sign of an iiwa (`vtbdrake.lcm.iiwa_status`). A
+        `SchunkWsgDriver` becomes a `simulated_gripper`. A `ZeroForceDriver` needs no system.
 
         Args:
             builder: The builder to which `add_models` has added the models.
             models: What `add_models` has returned.
 
         Returns:
-            The systems ``sim.act.<model>``, of the class `SimIiwaDriver`, by model.
+            The systems ``sim.act.<model>``, by model.
 
         Raises:
             ScenarioError: A driver does not fit its model.
         """
-        drivers = {
-            name: driver
-            for name, driver in self.model_drivers.items()
-            if isinstance(driver, pydrake.manipulation.IiwaDriver)
-        }
-        diagram_builder, by_name = builder.diagram_builder, {model.model_name: model for model in models}
-        # On these buses Drake adds no systems that send or receive.
-        silent = {driver.lcm_bus: DrakeLcmParams(lcm_url="memq://null") for driver in drivers.values()}
-        buses = ApplyLcmBusConfig(silent, diagram_builder)
-        for name, driver in drivers.items():
-            try:
-                pydrake.manipulation.ApplyDriverConfig(driver, name, builder.plant, by_name, buses, diagram_builder)
-            except RuntimeError as error:
-                raise ScenarioError(f"{type(self).__name__}.model_drivers.{name} cannot be added: {error}") from error
-            diagram_builder.GetMutableSubsystemByName(name).set_name(f"sim.act.{name}")
-        return {name: diagram_builder.GetSubsystemByName(f"sim.act.{name}") for name in drivers}
+        plant = builder.plant
+        if plant is None:
+            raise ScenarioError("drivers need a plant: call add_models first")
+        self._check_drivers(models)
+        for name, driver in self.model_drivers.items():
+            if isinstance(driver, IiwaDriver):
+                self._add_arm(builder, name, driver, models)
+            elif isinstance(driver, SchunkWsgDriver):
+                gripper = builder.add("act", name, simulated_gripper(driver))
+                instance = plant.GetModelInstanceByName(name)
+                for source, port in (
+                    (plant.get_state_output_port(instance), "state"),
+                    (plant.get_generalized_contact_forces_output_port(instance), "generalized_contact_forces"),
+                ):
+                    builder.connect(source, gripper.GetInputPort(port))
+                builder.connect(gripper.GetOutputPort("actuation"), plant.get_actuation_input_port(instance))
+        parts = builder.diagram_builder
+        paths = {name: f"sim.act.{name}" for name in self.model_drivers}
+        return {name: parts.GetSubsystemByName(path) for name, path in paths.items() if parts.HasSubsystemNamed(path)}
 
-    def add_cameras(self, builder: VirtualTestbedBuilder) -> dict[str, RgbdSensorDiscrete]:
+    def _check_drivers(self, models: Sequence[ModelInstanceInfo]) -> None:
+        names = [model.model_name for model in models]
+        for name, driver in self.model_drivers.items():
+            kind = type(driver).__name__
+            hand = driver.hand_model_name if isinstance(driver, IiwaDriver) else ""
+            for model, field_name in ((name, f"model_drivers.{name}"), (hand, f"model_drivers.{name}.hand_model_name")):
+                if model and model not in names:
+                    raise ScenarioError(
+                        f"{self.where(field_name)}: {kind} of {name} names the model {model!r}, which no add_model "
+                        f"directive adds; there are: {', '.join(names) or 'none'}"
+                    )
+
+    def _add_arm(
+        self, builder: VirtualTestbedBuilder, name: str, driver: IiwaDriver, models: Sequence[ModelInstanceInfo]
+    ) -> None:
+        parts, by_name = builder.diagram_builder, {model.model_name: model for model in models}
+        # On such a bus Drake adds no systems that send or receive.
+        silent = {driver.lcm_bus: DrakeLcmParams(lcm_url="memq://null")}
+        buses = ApplyLcmBusConfig(silent, parts)
+        parts.GetSystems()[-1].set_name(f"sim.act.{name}_no_bus")
+        try:
+            ApplyDriverConfig(driver, name, builder.plant, by_name, buses, parts)
+        except RuntimeError as error:
+            raise ScenarioError(
+                f"{self.where(f'model_drivers.{name}')}: {type(driver).__name__} cannot drive {name}: {error}"
+            ) from error
+        parts.GetMutableSubsystemByName(name).set_name(f"sim.act.{name}")
+
+    def build(self, **options: Any) -> VirtualTestbed:
+        testbed = super().build(**options)
+        simulated = {system.get_name() for system in testbed.diagram.GetSystems()}
+        unused = [
+            name
+            for name, driver in self.model_drivers.items()
+            if not isinstance(driver, ZeroForceDriver) and f"sim.act.{name}" not in simulated
+        ]
+        if unused:
+            _log.warning(
+                "the model_drivers of %s are not simulated: call add_drivers, or connect an actuator signal to these "
+                "models",
+                ", ".join(unused),
+            )
+        return testbed
+
+    def add_cameras(
+        self, builder: VirtualTestbedBuilder, *, only: Collection[str] | None = None
+    ) -> dict[str, RgbdSensorDiscrete]:
         """Add the cameras to the models that `add_models` has added.
 
         A camera takes an image every ``1 / fps`` seconds, and holds it. Its output ports are ``color_image``,
         ``depth_image_32f``, ``depth_image_16u``, ``label_image`` and ``body_pose_in_world``.
+
+        Args:
+            builder: The builder to which `add_models` has added the models.
+            only: The keys of the cameras to add; by default all.
 
         Returns:
             The cameras ``sim.sense.<CameraConfig.name>``, by their keys in ``cameras``.
@@ -158,10 +230,12 @@ class HardwareSimScenario(Scenario):
         """
         added = {}
         for key, config in self.cameras.items():
+            if only is not None and key not in only:
+                continue
             if config.capture_offset or config.output_delay:
                 raise ScenarioError(
-                    f"{type(self).__name__}.cameras.{key} has a capture_offset or output_delay: set both to 0, and put "
-                    "a DiscreteTimeDelay behind the camera"
+                    f"{self.where(f'cameras.{key}')}: {key} has a capture_offset or output_delay: set both to 0, and "
+                    "put a DiscreteTimeDelay behind the camera"
                 )
             camera = RgbdSensorDiscrete(self._sensor(builder, config), 1.0 / config.fps, config.label)
             added[key] = builder.add("sense", config.name, camera)
@@ -180,6 +254,13 @@ class HardwareSimScenario(Scenario):
         X_PB = parent.GetFixedPoseInBodyFrame() @ config.X_PB.GetDeterministicValue()
         color, depth = config.MakeCameras()
         return RgbdSensor(plant.GetBodyFrameIdOrThrow(parent.body().index()), X_PB, color, depth)
+
+
+def _remedy(error: str) -> str:
+    """Return what to do about an error of Drake's parser."""
+    if "does not exist" in error or "could not resolve" in error or "unknown package" in error:
+        return "; correct the path in the file, or put the mesh or model there (package:// needs a ROS package.xml)"
+    return ""
 
 
 def _renderer(config: CameraConfig) -> RenderEngine:

@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, is_dataclass
 from importlib.metadata import version
 from inspect import get_annotations
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -90,6 +91,28 @@ class Scenario(ABC):
     def __reduce_ex__(self, protocol: Any) -> Any:
         _make_picklable(self.__dict__)  # A list may have got another config since.
         return super().__reduce_ex__(protocol)
+
+    @classmethod
+    def blank(cls) -> Self:
+        """Return the scenario that the fields of a file are filled into: by default, that with the defaults."""
+        return cls()
+
+    def set_origin(self, path: str, lines: Mapping[str, int]) -> None:
+        """Remember the file that the fields come from, and the line of each dotted name, for `where`."""
+        self.__dict__["_origin"] = (path, lines)
+
+    def folder(self) -> Path | None:
+        """Return the folder of the file that the fields come from; None without a file."""
+        return Path(self.__dict__["_origin"][0]).parent if "_origin" in self.__dict__ else None
+
+    def where(self, name: str = "") -> str:
+        """Return where a field is set, for messages: file and line if it comes from a file, else class and field."""
+        if "_origin" not in self.__dict__:
+            return f"{type(self).__name__}.{name}" if name else type(self).__name__
+        path, lines = self.__dict__["_origin"]
+        while name and name not in lines:
+            name = name.rpartition(".")[0]
+        return f"{path}, line {lines[name]}" if name else str(path)
 
     @abstractmethod
     def interface(self) -> Interface:

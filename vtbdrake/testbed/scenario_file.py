@@ -11,7 +11,7 @@ from dataclasses import fields, is_dataclass
 from inspect import isabstract
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -19,6 +19,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from vtbdrake.settings import field_types
 from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name
 
+S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
 _MOST_NODES = 100_000
 
@@ -48,13 +49,19 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
     name, at, file = text.partition("@")
     if not (at and ":" in name):  # A file may have any name.
         name, file = "", text
-    file, _, key = file.partition("#") if not Path(file).exists() else (file, "", "")
+    file, key = file_and_key(file)
     is_file = file.endswith((".yaml", ".yml"))
     if name and not is_file:
         raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
     scenario = _load_yaml(Path(file), name, key) if is_file else scenario_class(text)()
     scenario.validate()
     return scenario
+
+
+def file_and_key(source: str) -> tuple[str, str]:
+    """Return the parts of ``FILE#KEY``; the key is empty without one. A file that exists may have any name."""
+    file, _, key = source.partition("#") if not Path(source).exists() else (source, "", "")
+    return file, key
 
 
 def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
@@ -126,18 +133,7 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         named: The class that the user has named; empty if only the file names it.
         key: The top-level key of the scenario; empty if there is only one.
     """
-    document = compose_yaml(path)
-    if not isinstance(document, yaml.MappingNode) or (
-        not key and (len(document.value) != 1 or isinstance(document.value[0][1], yaml.ScalarNode))
-    ):
-        raise ScenarioError(
-            f"{path} must have one key, package.module:Class, with the scenario's fields below it, or name the key "
-            f"as package.module:Class@{path}#KEY"
-        )
-    contents = {str(node.value): content for node, content in document.value}
-    if key and key not in contents:
-        raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(contents) or 'none'}")
-    name = key or next(iter(contents))
+    name, content = _scenario_node(path, key)
     if named and ":" in name and name not in (named, class_name(expected := scenario_class(named))):
         raise ScenarioError(f"{path} is of the scenario {name}, not of {class_name(expected)}")
     if not named and ":" in name and not is_imported(name):
@@ -147,15 +143,62 @@ def _load_yaml(path: Path, named: str, key: str) -> Scenario:
         )
     try:
         schema = scenario_class(named or name)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from error
+    return _filled(schema.blank(), content, path, name)
+
+
+def read_fields(scenario: S, path: Path, key: str = "") -> S:
+    """Return a copy of ``scenario`` with the fields below a top-level key of a YAML file; see `load_scenario`.
+
+    Args:
+        scenario: The scenario whose fields keep their values where the file gives none.
+        path: The file.
+        key: The key; empty if there is only one.
+    """
+    name, content = _scenario_node(path, key)
+    return _filled(scenario, content, path, name)
+
+
+def _scenario_node(path: Path, key: str) -> tuple[str, yaml.Node]:
+    """Return the top-level key of the scenario in a file, and what lies below it."""
+    document = compose_yaml(path)
+    if not isinstance(document, yaml.MappingNode) or (
+        not key and (len(document.value) != 1 or isinstance(document.value[0][1], yaml.ScalarNode))
+    ):
+        raise ScenarioError(
+            f"{path} must have one key, package.module:Class, with the scenario's fields below it, or name the key "
+            f"as {path}#KEY"
+        )
+    contents = {str(node.value): content for node, content in document.value}
+    if key and key not in contents:
+        raise ScenarioError(f"{path} has no key {key!r}; it has: {', '.join(contents) or 'none'}")
+    name = key or next(iter(contents))
+    return name, contents[name]
+
+
+def _filled(scenario: S, content: yaml.Node, path: Path, name: str) -> S:
+    """Return a copy of ``scenario`` with the fields of a YAML node."""
+    schema = type(scenario)
+    try:
         resolve_types(schema)
-        content = contents[name]
         _use_new_keys(content, schema)
         refuse_unknown(content, schema)
-        return yaml_load_typed(schema=schema, data=yaml.serialize(content))
+        filled: S = yaml_load_typed(schema=schema, data=yaml.serialize(content), defaults=scenario)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         if isinstance(error, ScenarioError):
             raise ScenarioError(f"{path}: {error}") from error
         raise ScenarioError(f"{path} does not fit {name}: {error}") from error
+    filled.set_origin(str(path.absolute()), dict(_lines(content)))
+    return filled
+
+
+def _lines(node: yaml.Node, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield (dotted name, line) of every key, counted from 1."""
+    for key, value in node.value if isinstance(node, yaml.MappingNode) else []:
+        below = f"{name}.{key.value}".lstrip(".")
+        yield below, key.start_mark.line + 1
+        yield from _lines(value, below)
 
 
 def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
@@ -197,7 +240,8 @@ def _check_nodes(document: yaml.Node | None, path: Path) -> None:
             keys = [str(key.value) for key, _ in node.value]
             if len(set(keys)) < len(keys):
                 twice = next(key for key in keys if keys.count(key) > 1)
-                raise ScenarioError(f"{path} has the key {twice!r} twice, near line {node.start_mark.line + 1}")
+                lines = [str(key.start_mark.line + 1) for key, _ in node.value if str(key.value) == twice]
+                raise ScenarioError(f"{path} has the key {twice!r} twice, in lines {' and '.join(lines)}: remove one")
             waiting += [value for _, value in node.value]
         elif isinstance(node, yaml.SequenceNode):
             waiting += node.value
@@ -224,8 +268,11 @@ def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
     if not isinstance(node, yaml.MappingNode):
         return
     # A tag chooses one of several classes; the first one needs no tag.
-    classes = [part for part in alternatives if isinstance(part, type) and field_types(part)]
+    classes = [p for p in alternatives if isinstance(p, type) and (field_types(p) or hasattr(p, "__fields__"))]
     expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
+    if len(classes) > 1 and node.tag.startswith("!") and expected and node.tag != f"!{expected.__name__}":
+        tags = ", ".join(f"!{part.__name__}" for part in classes)
+        raise ScenarioError(f"line {node.start_mark.line + 1}: {name} is one of {tags}, not {node.tag}")
     types = field_types(expected)
     for key, value in node.value:
         below = f"{name}.{key.value}".lstrip(".")

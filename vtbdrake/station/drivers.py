@@ -1,0 +1,403 @@
+"""The drivers of a station: the signals that each offers, its simulated and its real end, and what keeps it safe."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.lcm import DrakeLcmParams
+from pydrake.manipulation import IiwaDriver, SchunkWsgDriver
+from pydrake.multibody.parsing import ModelInstanceInfo
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import System
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, PassThrough
+from pydrake.systems.sensors import CameraConfig, ImageDepth16U, ImageLabel16I, ImageRgba8U
+
+from vtbdrake.control.fallback import Brake, Fallback, Hold, gravity_compensation
+from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status, wsg_command, wsg_status
+from vtbdrake.lcm.drake_messages import image_array_map
+from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.station.models import JointLimits, arm_model, driven_joints
+from vtbdrake.testbed import ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed.gripper import FORCE_LIMIT, STATUS_PERIOD
+
+AGE = 10.0
+"""The largest age of a sensor signal, in periods of its messages."""
+_MARGIN = np.radians(5.0)  # by which joints run into their stops
+_FINGER_MARGIN = 0.02  # m
+_BRAKING_TIME = 0.1  # s, in which the brake of an arm takes the speed of a joint that moves alone
+_LOOSE = 10.0  # how far, by effort limits, external torques and forces are plausible
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """How quickly the commands of a station may change where its models give no limit.
+
+    Attributes:
+        speed_time: The time in s in which a commanded position may reach its largest speed.
+        effort_time: The time in s in which a commanded torque may reach its largest value.
+    """
+
+    speed_time: float
+    effort_time: float
+
+
+class StationDriver(ABC):
+    """One driver of a station's file.
+
+    Attributes:
+        name: The model that it drives.
+        sense: The sensor signals that it offers.
+        act: The actuator signals that it takes.
+        optional: The actuator signals that a DPS may leave out.
+        mode: What it takes, in words, for messages.
+        period: The period of its status messages in s.
+    """
+
+    name: str
+    sense: Sequence[Signal]
+    act: Sequence[Signal]
+    optional: frozenset[str] = frozenset()
+    mode: str
+    period: float
+
+    @abstractmethod
+    def connect(self, builder: VirtualTestbedBuilder, simulated: System, used: Collection[str]) -> None:
+        """Connect the signals to the simulated driver.
+
+        Args:
+            builder: The builder of the testbed.
+            simulated: What `HardwareSimScenario.add_drivers` has added.
+            used: The actuator signals that the DPS commands.
+        """
+
+    @abstractmethod
+    def status(self) -> LcmMap:
+        """Return the map of the messages of the real driver."""
+
+    @abstractmethod
+    def command(self, used: Collection[str]) -> LcmMap:
+        """Return the map of the messages to the real driver."""
+
+    @abstractmethod
+    def continuity(self, period: float) -> Mapping[str, tuple[str, ArrayLike] | None]:
+        """Return where the actuator commands start from at a switch to real, in a loop of this period."""
+
+    @abstractmethod
+    def fallbacks(self) -> Mapping[str, Fallback]:
+        """Return the fallbacks of the actuator signals."""
+
+    def reported(self) -> Mapping[str, str]:
+        """Return `Protocol.reported`."""
+        return {}
+
+
+class Arm(StationDriver):
+    """An arm with a KUKA iiwa's control cabinet, in one of its control modes.
+
+    Signals, with the name of the model before each: the sensor signals ``_position_measured``, ``_velocity_estimated``,
+    ``_position_commanded`` (in the position modes), ``_torque_commanded``, ``_torque_measured``, ``_torque_external``,
+    and ``_torque_added`` (in torque-only mode): the commanded torque on top of the gravity compensation. The actuator
+    signals ``_position`` and ``_torque``, as the mode has them. In ``position_and_torque``, the torque may be left out.
+
+    After a fault, a position is held; torques brake the joints, and vanish without a measured velocity: the cabinet
+    carries the weight.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        driver: IiwaDriver,
+        plant: MultibodyPlant,
+        models: Mapping[str, ModelInstanceInfo],
+        *,
+        bus: DrakeLcmParams,
+        motion: Motion,
+        where: str,
+    ) -> None:
+        if driver.control_mode not in _MODES:
+            raise ScenarioError(
+                f"{where}: control_mode of {name} is one of {', '.join(_MODES)}, not {driver.control_mode!r}"
+            )
+        self.name, self.mode, self.period = name, driver.control_mode, driver.lcm_status_period
+        self._suffix = bus.channel_suffix
+        joints, limits = driven_joints(plant, models[name], driver=type(driver).__name__, where=where)
+        self.joints = tuple(joint.name() for joint in joints)
+        self.limits: JointLimits = limits
+        self.new_model = partial(arm_model, plant, models, name, driver)
+        self.model = self.new_model()
+        self._has_position, self._has_torque = "position" in self.mode, "torque" in self.mode
+        self._torque_alone = not self._has_position
+        self._size = len(joints)
+        home = plant.GetDefaultPositions(models[name].model_instance)
+        self.sense = self._sensors()
+        self.act = self._commands(np.clip(home, limits.lower, limits.upper), motion)
+        self.optional = frozenset({f"{name}_torque"} if self._has_position else ())
+
+    def _sensors(self) -> list[Signal]:
+        limits, age = self.limits, AGE * self.period
+        positions = {"unit": "rad", "lower": limits.lower - _MARGIN, "upper": limits.upper + _MARGIN}
+
+        def sensor(name: str, **options: Any) -> Signal:
+            return Signal(f"{self.name}_{name}", size=self._size, max_age=age, **options)
+
+        def torque(name: str, factor: float) -> Signal:
+            return sensor(name, unit="N m", lower=-factor * limits.effort, upper=factor * limits.effort)
+
+        # What is measured may pass the limits of the commands; only what is impossible is refused.
+        sensors = [
+            sensor("position_measured", **positions),
+            sensor("velocity_estimated", unit="rad/s", lower=-_LOOSE * limits.speed, upper=_LOOSE * limits.speed),
+            torque("torque_commanded", 2.0),
+            torque("torque_measured", 2.0),
+            torque("torque_external", _LOOSE),
+        ]
+        if self._has_position:
+            sensors.append(sensor("position_commanded", **positions))
+        else:
+            sensors.append(torque("torque_added", 4.0))
+        return sensors
+
+    def _commands(self, home: np.ndarray, motion: Motion) -> list[Signal]:
+        limits, commands = self.limits, []
+        if self._has_position:
+            acceleration = np.where(
+                np.isfinite(limits.acceleration), limits.acceleration, limits.speed / motion.speed_time
+            )
+            commands.append(
+                Signal(
+                    f"{self.name}_position",
+                    size=self._size,
+                    unit="rad",
+                    lower=limits.lower,
+                    upper=limits.upper,
+                    rate=limits.speed,
+                    acceleration=acceleration,
+                    idle=home,
+                )
+            )
+        if self._has_torque:
+            # On top of a position controller, nothing measures it: no limited rate could start anywhere.
+            rate = limits.effort / motion.effort_time if self._torque_alone else np.inf
+            commands.append(
+                Signal(
+                    f"{self.name}_torque",
+                    size=self._size,
+                    unit="N m",
+                    lower=-limits.effort,
+                    upper=limits.effort,
+                    rate=rate,
+                    idle=0.0,
+                )
+            )
+        return commands
+
+    def connect(self, builder: VirtualTestbedBuilder, simulated: System, used: Collection[str]) -> None:
+        offered = [signal.name.removeprefix(f"{self.name}_") for signal in self.sense]
+        for name in offered:
+            if name != "torque_added":
+                builder.sim_sensor(f"{self.name}_{name}", simulated.GetOutputPort(name))
+        if self._has_position:
+            builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"))
+        if self._torque_alone:
+            added = builder.add("act", f"{self.name}_torque", PassThrough(self._size))
+            builder.sim_actuator(f"{self.name}_torque", added.get_input_port())
+            builder.sim_sensor(f"{self.name}_torque_added", added.get_output_port())
+            builder.connect(added.get_output_port(), simulated.GetInputPort("torque"))
+        elif f"{self.name}_torque" in used:
+            builder.sim_actuator(f"{self.name}_torque", simulated.GetInputPort("torque"))
+        elif self._has_torque:
+            nothing = builder.add("act", f"{self.name}_torque", ConstantVectorSource(np.zeros(self._size)))
+            builder.connect(nothing.get_output_port(), simulated.GetInputPort("torque"))
+
+    def status(self) -> LcmMap:
+        fields = {
+            f"{self.name}_position_measured": "joint_position_measured",
+            f"{self.name}_velocity_estimated": "joint_velocity_estimated",
+            f"{self.name}_torque_commanded": "joint_torque_commanded",
+            f"{self.name}_torque_measured": "joint_torque_measured",
+            f"{self.name}_torque_external": "joint_torque_external",
+        }
+        channel = f"IIWA_STATUS{self._suffix}"
+        if self._has_position:
+            return iiwa_status(
+                {**fields, f"{self.name}_position_commanded": "joint_position_commanded"}, channel=channel
+            )
+        on_top = {f"{self.name}_torque_added": "joint_torque_measured", self._reported: "joint_torque_commanded"}
+        return iiwa_status(fields, on_top=on_top, gravity=gravity_compensation(self.model), channel=channel)
+
+    @property
+    def _reported(self) -> str:
+        return f"{self.name}_torque_reported"
+
+    def reported(self) -> Mapping[str, str]:
+        return {f"{self.name}_torque": self._reported} if self._torque_alone else {}
+
+    def command(self, used: Collection[str]) -> LcmMap:
+        fields = {f"{self.name}_position": "joint_position", f"{self.name}_torque": "joint_torque"}
+        return iiwa_command(
+            {name: path for name, path in fields.items() if name in used}, channel=f"IIWA_COMMAND{self._suffix}"
+        )
+
+    def continuity(self, period: float) -> Mapping[str, tuple[str, ArrayLike] | None]:
+        starts: dict[str, tuple[str, ArrayLike] | None] = {}
+        for signal in self.act:
+            allowed = np.broadcast_to(np.asarray(signal.rate) * period, (self._size,))
+            if signal.unit == "rad":
+                starts[signal.name] = (f"{self.name}_position_commanded", np.where(np.isinf(allowed), 0.005, allowed))
+            elif self._torque_alone:
+                starts[signal.name] = (f"{self.name}_torque_added", np.where(np.isinf(allowed), 2.5, allowed))
+            else:
+                starts[signal.name] = None
+        return starts
+
+    def fallbacks(self) -> Mapping[str, Fallback]:
+        # Of a joint that moves while the others are free, the inertia is smallest.
+        mass = self.model.CalcMassMatrix(self.model.CreateDefaultContext())
+        inertia = 1.0 / np.diag(np.linalg.inv(mass))
+        brake = Brake(f"{self.name}_velocity_estimated", gain=inertia / _BRAKING_TIME)
+        return {signal.name: Hold() if signal.unit == "rad" else brake for signal in self.act}
+
+
+_MODES = ("position_only", "position_and_torque", "torque_only")
+
+
+class Gripper(StationDriver):
+    """A Schunk WSG gripper under position control.
+
+    Signals of size 1, with the name of the model before each: the sensor signals ``_position_measured`` (the distance
+    of the fingers in m), ``_velocity_measured`` (m/s) and ``_force_measured`` (N, never negative); the actuator signals
+    ``_position`` (the distance in m) and ``_force_limit`` (N), which may be left out.
+
+    After a fault, the last command goes on: a gripper that has grasped something keeps it.
+    """
+
+    period = STATUS_PERIOD
+    mode = "position"
+
+    def __init__(
+        self,
+        name: str,
+        driver: SchunkWsgDriver,
+        plant: MultibodyPlant,
+        models: Mapping[str, ModelInstanceInfo],
+        *,
+        bus: DrakeLcmParams,
+        where: str,
+    ) -> None:
+        self.name, self._suffix = name, bus.channel_suffix
+        instance = models[name].model_instance
+        if (plant.num_positions(instance), plant.num_actuators(instance)) != (2, 2):
+            raise ScenarioError(
+                f"{where}: {type(driver).__name__} cannot drive {name} ({models[name].model_path}): it needs two "
+                f"actuated fingers, not {plant.num_positions(instance)} positions and {plant.num_actuators(instance)} "
+                "actuators"
+            )
+        _, limits = driven_joints(plant, models[name], driver=type(driver).__name__, where=where)
+        # Finger 0 opens to negative positions, finger 1 to positive ones.
+        least, most = max(0.0, limits.lower[1] - limits.upper[0]), limits.upper[1] - limits.lower[0]
+        home = plant.GetDefaultPositions(instance)
+        largest_force = 2.0 * float(limits.effort.min())
+        force = min(FORCE_LIMIT, largest_force)
+        age = AGE * STATUS_PERIOD
+        self.sense = [
+            Signal(
+                f"{name}_position_measured",
+                size=1,
+                unit="m",
+                lower=least - _FINGER_MARGIN,
+                upper=most + _FINGER_MARGIN,
+                max_age=age,
+            ),
+            Signal(f"{name}_velocity_measured", size=1, unit="m/s", lower=-10.0, upper=10.0, max_age=age),
+            Signal(f"{name}_force_measured", size=1, unit="N", lower=0.0, upper=_LOOSE * largest_force, max_age=age),
+        ]
+        self.act = [
+            Signal(
+                f"{name}_position",
+                size=1,
+                unit="m",
+                lower=least,
+                upper=most,
+                idle=float(np.clip(home[1] - home[0], least, most)),
+            ),
+            Signal(f"{name}_force_limit", size=1, unit="N", lower=0.0, upper=largest_force, idle=force),
+        ]
+        self._force = force
+        self.optional = frozenset({f"{name}_force_limit"})
+
+    def connect(self, builder: VirtualTestbedBuilder, simulated: System, used: Collection[str]) -> None:
+        state = builder.add("sense", f"{self.name}_state", Demultiplexer(2, 1))
+        builder.connect(simulated.GetOutputPort("state_measured"), state.get_input_port())
+        builder.sim_sensor(f"{self.name}_position_measured", state.get_output_port(0))
+        builder.sim_sensor(f"{self.name}_velocity_measured", state.get_output_port(1))
+        builder.sim_sensor(f"{self.name}_force_measured", simulated.GetOutputPort("force_measured"))
+        builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"))
+        if f"{self.name}_force_limit" in used:
+            builder.sim_actuator(f"{self.name}_force_limit", simulated.GetInputPort("force_limit"))
+        else:
+            limit = builder.add("act", f"{self.name}_force_limit", ConstantVectorSource([self._force]))
+            builder.connect(limit.get_output_port(), simulated.GetInputPort("force_limit"))
+
+    def status(self) -> LcmMap:
+        fields = {
+            f"{self.name}_position_measured": "actual_position_mm",
+            f"{self.name}_velocity_measured": "actual_speed_mm_per_s",
+            f"{self.name}_force_measured": "actual_force",
+        }
+        return wsg_status(fields, channel=f"SCHUNK_WSG_STATUS{self._suffix}")
+
+    def command(self, used: Collection[str]) -> LcmMap:
+        fields = {f"{self.name}_position": "target_position_mm", f"{self.name}_force_limit": "force"}
+        fields = {name: path for name, path in fields.items() if name in used}
+        force = None if "force" in fields.values() else self._force
+        return wsg_command(fields, force=force, channel=f"SCHUNK_WSG_COMMAND{self._suffix}")
+
+    def continuity(self, period: float) -> Mapping[str, tuple[str, ArrayLike] | None]:
+        # A gripper moves to its target at its own speed, wherever it is.
+        return {signal.name: None for signal in self.act}
+
+    def fallbacks(self) -> Mapping[str, Fallback]:
+        return {signal.name: Hold() for signal in self.act}
+
+
+class CameraImages:
+    """The images of a camera: sensor signals that a DPS may read, with the name of the camera before each.
+
+    They are ``_color_image`` (`ImageRgba8U`), ``_depth_image`` (`ImageDepth16U`, in mm) and ``_label_image``
+    (`ImageLabel16I`), as far as ``rgb``, ``depth`` and ``label`` of the `CameraConfig` ask for them.
+    """
+
+    _KINDS = (
+        ("rgb", "color_image", "color_image", "color", ImageRgba8U),
+        ("depth", "depth_image", "depth_image_16u", "depth", ImageDepth16U),
+        ("label", "label_image", "label_image", "label", ImageLabel16I),
+    )
+
+    def __init__(self, config: CameraConfig, *, bus: DrakeLcmParams) -> None:
+        self.period = 1.0 / config.fps
+        self._channel = f"DRAKE_RGBD_CAMERA_IMAGES_{config.name}{bus.channel_suffix}"
+        self._compress = config.do_compress
+        kinds = [(f"{config.name}_{kind[1]}", *kind) for kind in self._KINDS if getattr(config, kind[0])]
+        self.sense = [
+            Signal(name, model_value=image(config.width, config.height), max_age=AGE * self.period)
+            for name, *_, image in kinds
+        ]
+        self._ports = {name: port for name, _, _, port, _, _ in kinds}
+        self._frames = {name: frame for name, *_, frame, _ in kinds}
+
+    def connect(self, builder: VirtualTestbedBuilder, camera: System, used: Collection[str]) -> None:
+        """Connect the images that the DPS reads to the simulated camera."""
+        for name, port in self._ports.items():
+            if name in used:
+                builder.sim_sensor(name, camera.GetOutputPort(port))
+
+    def images(self, used: Collection[str]) -> LcmMap:
+        """Return the map of the messages of the real camera, as Drake's simulated one sends them."""
+        frames = {name: frame for name, frame in self._frames.items() if name in used}
+        return image_array_map(self._channel, frames, compress=self._compress)
