@@ -25,7 +25,7 @@ help:
 	@echo "make demo                          the space climber, from the question to the answer"
 	@echo "make demo-control                  an arm, from the simulation to the machine, at 1 kHz; the machine killed, and back"
 	@echo "make test [ARGS='-k name']         the tests"
-	@echo "make check                         ruff and mypy"
+	@echo "make check                         ruff, mypy, and the public interface against that of the newest release"
 	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
 	@echo "make bench [ONLY=name]             every benchmark; writes benchmarks/results.json"
@@ -56,6 +56,7 @@ check: $(STAMP)
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
+	$(RUN) tools/public_api.py
 
 # Warnings are errors: a link that leads nowhere, a page that is not in docs/index.md.
 docs: $(STAMP)

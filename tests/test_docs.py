@@ -14,7 +14,8 @@ pytestmark = pytest.mark.one_python
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOTS = [ROOT, ROOT / "vtbdrake"]
-PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").rglob("*.md"))]
+AT_THE_ROOT = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CHANGELOG.md")]
+PAGES = [*AT_THE_ROOT, *sorted((ROOT / "docs").rglob("*.md"))]
 # The same programs with fewer rollouts.
 SHORTER = {
     "README": {"resolution=1.0, coarse=5.0": "resolution=10.0, coarse=30.0", "(0, 1/8, 2/8, 3/8)": "(0, 1/8)"},

@@ -15,12 +15,15 @@ import sys
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import PathFinder
 from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
 from types import FrameType
 from typing import Any, Self
+
+from vtbdrake.drake_version import UntestedDrakeWarning
 
 _log = logging.getLogger(__name__)
 
@@ -299,6 +302,7 @@ def _search_path() -> list[str]:
 
 def _run(files: Sequence[int], grace: float) -> None:
     """Run the child: see `ChildProcess`."""
+    warnings.simplefilter("ignore", UntestedDrakeWarning)  # The parent has it.
     connection, call, *sockets = files
     threading.Thread(target=_exit_after_hang_up, args=(os.dup(connection), grace), daemon=True).start()
     with socket.socket(fileno=connection) as parent:

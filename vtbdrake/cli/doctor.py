@@ -23,12 +23,10 @@ import click
 
 from vtbdrake.cli import FAILED
 from vtbdrake.cli.options import option
+from vtbdrake.drake_version import TESTED_DRAKE
 from vtbdrake.failures import one_line
 
 OK, WARNING, FAILURE = "ok", "warning", "failure"
-
-TESTED_DRAKE = ("1.51.1", "1.58.0")
-"""The versions of Drake with which the tests run."""
 
 NETWORK_FILE_SYSTEMS = {
     "9p", "afs", "beegfs", "ceph", "cifs", "fuse.glusterfs", "fuse.sshfs", "gpfs", "lustre", "ncpfs", "nfs", "nfs4",

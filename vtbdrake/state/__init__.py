@@ -1,5 +1,8 @@
 """s = [x, a]: every element of a Context by address, unit and bounds; snapshots of it."""
 
+from importlib.metadata import version
+
+from vtbdrake.drake_version import warn_if_untested
 from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.codecs import SnapshotError
 from vtbdrake.state.declarations import (
@@ -28,3 +31,5 @@ __all__ = [
     "Variables",
     "collect",
 ]
+
+warn_if_untested(version("drake"))

@@ -1,0 +1,19 @@
+"""What the campaigns of the tests draw and measure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+ANGLE = "sim.sys.Pendulum.theta.position"
+
+
+def start(seed: int) -> dict[str, float]:
+    """Draw the angle at the start, in rad."""
+    return {ANGLE: float(np.random.default_rng(seed).uniform(-1.0, 1.0))}
+
+
+def small(angle: float) -> float:
+    """Return the magnitude of an angle; a large one is an error."""
+    if abs(angle) > 0.9:
+        raise ArithmeticError("beyond the scale")
+    return abs(angle)
