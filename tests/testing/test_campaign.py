@@ -116,6 +116,10 @@ def test_a_campaign_counts_what_its_rollouts_do(tmp_path: Path) -> None:
         assert "verdict" in cells[name, "speed"] and "pass" not in cells[name, "speed"]
         total += passed
     assert cells["all conditions", "small angle"]["pass"] == total
+    for rollout in reported["rollouts"]:
+        angle = rollout["values"]
+        passes = angle["small angle"] <= 0.7 and abs(angle["low at the end"]) <= 0.3
+        assert rollout["status"] == ("pass" if passes else "fail")
     assert cells["all conditions", "small angle"]["verdict"] == "reported"
     assert {cell["verdict"] for cell in cells.values()} >= {"met", "missed"}
 

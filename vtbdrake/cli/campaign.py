@@ -24,6 +24,7 @@ from vtbdrake.testing.campaign_report import (
     html_page,
     junit_xml,
     limits_text,
+    passed_text,
     reason,
 )
 from vtbdrake.testing.campaign_results import (
@@ -235,7 +236,7 @@ def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[C
         ]
         head = ["condition", "criterion", "both pass", "only here", "only there", "neither", "p", "difference"]
         click.echo("\n" + table(head, rows))
-    click.echo(f"\n{folder / PAGE}")
+    click.echo(f"\n{passed_text(result)}: {folder / PAGE}")
 
 
 def _with_verdict(cell: Cell) -> str:

@@ -68,6 +68,11 @@ def limits_text(criterion: Criterion) -> str:
     return f"{words}, in {criterion.rate:.4g} of the rollouts with {criterion.confidence:.4g} confidence{where}"
 
 
+def passed_text(result: CampaignResult) -> str:
+    """Return how many rollouts pass all criteria, in words."""
+    return f"{result.passed} of {result.count} rollouts pass all their criteria"
+
+
 def cell_text(cell: Cell) -> str:
     """Return the rate of a cell with its interval, or the range of its numbers, in a few words."""
     if not cell.criterion.is_limited:
@@ -180,13 +185,12 @@ def html_page(
     """
     campaign, evidence = result.campaign, evidence or {}
     title = html.escape(campaign.path.stem)
-    done = sum(bool(rollout.end) for rollout in result.rollouts)
     judged = [cell for cell in result.cells() if cell.is_judged]
     met = sum(cell.verdict == MET for cell in judged)
     word = MET if result.is_met else MISSED if any(cell.verdict == MISSED for cell in judged) else UNDECIDED
     summary = (
-        f"{met} of {len(judged)} requirements met. {done} of {len(result.rollouts)} rollouts of "
-        f"<code>{html.escape(campaign.scenario)}</code>: {len(campaign.conditions)} conditions, seeds "
+        f"{met} of {len(judged)} requirements met. {passed_text(result)}. {result.count} of {len(result.rollouts)} "
+        f"rollouts of <code>{html.escape(campaign.scenario)}</code>: {len(campaign.conditions)} conditions, seeds "
         f"{campaign.seeds.first} to {campaign.seeds.first + campaign.seeds.count - 1}."
     )
     sections = [

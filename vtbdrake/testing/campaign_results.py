@@ -184,6 +184,26 @@ class CampaignResult:
         rollouts = tuple(rollout for rollout in self.rollouts if rollout.condition in rows)
         return Cell(name, criterion, condition, rollouts)
 
+    def status(self, rollout: CampaignRollout) -> str:
+        """Return what all criteria together say of a rollout: `PASS` if it passes each that applies to it."""
+        applied = (
+            (name, criterion)
+            for name, criterion in self.campaign.criteria.items()
+            if criterion.is_limited and rollout.condition in (criterion.conditions or self.campaign.conditions)
+        )
+        statuses = {rollout.status(name, criterion) for name, criterion in applied}
+        return next((status for status in (NOT_RUN, ERROR, FAIL) if status in statuses), PASS)
+
+    @property
+    def passed(self) -> int:
+        """Return the number of rollouts that pass all criteria."""
+        return sum(bool(rollout.end) and self.status(rollout) == PASS for rollout in self.rollouts)
+
+    @property
+    def count(self) -> int:
+        """Return the number of rollouts that were run."""
+        return sum(bool(rollout.end) for rollout in self.rollouts)
+
     @property
     def is_met(self) -> bool:
         """Return whether all that the campaign requires is shown."""
@@ -192,7 +212,7 @@ class CampaignResult:
     @property
     def is_complete(self) -> bool:
         """Return whether all rollouts were run."""
-        return all(rollout.end for rollout in self.rollouts)
+        return self.count == len(self.rollouts)
 
     def compare(self, baseline: CampaignResult) -> list[Comparison]:
         """Return the comparisons with a baseline, pair by pair, in the order of `cells`."""
@@ -221,7 +241,7 @@ class CampaignResult:
             "seeds": [seeds.start, seeds[-1]],
             "criteria": {name: asdict(criterion) for name, criterion in campaign.criteria.items()},
             "cells": [cell.to_dict() for cell in self.cells()],
-            "rollouts": [asdict(rollout) for rollout in self.rollouts],
+            "rollouts": [{**asdict(rollout), "status": self.status(rollout)} for rollout in self.rollouts],
             "comparisons": [{**asdict(each), "p": each.p, "difference": each.difference} for each in comparisons],
         }
 
