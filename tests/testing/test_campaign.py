@@ -144,6 +144,15 @@ def test_junit_has_a_case_for_every_requirement(tmp_path: Path) -> None:
         assert suite.get("failures") == str(len(list(suite.iter("failure"))))
 
 
+def test_seeds_that_change_nothing_are_named(tmp_path: Path) -> None:
+    path = written(tmp_path, conditions={"free": {}, "damped": {DAMPING: 1.0}}, seeds={"count": 3, "set": [RATE]})
+    assert "Warning" not in run_campaign(path)
+    path = written(tmp_path, "still.yaml", seeds={"count": 3, "set": ["u.angle"]}, conditions={"free": {}})
+    warning = "All seeds give the same numbers under: free. Equal rollouts are no trials"
+    assert warning in run_campaign(path, code=0)
+    assert warning in (path.with_suffix("") / "index.html").read_text()
+
+
 def test_a_failed_rollout_is_an_error_and_has_not_passed(tmp_path: Path) -> None:
     criteria = {"scale": {"of": ANGLE, "f": f"{FUNCTIONS}:small", "at_most": 1.0}}
     path = written(tmp_path, criteria=criteria, conditions={"far": {RATE: 6.0}, "still": {RATE: 0.0}})

@@ -26,6 +26,7 @@ from vtbdrake.testing.campaign_report import (
     limits_text,
     passed_text,
     reason,
+    warning,
 )
 from vtbdrake.testing.campaign_results import (
     ALL,
@@ -236,6 +237,8 @@ def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[C
         ]
         head = ["condition", "criterion", "both pass", "only here", "only there", "neither", "p", "difference"]
         click.echo("\n" + table(head, rows))
+    if caution := warning(result):
+        click.echo(f"\nWarning: {caution}")
     click.echo(f"\n{passed_text(result)}: {folder / PAGE}")
 
 

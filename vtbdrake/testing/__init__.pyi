@@ -8,6 +8,9 @@ from vtbdrake.testing.assertions import assert_replays as assert_replays
 from vtbdrake.testing.assertions import assert_same_motion as assert_same_motion
 from vtbdrake.testing.assertions import assert_settles as assert_settles
 from vtbdrake.testing.assertions import assert_succeeds as assert_succeeds
+from vtbdrake.testing.campaign import Campaign as Campaign
+from vtbdrake.testing.campaign import CampaignError as CampaignError
+from vtbdrake.testing.campaign_results import CampaignResult as CampaignResult
 from vtbdrake.testing.check import CheckFailedError as CheckFailedError
 from vtbdrake.testing.check import CheckResult as CheckResult
 from vtbdrake.testing.check import CheckSkippedError as CheckSkippedError

@@ -73,6 +73,16 @@ def passed_text(result: CampaignResult) -> str:
     return f"{result.passed} of {result.count} rollouts pass all their criteria"
 
 
+def warning(result: CampaignResult) -> str:
+    """Return what makes the rates meaningless; empty if nothing does."""
+    if not (conditions := result.unvaried):
+        return ""
+    return (
+        f"All seeds give the same numbers under: {', '.join(conditions)}. Equal rollouts are no trials, and their "
+        "rates and intervals say nothing: let the seeds change something there, such as noise."
+    )
+
+
 def cell_text(cell: Cell) -> str:
     """Return the rate of a cell with its interval, or the range of its numbers, in a few words."""
     if not cell.criterion.is_limited:
@@ -195,6 +205,7 @@ def html_page(
     )
     sections = [
         f'<h1>{title} <span class="{word}">{"met" if result.is_met else "not met"}</span></h1><p>{summary}</p>',
+        f'<p class="undecided">{html.escape(caution)}</p>' if (caution := warning(result)) else "",
         _table(result),
         _legend(),
         *(_failure(cell, commands, evidence) for cell in failed_cells(result)),

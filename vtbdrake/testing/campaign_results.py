@@ -205,6 +205,16 @@ class CampaignResult:
         return sum(bool(rollout.end) for rollout in self.rollouts)
 
     @property
+    def unvaried(self) -> list[str]:
+        """Return the conditions in which all rollouts have the same numbers: their seeds change nothing."""
+        conditions = []
+        for condition in self.campaign.conditions:
+            numbers = [rollout.values for rollout in self.rollouts if rollout.condition == condition and rollout.values]
+            if len(numbers) > 1 and all(values == numbers[0] for values in numbers):
+                conditions.append(condition)
+        return conditions
+
+    @property
     def is_met(self) -> bool:
         """Return whether all that the campaign requires is shown."""
         return all(cell.verdict == MET for cell in self.cells() if cell.is_judged)
