@@ -269,14 +269,28 @@ class ChannelReader:
     """Checks the messages of one channel and updates its signals, by the rules of `LcmBridge`."""
 
     def __init__(
-        self, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal], reorder_window: float
+        self,
+        map: LcmMap,
+        signals: Sequence[Signal],
+        received: Mapping[str, ReceivedSignal],
+        reorder_window: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Prepare the decoder.
+
+        Args:
+            map: The map of the channel.
+            signals: The signals of the map.
+            received: The received signals, by name; those of the map are updated.
+            reorder_window: Window in seconds, see `LcmBridge`.
+            clock: The time at which messages arrive, in seconds.
 
         Raises:
             ValueError: The map cannot carry the signals.
         """
         self.channel = map.channel  # name of the channel
+        self._clock = clock
         self.clock_jumps = 0  # how often the sender's time jumped, back or ahead, and was accepted
         self._decode = map.decoder(signals)
         self._signals = [(signal.name, received[signal.name], Bounds(signal)) for signal in signals]
@@ -293,7 +307,7 @@ class ChannelReader:
 
     def receive(self, channel: str, data: bytes) -> None:
         """Handle one message."""
-        now = time.monotonic()
+        now = self._clock()
         try:
             sent, values = self._decode(data)
             fits = self._last < sent <= now + self._ahead + MAX_AHEAD

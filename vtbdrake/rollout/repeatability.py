@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from html import escape
 from itertools import zip_longest
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import ContextBase
+from pydrake.systems.framework import Context, ContextBase
 
 from vtbdrake.failures import error_text
 from vtbdrake.pickling import dumps
@@ -20,14 +20,18 @@ from vtbdrake.rollout.quality import QualityError
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
+from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import leaves, read_group, stateful_leaves
 from vtbdrake.testbed import VirtualTestbed
 
 # Seconds of processor time for the reference; the other rollouts are as long in simulated time.
 _BUDGET = 0.1
 
-# Compared at a sample time: the numbers of each system, by path; under "" those of f and the other measures.
 Sample = Mapping[str, tuple[Any, ...]]
+"""The numbers of each system at a sample time, by path; under "" those of f and the other measures."""
+
+Trace = Sequence[tuple[float, Sample]]
+"""Sample times in seconds from t0, and the samples there."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,97 +81,125 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
         QualityError: f raises, is negative or NaN, so that nothing can be compared.
     """
     point, other = points[0], points[-1]
-    reference = list(_within(_BUDGET, _trace(RolloutRunner(task, testbed), point)))
-    before = _attributes(testbed)
-    repeated = _first(_trace(RolloutRunner(task, testbed), point), count=len(reference))
-    changed = [name for name, value in _attributes(testbed).items() if before.get(name) != value]
+    reference = list(within(_BUDGET, trace(RolloutRunner(task, testbed), point)))
+    before = python_attributes(testbed)
+    repeated = first(trace(RolloutRunner(task, testbed), point), count=len(reference))
+    changed = [name for name, value in python_attributes(testbed).items() if before.get(name) != value]
     findings = list(_compare(task, reference, repeated, changed, "a second rollout of the same point"))
     if not findings:
-        beside = _side_by_side(RolloutRunner(task, testbed), point, RolloutRunner(task, testbed), other, len(reference))
-        changed = [name for name, value in _attributes(testbed).items() if before.get(name) != value]
+        neighbour = trace(RolloutRunner(task, testbed), other)
+        beside = first(side_by_side(trace(RolloutRunner(task, testbed), point), neighbour), count=len(reference))
+        changed = [name for name, value in python_attributes(testbed).items() if before.get(name) != value]
         findings += _compare(task, reference, beside, changed, "a rollout that runs beside another one")
     short = replace(task, horizon=max(float(reference[-1][0]), task.sample_period), keep_state=False)
     sending = list(_unsendable(task))
     if not sending:
-        sending = list(_elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
+        sending = list(elsewhere(short, RolloutRunner(short, testbed), point, alone=not findings))
     end, sample = reference[-1]
     failure = next((measured for measured in sample[""] if isinstance(measured, str)), "")
-    return Check((*findings, *_kept_contexts(testbed), *sending), float(end), failure)
+    return Check((*findings, *kept_contexts(testbed), *sending), float(end), failure)
 
 
-def _trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Iterator[tuple[float, Sample]]:
-    """Yield the numbers of all systems at each sample time, and at last what ended the rollout."""
-    systems = list(stateful_leaves(runner.testbed.diagram))
+class Numbers:
+    """Reads the numbers of all systems of a testbed: numeric groups, and abstract states through their codecs."""
+
+    def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
+        self._systems = [
+            (leaf, abstract_state(leaf.path, leaf.system, leaf.system.GetMyContextFromRoot(context)))
+            for leaf in stateful_leaves(testbed.diagram)
+        ]
+
+    def read(self, context: Context) -> dict[str, tuple[Any, ...]]:
+        """Return the numbers by path."""
+        numbers = {}
+        for (path, system, groups), abstract in self._systems:
+            leaf_context = system.GetMyContextFromRoot(context)
+            arrays = [read_group(leaf_context, kind, index) for kind, index, _ in groups]
+            # A codec may list its arrays in another order after a restore.
+            parts = sorted(abstract.read(leaf_context).items())
+            numbers[path] = (*arrays, *(entry for part in parts for entry in part))
+        return numbers
+
+
+def trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Generator[tuple[float, Sample]]:
+    """Yield the numbers of all systems at each sample time, and at last what ended the rollout, if it failed.
+
+    Args:
+        runner: The runner, which runs nothing else meanwhile.
+        point: Address -> value, set in s0.
+    """
     t = 0.0
     try:
+        numbers = None
         for t in runner.simulate(point):
-            sample: dict[str, tuple[Any, ...]] = {"": tuple(runner.measured(t))}
-            for path, system, groups in systems:
-                context = system.GetMyContextFromRoot(runner.context)
-                sample[path] = tuple(read_group(context, kind, index) for kind, index, _ in groups)
-            yield t, sample
+            numbers = numbers or Numbers(runner.testbed, runner.context)
+            yield t, {"": tuple(runner.measured(t)), **numbers.read(runner.context)}
     except SimulationError as failure:
         yield t, {"": (str(failure),)}
 
 
-def _within(budget: float, trace: Iterator[tuple[float, Sample]]) -> Iterator[tuple[float, Sample]]:
-    """Yield at least three samples, and as many as take ``budget`` seconds."""
+def within(budget: float, samples: Iterator[tuple[float, Sample]]) -> Iterator[tuple[float, Sample]]:
+    """Yield at least three samples, and as many as take ``budget`` seconds of processor time."""
     end = time.thread_time() + budget
-    for count, sample in enumerate(trace):
+    for count, sample in enumerate(samples):
         yield sample
         if count >= 2 and time.thread_time() > end:
             return
 
 
-def _first(trace: Iterator[tuple[float, Sample]], *, count: int) -> list[tuple[float, Sample]]:
-    return [sample for _, sample in zip(range(count), trace, strict=False)]
+def first(samples: Iterator[tuple[float, Sample]], *, count: int) -> Trace:
+    """Return the first samples, at most ``count``."""
+    return [sample for _, sample in zip(range(count), samples, strict=False)]
 
 
-def _side_by_side(
-    runner: RolloutRunner, point: Mapping[str, Any], neighbour: RolloutRunner, other: Mapping[str, Any], count: int
-) -> list[tuple[float, Sample]]:
-    """Return ``count`` samples of one rollout, while another one takes its steps in turn."""
-    pairs = zip_longest(_trace(neighbour, other), _trace(runner, point))
-    return [mine for _, (_, mine) in zip(range(count), pairs, strict=False) if mine is not None]
+def side_by_side(
+    samples: Iterator[tuple[float, Sample]], neighbour: Iterator[object]
+) -> Iterator[tuple[float, Sample]]:
+    """Yield the samples of one rollout, while another one takes its steps in turn."""
+    pairs = zip_longest(neighbour, samples)
+    return (sample for _, sample in pairs if sample is not None)
 
 
-def _compare(
-    task: RolloutTask,
-    reference: Sequence[tuple[float, Sample]],
-    repeated: Sequence[tuple[float, Sample]],
-    changed: Sequence[str],
-    rerun: str,
-) -> Iterator[str]:
-    """Yield at most one finding: where the two rollouts differ first."""
+def first_difference(reference: Trace, repeated: Trace) -> tuple[float, list[str]] | None:
+    """Return where two rollouts differ first: the sample time, and the paths of what differs; None if they do not."""
     for (t, expected), (_, actual) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
         parted = [path for path in {**expected, **actual} if not _same(expected.get(path), actual.get(path))]
-        if not parted:
-            continue
-        name = task.quality.name if task.quality is not None else "the quality"
-        if parted == [""] and not changed:
-            yield (
-                f"{rerun} differs at t = {t:g} s in its quality {name} (or another measure), not in its state: it must "
-                "depend on its arguments alone, so keep no memory in it, and draw no random numbers"
-            )
-        else:
-            where = ", ".join(changed) or f"a system that drives {', '.join(path for path in parted if path)}"
-            yield (
-                f"{rerun} differs from t = {t:g} s on: {where} has memory outside the Context. Declare it as state "
-                "(DeclareDiscreteState, DeclareAbstractState) and read it from the context, so that rollouts repeat"
-            )
+        if parted:
+            return t, parted
+    return None
+
+
+def _compare(task: RolloutTask, reference: Trace, repeated: Trace, changed: Sequence[str], rerun: str) -> Iterator[str]:
+    """Yield at most one finding: where the two rollouts differ first."""
+    difference = first_difference(reference, repeated)
+    if difference is None:
         return
+    t, parted = difference
+    name = task.quality.name if task.quality is not None else "the quality"
+    if parted == [""] and not changed:
+        yield (
+            f"{rerun} differs at t = {t:g} s in its quality {name} (or another measure), not in its state: it must "
+            "depend on its arguments alone, so keep no memory in it, and draw no random numbers"
+        )
+    else:
+        where = ", ".join(changed) or f"a system that drives {', '.join(path for path in parted if path)}"
+        yield (
+            f"{rerun} differs from t = {t:g} s on: {where} has memory outside the Context. Declare it as state "
+            "(DeclareDiscreteState, DeclareAbstractState) and read it from the context, so that rollouts repeat"
+        )
 
 
 def _same(a: tuple[Any, ...] | None, b: tuple[Any, ...] | None) -> bool:
-    if a is None or b is None or len(a) != len(b):
-        return False
-    return all(
-        x == y if isinstance(x, str) or isinstance(y, str) else np.array_equal(x, y, equal_nan=True)
-        for x, y in zip(a, b, strict=True)
-    )
+    return a is not None and b is not None and len(a) == len(b) and all(map(_equal, a, b))
 
 
-def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
+def _equal(x: Any, y: Any) -> bool:
+    if isinstance(x, str) or isinstance(y, str):
+        return bool(x == y)
+    return np.array_equal(x, y, equal_nan=np.asarray(x).dtype.kind in "fc")
+
+
+def python_attributes(testbed: VirtualTestbed) -> dict[str, Any]:
     """Return the attributes of the systems in Python, by name: as bytes, or their identity where they do not pickle."""
     return {
         f"self.{name} of {path} ({type(system).__name__})": _fingerprint(value)
@@ -178,7 +210,7 @@ def _attributes(testbed: VirtualTestbed) -> dict[str, Any]:
     }
 
 
-def _kept_contexts(testbed: VirtualTestbed) -> Iterator[str]:
+def kept_contexts(testbed: VirtualTestbed) -> Iterator[str]:
     """Yield a finding per Context that a system in Python keeps, of a plant with which it computes for example."""
     for path, system in leaves(testbed.diagram):
         for name, value in vars(system).items() if path in testbed.python_systems else ():
@@ -221,8 +253,10 @@ def _unsendable(task: RolloutTask) -> Iterator[str]:
             return
 
 
-def _elsewhere(task: RolloutTask, runner: RolloutRunner, point: Mapping[str, Any], *, alone: bool) -> Iterator[str]:
-    """Compare with a rollout in another process; ``alone`` says whether rollouts agree in this one."""
+def elsewhere(
+    task: RolloutTask, runner: RolloutRunner, point: Mapping[str, Any], *, alone: bool = True
+) -> Iterator[str]:
+    """Yield a finding if a rollout in another process differs; ``alone`` says whether rollouts agree in this one."""
     here = _run(lambda: runner.run(point))
     with ProcessExecutor(1) as executor:
         there = _run(lambda: next(iter(executor.run(task, [point])))[1])

@@ -17,6 +17,8 @@ from vtbdrake.testing.check import CheckSkippedError as CheckSkippedError
 from vtbdrake.testing.check import Report as Report
 from vtbdrake.testing.check import ScenarioCheckError as ScenarioCheckError
 from vtbdrake.testing.check import check_scenario as check_scenario
+from vtbdrake.testing.lock_step import LockStep as LockStep
+from vtbdrake.testing.lock_step import MachineBridge as MachineBridge
 from vtbdrake.testing.plugin import parametrize_with_checks as parametrize_with_checks
 from vtbdrake.testing.subject import Subject as Subject
 from vtbdrake.testing.trace import Trace as Trace

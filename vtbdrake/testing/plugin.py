@@ -18,6 +18,7 @@ def parametrize_with_checks(
     scenarios: Iterable[Scenario],
     *,
     expected_failed_checks: Mapping[str, str] | Callable[[Scenario], Mapping[str, str]] | None = None,
+    values: Mapping[str, Any] | Callable[[Scenario], Mapping[str, Any]] | None = None,
     horizon: float | None = None,
 ) -> pytest.MarkDecorator:
     """Return a decorator that runs a test once for every scenario and every check, each in a test of its own.
@@ -35,6 +36,7 @@ def parametrize_with_checks(
         scenarios: The scenarios.
         expected_failed_checks: Name of a check -> the reason why it fails; or a function that returns these for a
             scenario.
+        values: Address -> value, set before every simulation; or a function that returns these for a scenario.
         horizon: Seconds that are simulated; see `check_scenario`.
 
     Raises:
@@ -46,18 +48,16 @@ def parametrize_with_checks(
 
     cases = []
     for number, scenario in enumerate(scenarios):
-        if callable(expected_failed_checks):
-            expected = checked_expectations(expected_failed_checks(scenario))
-        else:
-            expected = checked_expectations(expected_failed_checks)
-        subject = Subject(scenario, horizon=horizon)
+        expected = checked_expectations(_of(scenario, expected_failed_checks))
+        subject = Subject(scenario, values=_of(scenario, values), horizon=horizon)
         for check in CHECKS:
 
             def run(scenario: Scenario, check: Any = check, subject: Subject = subject) -> None:
-                try:
-                    check(subject)
-                except CheckSkippedError as error:
+                error = subject.outcome(check)
+                if isinstance(error, CheckSkippedError):
                     pytest.skip(str(error))
+                if error is not None:
+                    raise error
 
             name = check.__name__
             marks = []
@@ -65,3 +65,9 @@ def parametrize_with_checks(
                 marks.append(pytest.mark.xfail(reason=expected[name], raises=CheckFailedError, strict=True))
             cases.append(pytest.param(scenario, run, id=f"{type(scenario).__name__}{number}-{name}", marks=marks))
     return pytest.mark.parametrize(("scenario", "check"), cases)
+
+
+def _of(
+    scenario: Scenario, items: Mapping[str, Any] | Callable[[Scenario], Mapping[str, Any]] | None
+) -> Mapping[str, Any] | None:
+    return items(scenario) if callable(items) else items

@@ -1,0 +1,250 @@
+"""Checks that simulations repeat: again, side by side, elsewhere, from a copy and from a file."""
+
+from __future__ import annotations
+
+import gc
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, System
+
+from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.pickling import dumps
+from vtbdrake.rollout.repeatability import (
+    Numbers,
+    Trace,
+    elsewhere,
+    first,
+    first_difference,
+    kept_contexts,
+    python_attributes,
+    trace,
+)
+from vtbdrake.rollout.runner import RolloutRunner
+from vtbdrake.state import Snapshot
+from vtbdrake.state.systems import class_name
+from vtbdrake.state.variables import X
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testing.check import CheckFailedError, CheckSkippedError
+from vtbdrake.testing.subject import Subject
+
+
+def check_simulates(subject: Subject) -> None:
+    """Check that the first part of a simulation does not fail.
+
+    The error is that of the system that raised, or says that the state has become infinite or NaN: look at the
+    integrator, at its step, and at units.
+    """
+    subject.testbed  # noqa: B018
+    if subject.failure:
+        raise CheckFailedError(f"the simulation fails after {subject.reference[-1][0]:g} s: {subject.failure}")
+
+
+def check_state_is_in_the_context(subject: Subject) -> None:
+    """Check that no system remembers anything outside of its Context.
+
+    Rollouts share the systems and have a Context each: what a system keeps in ``self`` or in a Context of its own
+    passes from one rollout to another, and no snapshot has it. Declare it as state, as a parameter or as a cache entry.
+    """
+    subject.instants  # noqa: B018
+    before = python_attributes(subject.testbed)
+    _consume(trace(subject.runner(1), subject.values), len(subject.reference))
+    changed = [name for name, value in python_attributes(subject.testbed).items() if before.get(name) != value]
+    problems = [f"{name} changes while it is simulated" for name in changed] + list(kept_contexts(subject.testbed))
+    if problems:
+        raise CheckFailedError(
+            "; ".join(problems) + ": declare what is to be remembered as state (DeclareDiscreteState, "
+            "DeclareAbstractState), and read it from the context"
+        )
+
+
+def check_runs_repeat(subject: Subject) -> None:
+    """Check that a second simulation from the same state is identical to the last bit.
+
+    Optimization compares rollouts, and a log is proved by repeating it. What differs comes from a random generator
+    without a seed, from the clock, from a file, or from memory outside of the Context.
+    """
+    subject.instants  # noqa: B018
+    _compare(subject.reference, first(trace(subject.runner(2), subject.values), count=len(subject.reference)), "again")
+
+
+def check_threads_agree(subject: Subject) -> None:
+    """Check that a simulation in another thread, while a second one runs on the same Diagram, is identical.
+
+    So a study uses all cores with one build. What differs is shared by the two: memory outside of the Context, or an
+    object that belongs to the thread that made it.
+    """
+    subject.presuppose(check_runs_repeat)
+    _compare(subject.reference, list(subject.beside()), "beside another one and in another thread")
+
+
+def check_processes_agree(subject: Subject) -> None:
+    """Check that a simulation in another process, on a new build, is identical.
+
+    So a study uses all cores, and a cluster. What differs depends on the process: a global variable, the order of a
+    set, the time, a file, an environment variable.
+    """
+    subject.presuppose(check_runs_repeat)
+    try:
+        dumps(subject.scenario)
+    except FAILURES as error:
+        raise CheckSkippedError(f"the scenario cannot be sent to another process: {error_text(error)}") from error
+    states = [a for a, v in subject.testbed.variables().items() if v.kind == X and not v.derived]
+    outputs = [f"dps.{signal.name}" for signal in subject.testbed.interface.act]
+    horizon = max(float(subject.reference[-1][0]), subject.task.sample_period)
+    task = replace(subject.task, horizon=horizon, record=[*states, *outputs], start=subject.start)
+    for finding in elsewhere(task, RolloutRunner(task, subject.testbed), {}):
+        raise CheckFailedError(finding)
+
+
+def check_reset_equals_a_new_build(subject: Subject) -> None:
+    """Check that a used Context that is reset to defaults, and a new one, equal the first one of the build.
+
+    Rollouts reset a Context instead of building anew. Who changes the defaults of a system while it is simulated
+    (SetDefaultPositions, configure_default_state) changes where all later rollouts begin.
+    """
+    start, testbed = subject.start, subject.testbed
+    context = subject.started(testbed)
+    _run(testbed.simulator(context), subject)
+    testbed.diagram.SetDefaultContext(context)
+    context.SetTime(0.0)
+    testbed.write(context, subject.values)
+    for name, again in (("a used Context that is reset", context), ("a new Context", subject.started(testbed))):
+        differences = start.compare(testbed.snapshot(again))
+        if differences:
+            raise CheckFailedError(
+                f"after a simulation, {name} differs from the first one in {', '.join(sorted(differences))}: a system "
+                "changes its defaults while it is simulated; let it change its context only"
+            )
+
+
+def check_fork_is_the_future(subject: Subject) -> None:
+    """Check that a copy of a running simulation continues exactly as the original does.
+
+    A robot reasons in copies of its own state. A value of abstract state that two contexts share must never change:
+    make it a frozen dataclass with read-only arrays, and replace it as a whole.
+    """
+    testbed = subject.testbed
+    original = subject.started(testbed)
+    simulator = testbed.simulator(original)
+    instants = subject.instants
+    middle = len(instants) // 2
+    for instant in instants[1 : middle + 1]:
+        simulator.AdvanceTo(instant)
+    copied = testbed.default_context()
+    testbed.copier_from(testbed).copy(original, copied)
+    testbed.fork(simulator)  # An integrator with error control begins anew in both.
+    future = _futures(testbed, simulator, subject)
+    forecast = _futures(testbed, testbed.simulator(copied, restored=True), subject)
+    _compare(future, forecast, f"from a copy at {instants[middle]:g} s")
+
+
+def check_snapshot_resumes(subject: Subject) -> None:
+    """Check that a simulation continues exactly from a saved snapshot, on a new build.
+
+    Studies are resumed, and machines started, from files. A codec must keep every bit of an abstract state: do not
+    round, and do not leave out what can be computed again.
+    """
+    testbed = subject.testbed
+    context = subject.started(testbed)
+    simulator = testbed.simulator(context)
+    instants = subject.instants
+    middle = len(instants) // 2
+    for instant in instants[1 : middle + 1]:
+        simulator.AdvanceTo(instant)
+    saved = testbed.fork(simulator).to_bytes()
+    future = _futures(testbed, simulator, subject)
+    other = subject.scenario.build()
+    resumed = other.default_context()
+    other.restore(resumed, Snapshot.load(saved))
+    forecast = _futures(other, other.simulator(resumed, restored=True), subject)
+    _compare(future, forecast, f"from a snapshot at {instants[middle]:g} s")
+
+
+def check_dropped_testbed_is_freed(subject: Subject) -> None:
+    """Check that a testbed that nobody uses any more is freed.
+
+    A study that varies a field builds hundreds. A system in Python that is not a `vtbdrake.state.AddressedSystem` and
+    keeps its own methods, or itself in a list, is never freed.
+    """
+    subject.instants  # noqa: B018
+    before = _systems()
+    testbed = subject.scenario.build()
+    context = subject.started(testbed)
+    testbed.simulator(context).AdvanceTo(min(subject.period, float(subject.instants[-1])))
+    del testbed, context
+    alive = Counter(class_name(system) for number, system in _systems().items() if number not in before)
+    if alive:
+        names = ", ".join(f"{count} {name}" for name, count in sorted(alive.items()))
+        raise CheckFailedError(
+            f"of a testbed that is not used any more, these systems are still there: {names}. Make systems in Python "
+            "subclasses of vtbdrake.state.AddressedSystem, and keep them in no list"
+        )
+
+
+def check_runs_keep_no_memory(subject: Subject) -> None:
+    """Check that the number of Python's objects does not grow from one simulation to the next.
+
+    A study simulates a hundred thousand times. What grows is a list or a dictionary outside of the Context: a log, a
+    cache without a limit.
+    """
+    runner, count = subject.runner(1), len(subject.reference)
+    subject.instants  # noqa: B018
+    counts = []
+    for _ in range(4):
+        _consume(trace(runner, subject.values), count)
+        gc.collect()
+        counts.append(len(gc.get_objects()))
+    # The first runs fill caches.
+    grown = [after - before for before, after in pairwise(counts[1:])]
+    if min(grown) > 0:
+        raise CheckFailedError(
+            f"every simulation of {count} samples leaves {min(grown)} objects of Python behind: something outside of "
+            "the Context keeps them"
+        )
+
+
+def _compare(reference: Trace, repeated: Trace, where: str) -> None:
+    difference = first_difference(reference, repeated)
+    if difference is None:
+        return
+    t, parted = difference
+    end = next((text for samples in (reference, repeated) for text in samples[-1][1].get("", ()) if _is_text(text)), "")
+    what = f"ends otherwise ({end})" if end else f"differs in {', '.join(path for path in parted if path)}"
+    raise CheckFailedError(f"simulated {where}, it {what}, from t = {t:g} s on")
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _consume(samples: Iterator[object], count: int) -> None:
+    for _, _ in zip(range(count), samples, strict=False):
+        pass
+
+
+def _run(simulator: Simulator, subject: Subject) -> None:
+    for instant in subject.instants[1:]:
+        simulator.AdvanceTo(instant)
+
+
+def _futures(testbed: VirtualTestbed, simulator: Simulator, subject: Subject) -> Trace:
+    """Return the numbers of all systems at the remaining instants, of a simulation that has come to the middle."""
+    context: Context = simulator.get_mutable_context()
+    numbers, instants = Numbers(testbed, context), subject.instants
+    samples: list[tuple[float, Any]] = []
+    for instant in instants[len(instants) // 2 + 1 :]:
+        simulator.AdvanceTo(instant)
+        samples.append((float(instant), numbers.read(context)))
+    return samples
+
+
+def _systems() -> dict[int, System]:
+    """Return all systems that Python knows and that are alive, by identity."""
+    for _ in range(3):  # What a system of the Diagram owns is freed after it.
+        gc.collect()
+    return {id(thing): thing for thing in gc.get_objects() if isinstance(thing, System)}
