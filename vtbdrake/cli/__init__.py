@@ -27,6 +27,7 @@ _COMMANDS = {
     "get": "live:get",
     "hub": "hub:hub",
     "machine": "machine:machine",
+    "new": "new:new",
     "replay": "log:replay",
     "reset": "live:reset",
     "rollout": "testbed:rollout",

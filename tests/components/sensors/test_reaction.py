@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia, WeldJoint
+from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia, UnitInertia, WeldJoint
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 
@@ -107,7 +107,22 @@ def test_joint_torque_is_the_drives_less_its_rotors() -> None:
     assert y == pytest.approx([4.0 - ROTOR * GEAR**2 * acceleration], rel=1e-3)
 
 
-def test_joint_torque_sensors_measure_revolute_joints_only() -> None:
+def test_force_along_a_vertical_slide_carries_its_load() -> None:
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=PERIOD, use_sampled_output_ports=False), builder)
+    plant.set_name("plant")
+    load = plant.AddRigidBody("load", compact(TOOL_MASS, TOOL_COM))
+    joint = plant.AddJoint(PrismaticJoint("joint", plant.world_frame(), load.body_frame(), [0, 0, 1]))
+    plant.AddJointActuator("drive", joint)
+    plant.Finalize()
+    sensor = JointTorqueSensors(plant, [joint], period=PERIOD)
+    y, context = simulate(sensor, builder, plant, q=0.1, v=0.0, u=None)
+    gravity = np.linalg.norm(plant.gravity_field().gravity_vector())
+    assert y == pytest.approx([TOOL_MASS * gravity])
+    assert [element.unit for element in sensor.variables if element.name == "noise"] == ["N"]
+
+
+def test_joint_torque_sensors_measure_revolute_and_prismatic_joints_only() -> None:
     _, plant = pendulum(sampled_ports=True)
     with pytest.raises(ValueError, match="'flange' is weld"):
         JointTorqueSensors(plant, [plant.GetJointByName("flange")], period=PERIOD)

@@ -16,7 +16,7 @@ from vtbdrake.components.sensors.sampled import SampledSensor
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
-    from pydrake.multibody.tree import Joint, RevoluteJoint
+    from pydrake.multibody.tree import Joint
 
 
 class ForceTorqueSensor(SampledSensor):
@@ -69,7 +69,7 @@ class ForceTorqueSensor(SampledSensor):
 
 
 class JointTorqueSensors(SampledSensor):
-    """Measures the torques about the axes of revolute joints, on their output side.
+    """Measures the torques about the axes of revolute joints, or the forces along prismatic ones, on their output side.
 
     .. pydrake_system::
 
@@ -79,37 +79,37 @@ class JointTorqueSensors(SampledSensor):
         output_ports:
         - joint_torque
 
-    ``joint_torque`` (N m) holds for each of ``joints`` what its drive exerts on the child about the joint's axis: the
-    drive's torque, less what accelerates its rotor. Before the first sample it shows ``initial``, a scalar or one
-    torque per joint. About restored contexts, see `ForceTorqueSensor`.
+    ``joint_torque`` (N m, or N) holds for each of ``joints`` what its drive exerts on the child about or along the
+    joint's axis: the drive's torque, less what accelerates its rotor. Before the first sample it shows ``initial``, a
+    scalar or one torque per joint. About restored contexts, see `ForceTorqueSensor`.
     """
 
     def __init__(
         self,
         plant: MultibodyPlant,
-        joints: Sequence[RevoluteJoint],
+        joints: Sequence[Joint],
         *,
         period: float,
         initial: ArrayLike = 0.0,
         stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
-        from pydrake.multibody.tree import RevoluteJoint
-
         for joint in joints:
-            if not isinstance(joint, RevoluteJoint):
+            if joint.type_name() not in ("revolute", "prismatic"):
                 raise ValueError(
-                    f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute joints."
+                    f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute and "
+                    "prismatic joints."
                 )
         self._places = places(plant, joints)
         # In Jc and in the frame of the parent, an axis has the same components. A torque is the power at unit rate.
-        self._turns = [SpatialVelocity(w=joint.revolute_axis(), v=np.zeros(3)) for joint in joints]
+        self._motions = [_unit_velocity(joint) for joint in joints]
+        unit = ", ".join(dict.fromkeys("N" if joint.type_name() == "prismatic" else "N m" for joint in joints))
         super().__init__(
             "joint_torque",
             default=np.broadcast_to(np.asarray(initial, dtype=float), (len(joints),)),
             period=period,
-            unit="N m",
-            noise={"noise": (len(joints), "N m")},
+            unit=unit,
+            noise={"noise": (len(joints), unit)},
             stream=stream,
             errors=errors,
         )
@@ -117,7 +117,14 @@ class JointTorqueSensors(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         F_CJc_Jc = self._port.Eval(context)
-        return np.array([F_CJc_Jc[k].dot(turn) for k, turn in zip(self._places, self._turns, strict=True)])
+        return np.array([F_CJc_Jc[k].dot(motion) for k, motion in zip(self._places, self._motions, strict=True)])
+
+
+def _unit_velocity(joint: Joint) -> SpatialVelocity:
+    """Return the velocity of the child at the rate 1 of a revolute or prismatic joint, in Jc."""
+    if joint.type_name() == "prismatic":
+        return SpatialVelocity(w=np.zeros(3), v=joint.translation_axis())
+    return SpatialVelocity(w=joint.revolute_axis(), v=np.zeros(3))
 
 
 def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:

@@ -1,0 +1,180 @@
+"""What a model file says about its robot, against the file's own numbers; and what a file without one gets."""
+
+from pathlib import Path
+
+import numpy as np
+import pydrake
+import pytest
+
+from vtbdrake.project import RobotFileError, read_robot, resolve
+
+pytestmark = pytest.mark.one_python
+
+MODELS = Path(__file__).parent / "models"
+EXAMPLES = Path(pydrake.getDrakePath()) / "examples"
+
+INERTIA = '<inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+LIMIT = '<limit lower="-1" upper="1" effort="5" velocity="1"/>'
+
+
+def urdf(folder: Path, *, link: str = INERTIA, kind: str = "revolute", joint: str = LIMIT, further: str = "") -> Path:
+    """Write a URDF with two links and one joint, in lines 3 to 5."""
+    path = folder / "robot.urdf"
+    path.write_text(
+        f'<?xml version="1.0"?>\n<robot name="robot">\n<link name="base">{INERTIA}</link>\n'
+        f'<link name="arm">{link}</link>\n'
+        f'<joint name="hinge" type="{kind}"><parent link="base"/><child link="arm"/>'
+        f'<axis xyz="0 1 0"/>{joint}</joint>\n'
+        f"{further}</robot>\n"
+    )
+    return path
+
+
+def test_drives_follow_the_order_of_the_actuators() -> None:
+    robot = read_robot(MODELS / "scara.urdf")
+    assert [joint.name for joint in robot.joints] == ["shoulder", "elbow", "lift"]
+    assert robot.driven == ("lift", "elbow", "shoulder")
+    lift = robot.joints[2]
+    assert (lift.lower, lift.upper, lift.speed, lift.effort, lift.assumed) == (0.02, 0.2, 0.8, 60.0, ())
+    assert lift.home == pytest.approx(0.11)  # 0 is outside its range
+
+
+def test_a_joint_without_actuator_moves_freely() -> None:
+    robot = read_robot(EXAMPLES / "acrobot" / "Acrobot.urdf")
+    assert robot.driven == ("elbow",)
+    assert any("shoulder has no actuator" in note and "Acrobot.urdf:66" in note for note in robot.notes)
+
+
+def test_all_joints_are_driven_where_the_file_has_no_actuators() -> None:
+    robot = read_robot(MODELS / "bare.urdf")
+    assert robot.driven == ("pan", "tilt") and robot.adds_drives
+    for joint in robot.joints:
+        assert joint.assumed == ("effort", "range", "speed")
+        assert np.isfinite([joint.lower, joint.upper, joint.speed, joint.effort]).all() and joint.effort > 0.0
+
+
+def test_an_assumed_drive_carries_the_robot_in_every_posture() -> None:
+    """The tilted head weighs at most m g r = 0.9 kg 9.81 m/s^2 |(0.05, 0.02) m| on its tilt."""
+    tilt = read_robot(MODELS / "bare.urdf").joints[1]
+    assert tilt.effort > 0.9 * 9.81 * np.hypot(0.05, 0.02)
+
+
+def test_a_free_base_is_welded_where_the_file_places_it() -> None:
+    welded = read_robot(EXAMPLES / "planar_gripper" / "planar_gripper.sdf").welded
+    assert list(welded) == ["finger1_base", "finger2_base", "finger3_base"]
+    assert all(X_WB.IsExactlyIdentity() for X_WB in welded.values())
+    desk = read_robot(EXAMPLES / "kuka_iiwa_arm" / "models" / "desk" / "transcendesk55inch.sdf").welded
+    np.testing.assert_allclose(desk["table_upper"].translation(), [-0.2437, -0.6251, 0.48], atol=1e-3)
+
+
+def test_a_joint_that_follows_another_has_no_drive_of_its_own() -> None:
+    robot = read_robot(MODELS / "hand.sdf")
+    assert robot.driven == ("left_finger",)
+    assert [(c.joint, c.leader, c.multiplier) for c in robot.couplings] == [("right_finger", "left_finger", 1.0)]
+    assert robot.without_drive == ("right_finger",)
+
+
+def test_motors_of_mujoco_act_by_their_gear() -> None:
+    robot = read_robot(MODELS / "arm.xml")
+    efforts = {joint.name: joint.effort for joint in robot.joints}
+    assert (efforts["shoulder"], efforts["elbow"]) == (50.0 * 1.0, 20.0)  # gear times ctrlrange, forcerange
+    assert robot.servos == ("m3",)  # a <position>
+
+
+def test_bodies_that_touch_at_home_are_listed() -> None:
+    robot = read_robot(EXAMPLES / "planar_gripper" / "planar_gripper.sdf")
+    assert set(robot.touching) == {f"finger{k}_{link}" for k in (1, 2, 3) for link in ("link2", "tip_link")}
+
+
+def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
+    heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')
+    drive = (
+        '<transmission name="t"><type>SimpleTransmission</type><joint name="hinge"/><actuator name="a"/></transmission>'
+    )
+    robot = read_robot(urdf(tmp_path, link=heavy, further=drive))
+    assert any("cannot carry the robot at home: its limit is 5, the weight 9.81" in note for note in robot.notes)
+
+
+def test_files_of_a_package_come_along(tmp_path: Path) -> None:
+    package = tmp_path / "my_robot"
+    (package / "urdf").mkdir(parents=True)
+    (package / "meshes").mkdir()
+    (package / "package.xml").write_text("<package><name>my_robot</name></package>")
+    (package / "meshes" / "arm.obj").write_text(
+        "mtllib arm.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+    )
+    (package / "meshes" / "arm.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    visual = '<visual><geometry><mesh filename="package://my_robot/meshes/arm.obj"/></geometry></visual>'
+    robot = read_robot(urdf(package / "urdf", link=INERTIA + visual))
+    names = ("package.xml", "urdf/robot.urdf", "meshes/arm.obj", "meshes/arm.mtl")
+    assert {path.as_posix() for path in robot.files} == {f"my_robot/{name}" for name in names}
+    assert robot.packages and robot.model == Path("my_robot/urdf/robot.urdf")
+
+
+def test_files_beside_the_model_keep_their_places(tmp_path: Path) -> None:
+    (tmp_path / "urdf").mkdir()
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "arm.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    visual = '<visual><geometry><mesh filename="../meshes/arm.obj"/></geometry></visual>'
+    robot = read_robot(urdf(tmp_path / "urdf", link=INERTIA + visual))
+    assert {path.as_posix() for path in robot.files} == {"urdf/robot.urdf", "meshes/arm.obj"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "line", "message"),
+    [
+        ({"link": ""}, 4, "give the link arm an <inertial>"),
+        ({"kind": "planar", "joint": ""}, 5, "hinge is planar.* replace it by several"),
+        ({"kind": "revolut"}, 5, "unrecognized type"),
+        ({"joint": '<limit lower="0" upper="0" effort="1" velocity="1"/>'}, 5, "range of hinge is empty, 0 to 0"),
+        (
+            {"link": f'{INERTIA}<visual><geometry><mesh filename="no.obj"/></geometry></visual>'},
+            4,
+            "does not exist.* Put the file there, or take",
+        ),
+        (
+            {"link": f'{INERTIA}<visual><geometry><mesh filename="package://pkg/no.obj"/></geometry></visual>'},
+            4,
+            "unknown package 'pkg'.* with its package.xml",
+        ),
+    ],
+)
+def test_bad_files_get_file_line_and_remedy(tmp_path: Path, changes: dict[str, str], line: int, message: str) -> None:
+    with pytest.raises(RobotFileError, match=rf"robot\.urdf:{line}: .*{message}"):
+        read_robot(urdf(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted(p for p in EXAMPLES.rglob("*") if p.suffix in (".urdf", ".sdf") if "object" in str(p) or "quad" in str(p)),
+    ids=lambda path: path.name,
+)
+def test_objects_have_no_joints_to_drive(path: Path) -> None:
+    with pytest.raises(RobotFileError, match=rf"{path.name} has no joints to drive"):
+        read_robot(path)
+
+
+def test_loops_of_joints_are_refused_with_a_remedy(tmp_path: Path) -> None:
+    """The ball constraint of the linkage as a joint."""
+    text = (MODELS / "fourbar.sdf").read_text()
+    begin, end = text.index("<drake:ball_constraint>"), text.index("</drake:ball_constraint>")
+    loop = '<joint name="loop" type="revolute"><parent>coupler</parent><child>rocker</child>'
+    loop += "<axis><xyz>0 1 0</xyz></axis></joint>"
+    path = tmp_path / "loop.sdf"
+    path.write_text(text[:begin] + loop + text[end + len("</drake:ball_constraint>") :])
+    with pytest.raises(RobotFileError, match=r"loop\.sdf: .*open each loop at one joint"):
+        read_robot(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("missing.urdf", "there is no file missing.urdf"),
+        (str(MODELS / "robot.xacro"), "there is no file"),
+        ("package://no_such_package/robot.urdf", "is not on this computer.* downloads package://drake_models"),
+        (__file__, "is not named like a URDF"),
+    ],
+)
+def test_files_that_are_none_are_refused(text: str, message: str) -> None:
+    with pytest.raises(RobotFileError, match=message):
+        resolve(text)

@@ -1,0 +1,21 @@
+"""Projects for a robot: from its model file to a tested testbed and a machine."""
+
+from pathlib import Path
+
+from vtbdrake.project.robot_file import Robot, RobotFileError, read_robot, replace_servo, resolve
+from vtbdrake.project.writer import ProjectError, check_name, write_project
+
+SMALL_ARM = Path(__file__).parent / "arm.urdf"
+"""The model of a small arm with three joints."""
+
+__all__ = [
+    "SMALL_ARM",
+    "ProjectError",
+    "Robot",
+    "RobotFileError",
+    "check_name",
+    "read_robot",
+    "replace_servo",
+    "resolve",
+    "write_project",
+]
