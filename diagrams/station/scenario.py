@@ -19,7 +19,7 @@ HOME = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])
 OPEN = 0.04
 """The distance of the fingers in m at first."""
 PERIOD = 0.005
-_SPEED = 0.2  # rad/s, at which the reference follows its target
+_SPEED, _ACCELERATION = 0.2, 1.0  # rad/s, rad/s^2, of the reference
 _STIFFNESS = np.array([300.0, 300.0, 200.0, 200.0, 50.0, 40.0, 10.0])  # N m/rad
 _DAMPING = np.array([30.0, 30.0, 20.0, 20.0, 3.0, 2.0, 0.3])  # N m s/rad
 
@@ -39,8 +39,9 @@ class JointControl(AddressedSystem):
         - iiwa_position or iiwa_torque
         - wsg_position
 
-    The reference r moves to the target at 0.2 rad/s; ``iiwa_position`` is r, ``iiwa_torque`` is K (r - q) - D v. The
-    distance of the gripper's fingers is ``opening``.
+    The reference r moves to the target with at most 0.2 rad/s and 1 rad/s^2: with the speed from which it comes to rest
+    there. ``iiwa_position`` is r, ``iiwa_torque`` is K (r - q) - D v. The distance of the gripper's fingers is
+    ``opening``.
     """
 
     def __init__(self, *, torque: bool) -> None:
@@ -54,6 +55,7 @@ class JointControl(AddressedSystem):
             damping=Quantity(_DAMPING, "N m s/rad", (0.0, np.inf)),
         )
         self._reference = self.declare_discrete_state(reference=Quantity(HOME, "rad"))
+        self._speed = self.declare_discrete_state(speed=Quantity(np.zeros(size), "rad/s"))
         self._torque = self.declare_discrete_state(torque=Quantity(np.zeros(size), "N m"))
         self._opening = self.declare_discrete_state(opening=Quantity([OPEN], "m"))
         if torque:
@@ -70,7 +72,15 @@ class JointControl(AddressedSystem):
             for name in ("iiwa_position_measured", "iiwa_velocity_estimated", "target", "opening")
         )
         gains, before = self._gains.view(context), self._reference.view(context).reference
-        reference = before + np.clip(target - before, -_SPEED * PERIOD, _SPEED * PERIOD)
+        change = _ACCELERATION * PERIOD
+        way = target - before
+        # The largest speed that shrinks by `change` per period and covers the way.
+        approach = np.sign(way) * change * (np.sqrt(1.0 + 8.0 * np.abs(way) / (change * PERIOD)) - 1.0) / 2.0
+        aim = np.clip(approach, -_SPEED, _SPEED)
+        last = self._speed.view(context).speed
+        speed = np.clip(aim, last - change, last + change)
+        reference = before + speed * PERIOD
+        self._speed.mutable(discrete).speed = speed
         self._reference.mutable(discrete).reference = reference
         self._torque.mutable(discrete).torque = gains.stiffness * (reference - q) - gains.damping * v
         self._opening.mutable(discrete).opening = opening

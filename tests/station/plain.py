@@ -12,7 +12,7 @@ from drake import lcmt_schunk_wsg_command
 from pydrake.common.value import Value
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import SceneGraphConfig
-from pydrake.lcm import DrakeLcmParams
+from pydrake.lcm import DrakeLcm, DrakeLcmParams
 from pydrake.manipulation import (
     ApplyDriverConfigs,
     ApplyNamedPositionsAsDefaults,
@@ -24,7 +24,7 @@ from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, P
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, System, TriggerType
-from pydrake.systems.lcm import ApplyLcmBusConfig, LcmPublisherSystem
+from pydrake.systems.lcm import ApplyLcmBusConfig, LcmBuses, LcmInterfaceSystem, LcmPublisherSystem
 from pydrake.systems.primitives import ConstantValueSource
 from pydrake.systems.sensors import ApplyCameraConfig, CameraConfig
 
@@ -78,6 +78,7 @@ def build(
     key: str,
     *,
     urls: Mapping[str, str],
+    bus: DrakeLcm | None = None,
     grip: lcmt_schunk_wsg_command | None = None,
     sources: Mapping[str, System] | None = None,
     cameras: bool = False,
@@ -90,6 +91,7 @@ def build(
         file: The file.
         key: The station in it.
         urls: The URL of the LCM bus of each driver, by model.
+        bus: The bus of all drivers instead.
         grip: A command that waits on the gripper's bus.
         sources: What feeds the ports of the arm's driver, which has no bus.
         cameras: Whether there are cameras, on the bus of the gripper.
@@ -110,8 +112,13 @@ def build(
     for name, url in urls.items():
         scenario.model_drivers[name].lcm_bus = f"bus_{name}"
         scenario.lcm_buses[f"bus_{name}"] = DrakeLcmParams(lcm_url=url)
-    scenario.lcm_buses.pop("default")
-    buses = ApplyLcmBusConfig(lcm_buses=scenario.lcm_buses, builder=builder)
+    if bus is None:
+        scenario.lcm_buses.pop("default")
+        buses = ApplyLcmBusConfig(lcm_buses=scenario.lcm_buses, builder=builder)
+    else:
+        builder.AddSystem(LcmInterfaceSystem(bus))
+        buses = LcmBuses()
+        buses.Add("default", bus)
     ApplyDriverConfigs(
         driver_configs=scenario.model_drivers,
         sim_plant=plant,
@@ -121,7 +128,7 @@ def build(
     )
     if cameras:
         for camera in scenario.cameras.values():
-            camera.lcm_bus = "bus_wsg"
+            camera.lcm_bus = "default" if bus else "bus_wsg"
             ApplyCameraConfig(config=camera, builder=builder, lcm_buses=buses)
     for name, source in (sources or {}).items():
         builder.AddSystem(source)

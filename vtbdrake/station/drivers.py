@@ -374,7 +374,7 @@ class CameraImages:
     """
 
     _KINDS = (
-        ("rgb", "color_image", "color_image", "color", ImageRgba8U),
+        ("rgb", "color_image", "color_image", "rgb", ImageRgba8U),
         ("depth", "depth_image", "depth_image_16u", "depth", ImageDepth16U),
         ("label", "label_image", "label_image", "label", ImageLabel16I),
     )

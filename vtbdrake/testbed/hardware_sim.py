@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from pydrake.geometry import (
@@ -31,6 +32,7 @@ from pydrake.multibody.parsing import (
     ModelDirective,
     ModelDirectives,
     ModelInstanceInfo,
+    PackageMap,
     Parser,
     ProcessModelDirectives,
 )
@@ -74,6 +76,8 @@ class HardwareSimScenario(Scenario):
         directives: The models, as for `ProcessModelDirectives`.
         cameras: Cameras by any name; ``CameraConfig.name`` is the name in the Diagram.
         initial_position: Positions of joints, by joint, by model instance; they override those of the directives.
+        packages: Folders of packages, by name, for ``package://``. The package of the scenario's file is there: that of
+            the next ``package.xml`` in its folder or above.
     """
 
     plant_config: MultibodyPlantConfig = field(default_factory=MultibodyPlantConfig)
@@ -86,12 +90,23 @@ class HardwareSimScenario(Scenario):
     lcm_buses: dict[str, DrakeLcmParams] = field(default_factory=dict)
     model_drivers: dict[str, Driver] = field(default_factory=dict)
     visualization: VisualizationConfig = field(default_factory=VisualizationConfig)
+    packages: dict[str, str] = field(default_factory=dict)
+
+    _PLACES: ClassVar[tuple[str, ...]] = ("packages",)
+
+    def set_origin(self, path: str, lines: Mapping[str, int]) -> None:
+        super().set_origin(path, lines)
+        for folder in Path(path).parents:
+            if (folder / "package.xml").exists():
+                package = PackageMap.MakeEmpty()
+                package.AddPackageXml(str(folder / "package.xml"))
+                self.packages = {**dict.fromkeys(package.GetPackageNames(), str(folder)), **self.packages}
+                break
 
     def add_models(self, builder: VirtualTestbedBuilder) -> list[ModelInstanceInfo]:
         """Add the plant with the models of the directives at their initial positions, and finalize it.
 
-        ``package://`` finds what Drake finds, the packages of ``ROS_PACKAGE_PATH``, and the package of the scenario's
-        file: the next ``package.xml`` in its folder or above.
+        ``package://`` finds what Drake finds, the packages of ``ROS_PACKAGE_PATH``, and ``packages``.
 
         Returns:
             The models that the directives have added.
@@ -107,11 +122,8 @@ class HardwareSimScenario(Scenario):
         parser = Parser(plant)
         packages = parser.package_map()
         packages.PopulateFromRosPackagePath()
-        folder = self.folder()
-        for parent in [folder, *folder.parents] if folder else []:
-            if (parent / "package.xml").exists():
-                packages.AddPackageXml(str(parent / "package.xml"))
-                break
+        for name, folder in self.packages.items():
+            packages.Add(name, folder)
         try:
             models = ProcessModelDirectives(ModelDirectives(directives=self.directives), parser)
             plant.Finalize()

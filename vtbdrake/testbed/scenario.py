@@ -12,8 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, is_dataclass
 from importlib.metadata import version
 from inspect import get_annotations
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
@@ -64,6 +63,9 @@ class Scenario(ABC):
 
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
 
+    # Names of fields that tell where something lies, not what it is: no part of the identity.
+    _PLACES: ClassVar[tuple[str, ...]] = ()
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         # Else, the dataclass decorator would replace them: Drake's configs have no equality.
@@ -100,10 +102,6 @@ class Scenario(ABC):
     def set_origin(self, path: str, lines: Mapping[str, int]) -> None:
         """Remember the file that the fields come from, and the line of each dotted name, for `where`."""
         self.__dict__["_origin"] = (path, lines)
-
-    def folder(self) -> Path | None:
-        """Return the folder of the file that the fields come from; None without a file."""
-        return Path(self.__dict__["_origin"][0]).parent if "_origin" in self.__dict__ else None
 
     def where(self, name: str = "") -> str:
         """Return where a field is set, for messages: file and line if it comes from a file, else class and field."""
@@ -252,7 +250,7 @@ class Scenario(ABC):
 
     def record(self) -> dict[str, Any]:
         """Return the identity of the scenario as plain data: its name and all fields, nested ones by dotted names."""
-        values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items()}
+        values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items() if key not in self._PLACES}
         flat = {key: value for key, value in _flat(values) if key not in _NO_IDENTITY}
         return {"scenario": self.name(), **flat}
 
