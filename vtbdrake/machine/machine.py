@@ -135,6 +135,7 @@ class Machine:
         scenario: The scenario of the world. Its deployment has the protocol of the machine (see `Protocol`).
         config: The differences from the simulated world.
         epoch: The time of cycle 0 in its messages, in microseconds.
+        world: The world of the scenario, if it has been built already; the machine simulates a new context of it.
 
     Attributes:
         protocol: Its LCM protocol.
@@ -147,11 +148,18 @@ class Machine:
         ValueError: The config does not fit the scenario.
     """
 
-    def __init__(self, scenario: Scenario, config: MachineConfig | None = None, *, epoch: int = 0) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        config: MachineConfig | None = None,
+        *,
+        epoch: int = 0,
+        world: WorldAlone | None = None,
+    ) -> None:
         self.config = config = config or MachineConfig()
         self.protocol = protocol_of(scenario)
         self.period = period = config.period or scenario.deployment().period
-        self.world = world = WorldAlone(scenario)
+        self.world = world = world or WorldAlone(scenario)
         self.cycle = 0
         self._epoch = epoch
         seeds = np.random.SeedSequence(config.seed).spawn(4)

@@ -161,6 +161,8 @@ class WorldAlone(AddressedDiagram):
     def actuate(self, context: Context, name: str, value: Any) -> None:
         """Set the command of the simulated actuator ``name``, which holds until the next one.
 
+        A `feed` of the same context is invalid afterwards: Drake has deleted what it writes to. Use one of the two.
+
         Args:
             context: A root context of this world.
             name: The actuator signal.
@@ -178,6 +180,9 @@ class WorldAlone(AddressedDiagram):
         self.feed(context)(name, np.array(value, dtype=float) if signal.is_vector else value)
 
     def feed(self, context: Context) -> Feed:
-        """Return a `Feed` of the simulated actuators of one context; it does not check values."""
+        """Return a `Feed` of the simulated actuators of one context; it does not check values.
+
+        There is one feed of a context at a time, and no `actuate` beside it.
+        """
         self.check_context(context)
         return Feed(self._actuators, context)

@@ -20,6 +20,12 @@ from vtbdrake.testing.check import check_scenario as check_scenario
 from vtbdrake.testing.lock_step import LockStep as LockStep
 from vtbdrake.testing.lock_step import MachineBridge as MachineBridge
 from vtbdrake.testing.plugin import parametrize_with_checks as parametrize_with_checks
+from vtbdrake.testing.stateful import loop_state_machine as loop_state_machine
+from vtbdrake.testing.strategies import bad_samples as bad_samples
+from vtbdrake.testing.strategies import commands as commands
+from vtbdrake.testing.strategies import injected_faults as injected_faults
+from vtbdrake.testing.strategies import samples as samples
+from vtbdrake.testing.strategies import sensor_samples as sensor_samples
 from vtbdrake.testing.subject import Subject as Subject
 from vtbdrake.testing.trace import Trace as Trace
 from vtbdrake.testing.trace import simulate as simulate

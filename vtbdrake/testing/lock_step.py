@@ -29,6 +29,11 @@ class MachineBridge(Bridge):
     Args:
         machine: The machine, in its cycle 0.
         clock: The clock of the loop; cycle k of the machine begins k periods after its present time.
+
+    Attributes:
+        machine: The machine.
+        cut: Whether the connection is cut: nothing arrives, and no command leaves.
+        dead: Whether the machine is dead, until `restart`: nothing moves and nothing arrives.
     """
 
     real_time = False
@@ -37,6 +42,7 @@ class MachineBridge(Bridge):
         protocol, interface = machine.protocol, machine.world.interface
         self.interface = interface
         self.machine = machine
+        self.cut = self.dead = False
         self.channels = {name: map.channel for map in protocol.sense for name in map.signals}
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
         carriers = reported_signals(interface, protocol.reported)
@@ -61,6 +67,11 @@ class MachineBridge(Bridge):
         ]
         self._utime = 0
 
+    def restart(self, machine: Machine) -> None:
+        """Continue with another machine of the same scenario, in its cycle 0."""
+        self.machine, self.dead = machine, False
+        self._start, self._sent_cycle = self._clock.now(), -1
+
     def open(self) -> None:
         pass
 
@@ -69,30 +80,34 @@ class MachineBridge(Bridge):
 
     @property
     def connected(self) -> bool:
-        return True
+        return not self.cut
 
     def poll(self, timeout: float = 0.0) -> int:
         if timeout:
             self._clock.wait_until(self._clock.now() + min(timeout, self.machine.period))
         cycle = floor((self._clock.now() - self._start) / self.machine.period + _ON_GRID)
         count = 0
-        while self._sent_cycle < cycle:
+        while not self.dead and self._sent_cycle < cycle:
             if self._sent_cycle >= 0:
                 self.machine.advance()
             self._sent_cycle += 1
             for channel, data in self.machine.messages():
-                self._readers[channel].receive(channel, data)
-                count += 1
+                if not self.cut:
+                    self._readers[channel].receive(channel, data)
+                    count += 1
         return count
 
     def publish(self, actuation: Mapping[str, Any]) -> Collection[str]:
+        if self.cut:
+            return tuple(actuation)
         self._utime = max(self._utime + 1, round(1e6 * self._clock.now()))
         left: set[str] = set()
         for writer in self._writers:
             message = writer.message(actuation, self._utime)
             if message is not None:
                 names, data = message
-                self.machine.receive(writer.channel, data)
+                if not self.dead:
+                    self.machine.receive(writer.channel, data)
                 left.update(names)
         return tuple(name for name in actuation if name not in left)
 

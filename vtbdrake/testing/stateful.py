@@ -1,0 +1,172 @@
+"""A rule-based state machine of Hypothesis that does to a control loop what happens to one, in lock-step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
+from vtbdrake.deployment import Deployment
+from vtbdrake.lazy import extra_module
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import InjectedFault, Machine
+from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+from vtbdrake.testbed.parts import WorldAlone
+from vtbdrake.testbed.testbed import MODES
+from vtbdrake.testing.loop_rules import LoopRules, WatchedBridge
+from vtbdrake.testing.strategies import commands, injected_faults
+
+if TYPE_CHECKING:
+    from hypothesis import stateful
+    from hypothesis import strategies as st
+else:
+    stateful = extra_module("hypothesis.stateful", purpose="the state machine of a loop", extra="testing")
+    st = extra_module("hypothesis.strategies", purpose="the state machine of a loop", extra="testing")
+
+START = 30
+"""Number of cycles before the first switch: the pace of the messages is known then."""
+
+
+def loop_state_machine(
+    scenario: Scenario,
+    *,
+    alone: bool = False,
+    values: Mapping[str, Any] | None = None,
+) -> type[stateful.RuleBasedStateMachine]:
+    """Return a state machine that does to the loop of a scenario what may happen to it, and checks that it keeps rules.
+
+    In a test file::
+
+        TestLoop = loop_state_machine(ArmScenario()).TestCase
+
+    The machine of the loop is in the same process, and time is simulated: a failure repeats, and Hypothesis makes it
+    short. Messages arrive, are lost, late, repeated or corrupted; the machine dies and comes back; the connection is
+    cut; the loop is held up; switches are thrown; the guards are reset; commands u change. Checked is what
+    `LoopRules` lists, and that nothing raises. What the scenario's slow parts compute is missing mostly: there is no
+    time for it.
+
+    Args:
+        scenario: The scenario.
+        alone: Whether the DPS runs alone, and not in the whole testbed.
+        values: Values of variables by address that are set at first, so that the DPS can take over.
+
+    Raises:
+        ProtocolError: The deployment of the scenario has no protocol, so no machine.
+        DeploymentError: The DPS cannot run safely.
+    """
+    # By the clock: where messages began the cycles, those that fail to come would stop it.
+    deployment = Deployment.of(scenario, pace="")
+    interface, protocol, period = scenario.interface(), protocol_of(scenario), deployment.period
+    modes = ["real"] if alone else list(MODES)
+
+    @cache
+    def built() -> tuple[VirtualTestbed | DpsAlone, WorldAlone]:
+        return DpsAlone(scenario) if alone else scenario.build(), WorldAlone(scenario)
+
+    class LoopMachine(stateful.RuleBasedStateMachine):
+        """The loop, its machine and its clock."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            target, world = built()
+            self.clock = SimulatedClock()
+            self.bridge = WatchedBridge(Machine(scenario, world=world), self.clock)
+            self.runtime: Runtime = deployment.runtime(target, self.bridge, clock=self.clock)
+            self.loop_rules = LoopRules(self.runtime, self.bridge)
+            self.runtime.write(values or {})
+
+        def teardown(self) -> None:
+            with self.runtime:
+                self.runtime.leave("the test ended")
+
+        def _restart(self) -> None:
+            epoch = round(1e6 * self.clock.now())
+            self.bridge.restart(Machine(scenario, world=built()[1], epoch=epoch))
+
+        def _run(self, cycles: int) -> None:
+            for _ in range(cycles):
+                self.clock.advance(period)
+                self.runtime.run(cycles=1)
+
+        @stateful.initialize()
+        def start(self) -> None:
+            self._run(START)
+            self.switch("real")
+
+        @stateful.rule(cycles=st.integers(1, 40))
+        def run(self, cycles: int) -> None:
+            self._run(cycles)
+
+        @stateful.rule(fault=injected_faults(protocol, period=period), cycles=st.integers(1, 20))
+        def disturb(self, fault: InjectedFault, cycles: int) -> None:
+            """Let messages be lost, late, repeated or corrupted for some cycles."""
+            self.bridge.machine.begin(fault)
+            self._run(cycles)
+            self.bridge.machine.end_faults()
+
+        @stateful.rule(periods=st.floats(0.0, 40.0))
+        def hold_up(self, periods: float) -> None:
+            self.clock.advance(periods * period)
+            self.runtime.run(cycles=1)
+
+        @stateful.rule(cycles=st.integers(1, 5))
+        def hurry(self, cycles: int) -> None:
+            """Run cycles at once, as by hand."""
+            for _ in range(cycles):
+                self.runtime.run(cycles=1)
+
+        @stateful.rule(cut=st.booleans())
+        def connect(self, cut: bool) -> None:
+            self.bridge.cut = cut
+
+        @stateful.precondition(lambda self: not self.bridge.dead)
+        @stateful.rule()
+        def kill(self) -> None:
+            self.bridge.dead = True
+
+        @stateful.precondition(lambda self: self.bridge.dead)
+        @stateful.rule()
+        def restart(self) -> None:
+            self._restart()
+            self._run(START)
+
+        @stateful.rule(mode=st.sampled_from(modes))
+        def switch(self, mode: str) -> None:
+            before = self.runtime.active, set(self.runtime.watched)
+            try:
+                self.runtime.switch(mode)
+            except SwitchRefusedError:
+                assert (self.runtime.active, set(self.runtime.watched)) == before, "a refused switch was thrown"
+            self.loop_rules.note_switch()
+
+        @stateful.rule()
+        def reset(self) -> None:
+            try:
+                self.runtime.reset()
+            except SwitchRefusedError:
+                return
+            self.loop_rules.note_reset()
+
+        @stateful.rule()
+        def recover(self) -> None:
+            if self.bridge.dead:
+                self._restart()
+            self.bridge.cut = False
+            self.runtime.write(values or {})
+            self._run(START)
+            self.reset()
+            self.switch("real")
+
+        @stateful.rule(values=commands(interface))
+        def command(self, values: dict[str, Any]) -> None:
+            self.runtime.write(values)
+
+        @stateful.invariant()
+        def rules_are_kept(self) -> None:
+            assert not self.loop_rules.violations, "\n".join(self.loop_rules.violations)
+
+    LoopMachine.__name__ = LoopMachine.__qualname__ = f"{type(scenario).__name__}Loop"
+    return LoopMachine
