@@ -37,6 +37,9 @@ PERTURB, SEED = 0.05, 7
 # Consecutive missed deadlines after which the arm floats in place; the machine brakes after 100.
 MAX_MISSED = 50
 
+# For how long a reset may be refused, in s, until the reference follows the arm.
+PATIENCE = 0.1
+
 # With more latches than this, the figures of a trial mean nothing: the motions were interrupted too often.
 MANY_LATCHES = 30
 
@@ -48,23 +51,37 @@ INSTANTS = (0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6)
 
 
 class Attendant:
-    """A watcher of the loop that resets the guards as soon as possible, and collects their faults."""
+    """A watcher of the loop that resets the guards as soon as possible, and collects their faults.
+
+    Where the reference has gone on without the arm, so that commands would jump, it follows the arm until the reset;
+    after that, the arm goes home and on to the next motion.
+    """
 
     def __init__(self) -> None:
         self.loop: Runtime | None = None
         self.reasons: list[str] = []
-        self._latched = False
+        self._since: float | None = None  # when the guards latched
+        self._interrupted: float | None = None  # the commanded motion while the reference follows the arm
 
     def __call__(self, cycle: Cycle) -> None:
-        if self.loop is None:
+        loop = self.loop
+        if loop is None or not loop.guards.latched:
             return
-        latched = self.loop.guards.latched
-        if latched and not self._latched:
-            self.reasons.append(latched[0].reason)
-        self._latched = bool(latched)
-        if latched:
-            with suppress(SwitchRefusedError):
-                self.loop.reset()
+        now = loop.clock.now()
+        if self._since is None:
+            self._since = now
+            self.reasons.append(loop.guards.latched[0].reason)
+        try:
+            loop.reset()
+        except SwitchRefusedError:
+            if self._interrupted is None and now - self._since > PATIENCE:
+                self._interrupted = float(loop.target.read(loop.context, "u.motion"))
+                loop.write({"u.motion": float(Motion.FOLLOW)})
+            return
+        self._since = None
+        if self._interrupted is not None:
+            loop.write({"u.motion": self._interrupted})
+            self._interrupted = None
 
 
 class Demo:
@@ -84,14 +101,14 @@ class Demo:
         print(f"\n== {self.law}\n")
         self.bridge.open()
         try:
-            simulated, loop = self._simulate()
+            simulated, loop = self.simulate()
             successor = ChildProcess(_succeed, self.scenario, self.bridge.url, name="the machine's successor")
             with self.machine, closing(successor), RealTime(priority=LOOP_PRIORITY) as rights:
                 if death:
                     print("\n".join(f"  {line}" for line in str(rights).splitlines()))
                 loop = self._strip(self._shadow(loop))
                 real = self._on_the_machine(loop)
-                self._report(simulated, real)
+                self.report(simulated, real)
                 self._report_timing(loop)
                 if death:
                     self._die_and_recover(loop, successor)
@@ -100,7 +117,8 @@ class Demo:
 
     # -- the stages
 
-    def _simulate(self) -> tuple[Track, Runtime]:
+    def simulate(self) -> tuple[Track, Runtime]:
+        """Run the motions in the simulation, as fast as it goes; return their track, and the loop at its end."""
         context = self.testbed.default_context()
         self.testbed.write(context, DURATIONS)
         loop = Runtime(self.testbed, self.bridge, context=context, clock=SimulatedClock())
@@ -143,7 +161,7 @@ class Demo:
         print("\nThe machine is killed in the middle of a circle:")
         loop.target.write(loop.context, {"u.motion": float(Motion.CIRCLE)})
         loop.run(seconds=2.2)
-        _reset_guards(loop)
+        self._reset_guards(loop)
         killed = time.monotonic()
         os.kill(self.machine.pid, signal.SIGKILL)
         loop.run(until=lambda: bool(loop.guards.latched), seconds=5.0)
@@ -151,7 +169,7 @@ class Demo:
         print(f"  {1e3 * (fault.time - killed):.1f} ms later the guards latch: {fault.reason}")
         loop.run(seconds=0.5 * CARRY)
         print(f"  the loop continues, and carries the arm at its last pose: {_torque(_last_sent(loop))}")
-        loop.run(seconds=CARRY)
+        loop.run(until=lambda: _silence(loop) > 1.1 * CARRY, seconds=10.0 * CARRY)
         sent = self.bridge.sent["joint_torque"].count
         loop.run(seconds=0.5)
         silent = self.bridge.sent["joint_torque"].count == sent
@@ -167,7 +185,7 @@ class Demo:
         loop.run(until=lambda: not _sensor_faults(loop), seconds=60.0)
         loop.run(seconds=0.1)
         print("  the machine is restarted: its sensors are fresh, the arm floats in place")
-        _reset_guards(loop)
+        self._reset_guards(loop)
         self.attendant.reasons.clear()
         self.attendant.loop = loop
         errors = run_trial(loop, (Motion.CIRCLE,)).errors((Motion.CIRCLE,))
@@ -175,6 +193,11 @@ class Demo:
             f"  reset; the next circle is tracked to {1e3 * rms(errors):.2f} mm (RMS), {1e3 * errors.max():.2f} at most"
         )
         self._print_latches()
+
+    def _reset_guards(self, loop: Runtime) -> None:
+        self.attendant.loop = loop
+        loop.run(until=lambda: not loop.guards.latched, seconds=10.0)
+        self.attendant.loop = None
 
     # -- results
 
@@ -188,7 +211,8 @@ class Demo:
             print("        With so many latches, the figures describe this computer, not the control law: give")
             print("        it real-time rights (see above), or less other load.")
 
-    def _report(self, simulated: Track, real: Track) -> None:
+    def report(self, simulated: Track, real: Track) -> None:
+        """Print the tracking errors and the forces of the simulation and of the machine, side by side."""
         rows = []
         for motion in FREE:
             both = [track.errors((motion,)) for track in (simulated, real)]
@@ -236,23 +260,17 @@ def _succeed(connection: socket.socket, scenario: ManipulatorScenario, url: str)
             connection.recv(16)
 
 
-def _reset_guards(loop: Runtime) -> None:
-    """Reset the guards as soon as possible."""
-    for _ in range(1000):
-        if not loop.guards.latched:
-            return
-        with suppress(SwitchRefusedError):
-            loop.reset()
-        loop.run(cycles=1)
-    loop.reset()
-
-
 def _sensor_faults(loop: Runtime) -> list[str]:
     return [
         reason
         for name, value in loop.bridge.sensed.items()
         for reason in loop.guards.sensor_faults(name, loop.clock.now(), value)
     ]
+
+
+def _silence(loop: Runtime) -> float:
+    """Return for how long no position of the arm has arrived, in s."""
+    return loop.clock.now() - loop.guards.monitors["joint_position"].arrived
 
 
 def _last_sent(loop: Runtime) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 import vtbdrake as vtb
+from tests.testbeds import PendulumScenario
 from vtbdrake.components.rendering import RenderingError, check_rendering
 from vtbdrake.rollout import MotionError, RolloutRunner
 from vtbdrake.state.systems import pose_from_array
@@ -15,7 +16,11 @@ from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.studies.mount import (
     BY_HAND,
     COUNT,
+    HORIZON,
     PARAMETERS,
+    TELLING,
+    MountAnswer,
+    Placement,
     distance_from_foot,
     entries,
     mount_problem,
@@ -82,3 +87,52 @@ def test_along_the_recorded_capture_the_count_is_the_same(problem):
     whole = RolloutRunner(replace(task, motion=None), problem.testbed).run(point)
     assert along.identical(whole)
     assert whole.quality.max() >= 4.0
+
+
+DAMPING = "sim.sys.Pendulum.theta.damping"
+
+
+def counted(values, *, failing=()):
+    """Return a sweep in which as many markers are counted as the value says, at all times; some of the values fail."""
+
+    def markers(count):
+        return np.nan if count in failing else count
+
+    problem = vtb.Problem(
+        scenario=PendulumScenario(),
+        parameters=[vtb.Parameter(DAMPING, 0.0, 12.0)],
+        quality=vtb.Quality(markers, of=DAMPING, reading="integral", upper=12.0),
+        horizon=HORIZON,
+        sample_period=2.0,
+        constraints=[vtb.Constraint(float, of=DAMPING, at_most=6.0)],
+    )
+    return problem.sweep(values=list(values), executor="serial", progress=False)
+
+
+def placement(*counts, failing=()):
+    return Placement("", pose(0.0, 0.0), tuple(counted(counts, failing=failing).rollouts))
+
+
+def test_answer_holds_where_nothing_by_hand_or_on_the_grid_sees_more():
+    by_hand = (placement(2.0, 4.0), placement(1.0, 1.5))
+    # 7 markers lie where the constraint is violated.
+    answer = MountAnswer(placement(5.0, 5.5), by_hand, (), counted([1.0, 5.0, 5.5, 7.0]))
+    assert (answer.best.mean, answer.best.most) == pytest.approx((5.25, 5.25))
+    assert answer.gain == pytest.approx(2.25)
+    assert answer.best_on_grid == pytest.approx(5.5)
+    assert answer.holds
+    assert not replace(answer, landscape=counted([5.25 + 1.01 * TELLING])).holds
+    assert not replace(answer, by_hand=(*by_hand, placement(5.25 - 0.99 * TELLING))).holds
+
+
+def test_nothing_is_claimed_where_a_rollout_failed(caplog):
+    answer = MountAnswer(placement(5.0), (placement(2.0),), (), counted([1.0, 3.0]))
+    assert answer.holds
+    # Otherwise the best of the grid, or of what was placed by hand, would be that of the rest.
+    for failed in (
+        replace(answer, landscape=counted([1.0, 3.0], failing=[3.0])),
+        replace(answer, by_hand=(placement(2.0), placement(2.0, 1.0, failing=[1.0]))),
+        replace(answer, best=placement(5.0, 5.5, failing=[5.5])),
+    ):
+        assert not failed.holds
+        assert np.isnan([failed.best_on_grid, failed.gain]).any()
