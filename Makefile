@@ -19,7 +19,7 @@ STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
-.PHONY: help python setup demo demo-control test check docs answers bench clean stale
+.PHONY: help python setup demo demo-control test check docs dist answers bench clean stale
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
@@ -29,6 +29,7 @@ help:
 	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
 	@echo "make bench [ONLY=name]             every benchmark; writes benchmarks/results.json"
+	@echo "make dist                          source distribution and wheel, in dist/, tried in an empty environment"
 	@echo "make setup                         only the environment that the others need"
 	@echo "make clean                         remove environments, caches and results"
 	@echo
@@ -62,6 +63,9 @@ check: $(STAMP)
 docs: $(STAMP)
 	$(RUN) -m sphinx --quiet --fail-on-warning --keep-going -c docs . build/docs
 	@echo "build/docs/index.html"
+
+dist: $(STAMP)
+	tools/dist.sh $(VENV)
 
 answers: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)

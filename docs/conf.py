@@ -36,6 +36,8 @@ templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"vtbdrake {version}"
 html_additional_pages = {"index": "to_start.html"}  # the first page is below docs/
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 html_copy_source = False
 
 myst_heading_anchors = 3

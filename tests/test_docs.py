@@ -1,5 +1,6 @@
-"""The programs in README.md and docs/ run, and their links lead somewhere."""
+"""The programs in README.md and docs/ run and print what the pages show, and their links lead somewhere."""
 
+import ast
 import os
 import re
 import subprocess
@@ -18,7 +19,6 @@ AT_THE_ROOT = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CHANGEL
 PAGES = [*AT_THE_ROOT, *sorted((ROOT / "docs").rglob("*.md"))]
 # The same programs with fewer rollouts.
 SHORTER = {
-    "README": {"resolution=1.0, coarse=5.0": "resolution=10.0, coarse=30.0", "(0, 1/8, 2/8, 3/8)": "(0, 1/8)"},
     "crater": {"horizon=6.0": "horizon=6.0, candidates=3, executor='serial'"},
     "studies": {"run(rollouts=40)": "run(rollouts=16)"},
 }
@@ -37,10 +37,14 @@ def program(page: Path) -> str:
     return "\n".join(kept)
 
 
-WITH_PROGRAM = [page for page in PAGES if program(page).strip()]
+WITH_PROGRAM = [
+    pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem == "README" else [])
+    for page in PAGES
+    if program(page).strip()
+]
 
 
-@pytest.mark.parametrize("page", WITH_PROGRAM, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", WITH_PROGRAM)
 def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
     script = tmp_path / f"{page.stem}.py"
     text = program(page)
@@ -60,6 +64,8 @@ def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr[-4000:]
+    for block in re.findall(r"^```output\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
+        assert block in done.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -76,6 +82,27 @@ def test_index_lists_every_page() -> None:
     index = ROOT / "docs" / "index.md"
     links = {(index.parent / link).resolve() for link in re.findall(r"\]\(([^)#:]+\.md)\)", index.read_text("utf-8"))}
     assert links == {*PAGES} - {index, ROOT / "README.md"}
+
+
+def texts_of_the_package() -> list[str]:
+    """Return the texts in the code of the package, with an ellipsis for what is filled in."""
+    texts = []
+    for path in (ROOT / "vtbdrake").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [part.value if isinstance(part, ast.Constant) else "…" for part in node.values]
+                texts.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return texts
+
+
+def test_quoted_errors_are_those_of_the_code() -> None:
+    texts = "\n".join(texts_of_the_package())
+    quoted = re.findall(r"^\| `(.*?)` \|", (ROOT / "docs" / "errors.md").read_text("utf-8"), re.MULTILINE)
+    assert len(quoted) > 30
+    patterns = [".*".join(map(re.escape, message.strip("… ").split("…"))) for message in quoted]
+    assert not [message for message, pattern in zip(quoted, patterns, strict=True) if not re.search(pattern, texts)]
 
 
 def test_architecture_names_every_module_and_folder() -> None:
