@@ -19,12 +19,17 @@ STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
+<<<<<<< HEAD
 .PHONY: help python setup demo demo-control test check docs dist answers bench clean stale
+=======
+.PHONY: help python setup demo demo-control test verify check docs answers bench clean stale
+>>>>>>> 79a6266 (make verify: 41 cases with known answers, in four groups, with tolerances from the orders of the integrators; docs/verification.md)
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
 	@echo "make demo-control                  an arm, from the simulation to the machine, at 1 kHz; the machine killed, and back"
 	@echo "make test [ARGS='-k name']         the tests"
+	@echo "make verify                        the cases with known answers among them, with their errors in a table"
 	@echo "make check                         ruff, mypy, and the public interface against that of the newest release"
 	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
@@ -52,6 +57,9 @@ demo-control: $(STAMP)
 test: $(STAMP)
 	$(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --max-worker-restart 0 \
 		--dist loadfile --no-loadscope-reorder $(ARGS)
+
+verify: $(STAMP)
+	$(RUN) -m tests.verification $(ARGS)
 
 check: $(STAMP)
 	$(RUN) -m ruff check .

@@ -10,8 +10,6 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, Multibody
 from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
 
 from vtbdrake.components.actuators import JointDrives
 
@@ -104,30 +102,6 @@ def test_friction_does_not_pass_the_current_loop() -> None:
     np.testing.assert_allclose(
         torques(1, u=lambda k: [0.0, 0.0], v=(1.0, 0.0), viscous=2.0, time_constant=1.0)[0, 0], -2.0
     )
-
-
-def test_spin_down_under_coulomb_friction_is_linear() -> None:
-    """Wheel b alone: I v' = -coulomb, with I = m r^2 / 2 + N^2 I_rotor."""
-    builder, plant = two_joints()
-    gear, rotor = 100.0, 2e-5
-    actuator = plant.GetJointActuatorByName("b")
-    actuator.set_default_gear_ratio(gear)
-    actuator.set_default_rotor_inertia(rotor)
-    joints = [plant.GetJointByName("a"), plant.GetJointByName("b")]
-    drives = builder.AddSystem(JointDrives(plant, joints, period=PERIOD, coulomb=[0.0, 0.9], coulomb_velocity=0.01))
-    builder.Connect(plant.get_state_output_port(), drives.GetInputPort("state"))
-    builder.Connect(drives.get_output_port(), plant.get_actuation_input_port())
-    idle = builder.AddSystem(TrajectorySource(PiecewisePolynomial(np.zeros((2, 1)))))
-    builder.Connect(idle.get_output_port(), drives.GetInputPort("command"))
-    simulator = Simulator(builder.Build())
-    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    plant.SetVelocities(context, [0.0, 2.0])
-    joints[0].Lock(context)
-    simulator.AdvanceTo(0.5)
-    inertia = 2.0 * 0.5**2 / 2 + gear**2 * rotor
-    # The drive feels the first velocity one period late.
-    expected = 2.0 - 0.9 / inertia * (0.5 - PERIOD)
-    assert plant.GetVelocities(context)[1] == pytest.approx(expected, rel=1e-6)
 
 
 def test_every_value_is_a_variable() -> None:

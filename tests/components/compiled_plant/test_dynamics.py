@@ -9,13 +9,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, SpatialInertia
 
 from tests.components.compiled_plant.plants import (
-    PLANTS,
     arm,
     cart_pole,
     climber,
     floating,
     inertia,
-    random_plant,
     simulate,
     states,
 )
@@ -27,73 +25,6 @@ def relative(value, expected) -> float:
     return float(np.max(np.abs(np.ravel(value) - expected)) / np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("make", PLANTS)
-def test_derivatives_are_those_of_the_plant(make):
-    plant = make(0.0)
-    context = plant.CreateDefaultContext()
-    dynamics = plant_dynamics(plant, context)
-    for x, u in states(plant):
-        plant.SetPositionsAndVelocities(context, x)
-        plant.get_actuation_input_port().FixValue(context, u)
-        expected = plant.EvalTimeDerivatives(context).CopyToVector()
-        assert relative(dynamics(x, u).full(), expected) < 1e-12
-
-
-@pytest.mark.parametrize("make", PLANTS)
-def test_steps_are_those_of_the_discrete_plant(make):
-    plant = make(0.005)
-    context = plant.CreateDefaultContext()
-    random = np.random.default_rng(1)
-    x = plant.GetPositionsAndVelocities(context)
-    lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-    limited = np.isfinite(lower) & np.isfinite(upper)
-    x[: limited.size][limited] = (lower[limited] + upper[limited]) / 2
-    x[limited.size :] = 0.3 * random.normal(size=plant.num_velocities())
-    plant.SetPositionsAndVelocities(context, x)
-    u = 0.1 * random.normal(size=(40, plant.num_actuated_dofs()))
-    step = plant_step(plant, context)
-    for k, expected in enumerate(simulate(plant, context, u, 40)):
-        following, overrun = step(x, u[k])
-        assert float(overrun) <= 0.0
-        x = following.full().ravel()
-        assert relative(x, expected) < 1e-12
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_random_plants_move_as_those_of_drake(seed):
-    plant = random_plant(0.0, seed)
-    context = plant.CreateDefaultContext()
-    dynamics = plant_dynamics(plant, context)
-    for x, u in states(plant, 3):
-        plant.SetPositionsAndVelocities(context, x)
-        plant.get_actuation_input_port().FixValue(context, u)
-        expected = plant.EvalTimeDerivatives(context).CopyToVector()
-        assert relative(dynamics(x, u).full(), expected) < 1e-11
-    plant = random_plant(0.002, seed)
-    context = plant.CreateDefaultContext()
-    step = plant_step(plant, context)
-    random = np.random.default_rng(seed)
-    x = plant.GetPositionsAndVelocities(context)
-    x[plant.num_positions() :] = 0.3 * random.normal(size=plant.num_velocities())
-    plant.SetPositionsAndVelocities(context, x)
-    u = random.normal(size=(20, plant.num_actuated_dofs()))
-    for k, expected in enumerate(simulate(plant, context, u, 20)):
-        x = step(x, u[k])[0].full().ravel()
-        assert relative(x, expected) < 1e-11
-
-
-def test_explicit_damping_would_be_another_step():
-    """The test above would find a damping that acts at the begin of the step."""
-    plant = cart_pole(0.02)
-    context = plant.CreateDefaultContext()
-    context.SetDiscreteState(np.array([0.0, 1.0, 0.0, 5.0]))
-    expected = simulate(plant, context, np.zeros((1, 1)), 1)[0]
-    model = PlantDynamics(plant, context)
-    q, v, u = model.symbols()
-    explicit = casadi.Function("explicit", [q, v, u], [v + 0.02 * model.acceleration(q, v, model.actuation(u))])
-    assert relative(explicit([0.0, 1.0], [0.0, 5.0], 0.0).full(), expected[2:]) > 1e-6
-
-
 def test_quaternion_needs_no_norm():
     plant = floating(0.0)
     context = plant.CreateDefaultContext()
@@ -103,32 +34,6 @@ def test_quaternion_needs_no_norm():
     plant.get_actuation_input_port().FixValue(context, u)
     expected = plant.EvalTimeDerivatives(context).CopyToVector()
     assert relative(plant_dynamics(plant, context)(x, u).full(), expected) < 1e-12
-
-
-def test_floating_body_conserves_momentum_and_energy():
-    plant = floating(0.0, gravity=False, damping=0.0)
-    context = plant.CreateDefaultContext()
-    model = PlantDynamics(plant, context)
-    dynamics = plant_dynamics(plant, context)
-    q, v, _ = model.symbols()
-    energy = casadi.Function("energy", [q, v], [model.energy(q, v)[0]])
-    x, _ = next(states(plant))
-    x[:4] /= np.linalg.norm(x[:4])
-    before = _momentum(plant, context, x), float(energy(x[: plant.num_positions()], x[plant.num_positions() :]))
-    one = casadi.integrator(
-        "one", "cvodes", {"x": (s := casadi.MX.sym("x", x.size)), "ode": dynamics(s, 0)}, 0.0, 2.0,
-        {"abstol": 1e-12, "reltol": 1e-12},
-    )  # fmt: skip
-    x = one(x0=x)["xf"].full().ravel()
-    after = _momentum(plant, context, x), float(energy(x[: plant.num_positions()], x[plant.num_positions() :]))
-    np.testing.assert_allclose(after[0], before[0], atol=1e-8)
-    assert after[1] == pytest.approx(before[1], rel=1e-8)
-
-
-def _momentum(plant, context, x):
-    """By Drake: [angular; linear] about the world's origin, in the world."""
-    plant.SetPositionsAndVelocities(context, x)
-    return plant.CalcSpatialMomentumInWorldAboutPoint(context, [0, 0, 0]).get_coeffs()
 
 
 @pytest.mark.parametrize("make", [arm, floating])

@@ -104,12 +104,6 @@ def test_the_plant_follows_its_torques_and_turns_alike(plant, model, reaction):
     np.testing.assert_allclose(x[4:7], motion.position[-1], atol=1e-5)
 
 
-def test_the_error_falls_with_the_fourth_power_of_the_step(model):
-    ends = [BaseReaction(model, SPLINE, steps=n, compile=False)(knots()).rotation[-1] for n in (20, 40, 320)]
-    coarse, fine = (np.max(np.abs(end - ends[-1])) for end in ends[:2])
-    assert 12.0 < coarse / fine < 20.0
-
-
 def test_the_base_turns_alike_at_any_speed(model, reaction):
     slower = BaseReaction(model, Spline("bspline", 8, 9.0), steps=STEPS, compile=False)(knots())
     motion = reaction(knots())

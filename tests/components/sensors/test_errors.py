@@ -124,15 +124,6 @@ def test_all_samples_dropped_shows_the_default() -> None:
     np.testing.assert_array_equal(readings(Ramp(ErrorModel(dropout=1.0), default=(7.0, 8.0)), 5), [[7.0, 8.0]] * 5)
 
 
-def test_variance_of_the_drift_grows_linearly() -> None:
-    drift, samples, seeds = 0.2, 101, 400
-    walks = np.array([readings(Constant(ErrorModel(drift=drift, seed=s)), samples) for s in range(seeds)]) - 0.37
-    ends = [25, 50, 100]
-    variance = walks[:, ends].var(axis=(0, 2))
-    # The relative standard deviation of a sample variance is sqrt(2 / N), N = 800.
-    np.testing.assert_allclose(variance, drift**2 * PERIOD * (np.array(ends) + 1), rtol=4 * np.sqrt(2 / 800))
-
-
 def test_drift_is_the_sum_of_independent_steps() -> None:
     y = readings(Constant(ErrorModel(drift=0.2, seed=3)), 50) - 0.37
     steps = [0.2 * np.sqrt(PERIOD) * normal_noise(2, seed=3, stream=STREAM, tick=k, channel=1) for k in range(50)]
