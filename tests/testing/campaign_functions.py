@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 ANGLE = "sim.sys.Pendulum.theta.position"
@@ -17,3 +19,10 @@ def small(angle: float) -> float:
     if abs(angle) > 0.9:
         raise ArithmeticError("beyond the scale")
     return abs(angle)
+
+
+def crashing(angle: float) -> float:
+    """Return an angle; a large one kills the process."""
+    if angle > 0.9:
+        os._exit(3)
+    return angle

@@ -171,6 +171,19 @@ def test_a_failed_rollout_is_an_error_and_has_not_passed(tmp_path: Path) -> None
     assert "ArithmeticError: beyond the scale" in page and 'class="error"' in page
 
 
+@pytest.mark.one_python
+def test_a_rollout_that_kills_its_process_does_not_kill_the_campaign(tmp_path: Path) -> None:
+    criteria = {"safe": {"of": ANGLE, "f": f"{FUNCTIONS}:crashing", "at_most": 2.0}}
+    conditions = {"far": {ANGLE: 1.0}, "near": {ANGLE: 0.1}}
+    path = written(tmp_path, criteria=criteria, conditions=conditions, seeds={"count": 1})
+    printed = run("campaign", path, "--executor", "processes", "--workers", 1)
+    assert printed.exit_code == 1, printed.output
+    cells = {c["condition"]: c for c in results(path)["cells"]}
+    assert (cells["far"]["error"], cells["near"]["verdict"]) == (1, "met")
+    assert "far/0: failed: its worker process died" in printed.stdout
+    assert "its worker process died" in (path.with_suffix("") / "index.html").read_text()
+
+
 def test_a_red_cell_has_its_command_log_and_animation(tmp_path: Path) -> None:
     path = written(tmp_path)
     run_campaign(path)

@@ -16,6 +16,7 @@ from vtbdrake.cli.options import grouped, option
 from vtbdrake.cli.output import number, save_recording, table, write_whole
 from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.failures import one_line
+from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.testing.campaign import Campaign, Rerun
 from vtbdrake.testing.campaign_report import (
     Evidence,
@@ -123,7 +124,7 @@ def campaign(
     result = stated.run(folder / STUDY, **running)
     comparisons = [] if baseline is None else result.compare(baseline)
     commands = {each.name: _command(file, folder, each.name) for each in result.rollouts}
-    kept = _gather_evidence(result, folder) if evidence else {}
+    kept = _gather_evidence(result, folder, **running) if evidence else {}
     page = html_page(result, commands=commands, evidence=kept, comparisons=comparisons, baseline=str(against))
     write_whole(folder / PAGE, page.encode())
     write_whole(folder / JUNIT, junit_xml(result, commands).encode())
@@ -154,18 +155,25 @@ def _baseline(stated: Campaign, against: Path, running: dict[str, Any]) -> Campa
     return stated.baseline(other_folder / STUDY)
 
 
-def _gather_evidence(result: CampaignResult, folder: Path) -> dict[str, Evidence]:
+def _gather_evidence(
+    result: CampaignResult, folder: Path, *, executor: str, time_limit: float | None, **_: Any
+) -> dict[str, Evidence]:
     """Run the first failure of each cell again; write log and animation."""
     firsts = {cell.having(FAIL, ERROR)[0].name: cell.having(FAIL, ERROR)[0] for cell in failed_cells(result)}
     meshcat: Meshcat | None = None
-    kept = {}
-    for rollout in list(firsts.values())[:_MOST_EVIDENCE]:
-        rerun = result.campaign.run_again(rollout.condition, rollout.seed)
-        if meshcat is None and rerun.motion is not None:
-            from vtbdrake.visualization import make_meshcat
+    kept: dict[str, Evidence] = {}
+    if not firsts:
+        return kept
+    # A rollout that has killed its process, or that never ends, does so again: not in this process.
+    where = "serial" if executor in ("serial", "threads") else "processes"
+    with borrowed(result.campaign.problem, where, rollouts=1, time_limit=time_limit) as opened:
+        for rollout in list(firsts.values())[:_MOST_EVIDENCE]:
+            rerun = result.campaign.run_again(rollout.condition, rollout.seed, executor=opened)
+            if meshcat is None and rerun.motion is not None:
+                from vtbdrake.visualization import make_meshcat
 
-            meshcat = make_meshcat()
-        kept[rollout.name] = _written(result.campaign, rollout, rerun, folder, meshcat)
+                meshcat = make_meshcat()
+            kept[rollout.name] = _written(result.campaign, rollout, rerun, folder, meshcat)
     return kept
 
 

@@ -15,7 +15,9 @@ import yaml
 
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.optimization import Motion, Problem, Study
-from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult, RolloutRunner
+from vtbdrake.optimization.sweep import borrowed
+from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult
+from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.rollout.named_function import largest, named_function, smallest
 from vtbdrake.rollout.quality import READINGS
 from vtbdrake.rollout.testbeds import split
@@ -422,8 +424,13 @@ class Campaign:
                     f"{path} was made with other values of {', '.join(different)} in {_text(name)}: {remedy}"
                 )
 
-    def run_again(self, condition: str, seed: int) -> Rerun:
+    def run_again(self, condition: str, seed: int, *, executor: str | Executor = "serial") -> Rerun:
         """Run one rollout alone, and record what its criteria look at.
+
+        Args:
+            condition: The name of its condition.
+            seed: Its seed.
+            executor: See `Problem.sweep`.
 
         Raises:
             CampaignError: There is no such rollout.
@@ -438,8 +445,11 @@ class Campaign:
         state = [_PLANT_STATE] if problem.testbed.plant is not None else []
         record = tuple(dict.fromkeys([*addresses, *self.record, *state]))
         values = problem.values((), condition=self.rollout_names.index((condition, seed)))
-        task, testbed = problem.placed(replace(problem.task, record=record, catch=True), values)
-        result = RolloutRunner(task, testbed).run(split(values)[1])
+        task = replace(problem.task, record=record, catch=True)
+        with borrowed(problem, executor, rollouts=1) as opened:
+            (result,) = run_rollouts(opened, task, [values], progress=False)
+        if result is None:
+            raise KeyboardInterrupt
         numbers = {
             name: criterion.value(violation)
             for (name, criterion), violation in zip(self.criteria.items(), result.measures, strict=False)
@@ -447,7 +457,8 @@ class Campaign:
         rollout = CampaignRollout(condition, seed, result.end, result.message, numbers)
         motion = None
         if state and len(result.times) > 1:
-            motion = Motion(task.scenario, result.times, result.record[_PLANT_STATE])
+            scenario = problem.scenario.with_fields(split(values)[0])
+            motion = Motion(scenario, result.times, result.record[_PLANT_STATE])
         return Rerun(rollout, result, motion, {name: self._samples(c, result) for name, c in self.criteria.items()})
 
     def _samples(self, criterion: Criterion, result: RolloutResult) -> np.ndarray:

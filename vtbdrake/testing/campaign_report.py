@@ -132,11 +132,14 @@ def junit_xml(result: CampaignResult, commands: Mapping[str, str]) -> str:
         cells = [cell for cell in result.cells() if cell.condition == condition and cell.is_judged]
         if not cells:
             continue
-        suite = ElementTree.SubElement(root, "testsuite", name=condition)
+        suite = ElementTree.SubElement(root, "testsuite", name=_xml_text(condition))
         counts = dict.fromkeys(totals, 0)
         for cell in cells:
             case = ElementTree.SubElement(
-                suite, "testcase", classname=f"{result.campaign.path.stem}.{condition}", name=cell.name
+                suite,
+                "testcase",
+                classname=_xml_text(f"{result.campaign.path.stem}.{condition}"),
+                name=_xml_text(cell.name),
             )
             kind = _add_outcome(case, cell, commands)
             for count in ("tests", kind) if kind else ("tests",):
