@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 FOLDER = Path(".vtb_failures")
 """The folder of plots and logs of failures, below the present directory; pytest's option ``--vtb-failures``."""
 
-_folder: ContextVar[Path] = ContextVar("folder of failures", default=FOLDER)
+_folder: ContextVar[Path | None] = ContextVar("folder of failures", default=FOLDER)
 
 
 @contextmanager
-def failures_in(folder: Path) -> Iterator[None]:
-    """Write the plots of failures into a folder, for the time of a ``with`` block."""
+def failures_in(folder: Path | None) -> Iterator[None]:
+    """Write the plots of failures into a folder, for the time of a ``with`` block; None: write none."""
     token = _folder.set(folder)
     try:
         yield
@@ -36,19 +36,18 @@ def fail(message: str, *, name: str, draw: Callable[[Axes], None] | None = None)
         draw: Draws into the axes of the plot.
     """
     __tracebackhide__ = True
-    if draw is not None:
-        message += f"\nplot: {_written(name, draw)}"
+    if draw is not None and (folder := _folder.get()) is not None:
+        message += f"\nplot: {_written(folder, name, draw)}"
     raise AssertionError(message)
 
 
-def _written(name: str, draw: Callable[[Axes], None]) -> str:
+def _written(folder: Path, name: str, draw: Callable[[Axes], None]) -> str:
     from vtbdrake.visualization.plots import Picture, finish
 
     picture = Picture(7.0, 3.5)
     axes = picture.add_subplot()
     draw(axes)
     finish(axes)
-    folder = _folder.get()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path = next(p for p in _names(folder, name) if not p.exists())
