@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,10 +97,9 @@ class CartPoleScenario(Scenario):
         )
 
     def _plan_command(self) -> Signal:
-        limit = np.full(self.knots, self.force_limit)
-        return Signal(
-            "plan", size=1 + self.knots, unit="s, N", lower=np.append(-inf, -limit), upper=np.append(inf, limit)
-        )
+        # A plan begins at a time of the DPS, which runs for thirty years at most.
+        limit = np.append(1e9, np.full(self.knots, self.force_limit))
+        return Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit)
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.

@@ -32,6 +32,9 @@ PROGRESS = 0.5
 PASSED = "the robot has passed the rim"
 """The message of a simulation that ends there."""
 
+FASTEST = 2.0
+"""The most that the visual odometer measures, in m/s: twenty times as fast as the robot walks."""
+
 TIPPED_OVER = np.radians(60.0)
 """From which roll or pitch on the robot has tipped over."""
 
@@ -111,7 +114,8 @@ class CraterScenario(SpaceClimberScenario):
 
     def interface(self) -> Interface:
         legs = super().interface()
-        eyes = Signal("visual_odometry", size=3, unit="m/s", max_age=5 * self._odometer_period)
+        age = 5 * self._odometer_period
+        eyes = Signal("visual_odometry", size=3, unit="m/s", lower=-FASTEST, upper=FASTEST, max_age=age)
         return replace(legs, sense=[*legs.sense, eyes])
 
     @property

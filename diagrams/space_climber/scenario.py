@@ -35,6 +35,9 @@ from vtbdrake_diagrams.space_climber.plant import add_climber, add_payload, set_
 
 JOINTS = len(JOINT_NAMES)
 
+IMU_RANGE = np.repeat([35.0, 160.0], 3)
+"""What a common MEMS IMU measures at most: 2000 deg/s and 16 g, in rad/s and m/s^2."""
+
 
 def _cenic() -> SimulatorConfig:
     # Chosen by the convergence study that the benchmark `rollout_rtf` prints. The samples of the DPS end every step, so
@@ -76,8 +79,8 @@ class SpaceClimberScenario(Scenario):
         m = Morphology()
         return Interface(
             sense=[
-                Signal("imu", size=6, unit="rad/s, m/s^2", max_age=5 * self.period),
-                Signal("joint_encoders", size=JOINTS, unit="rad", max_age=5 * self.period),
+                Signal("imu", size=6, unit="rad/s, m/s^2", lower=-IMU_RANGE, upper=IMU_RANGE, max_age=5 * self.period),
+                Signal("joint_encoders", size=JOINTS, unit="rad", lower=-np.pi, upper=np.pi, max_age=5 * self.period),
                 Signal("foot_contact", size=len(LEGS), lower=0.0, upper=1.0, max_age=5 * self.period),
             ],
             act=[

@@ -358,6 +358,17 @@ def test_a_field_that_no_file_can_hold_is_named():
         testbed.snapshot(testbed.default_context()).to_bytes()
 
 
+@dataclass
+class Paired(AcrobotScenario):
+    pair: tuple[float, ...] = (1.0, 2.0)
+
+
+def test_a_field_that_no_yaml_can_hold_is_named(tmp_path):
+    with pytest.raises(ScenarioError, match=r"no file can hold Paired.pair, a tuple\[float, ...\]: make it of"):
+        Paired().save(tmp_path / "scenario.yaml")
+    assert not list(tmp_path.iterdir())
+
+
 def test_fields_are_set_in_a_copy_nested_ones_too():
     scenario = Varied()
     values = {

@@ -65,9 +65,29 @@ def file_and_key(source: str) -> tuple[str, str]:
 
 
 def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
-    """Write a YAML file that `load_scenario` reads."""
+    """Write a YAML file that `load_scenario` reads.
+
+    Raises:
+        ScenarioError: A field is of a type that no file can hold.
+    """
     resolve_types(type(scenario))
-    Path(path).write_text(yaml_dump_typed(scenario, child_name=scenario.name()))
+    try:
+        text = yaml_dump_typed(scenario, child_name=scenario.name())
+    except Exception:
+        for item in fields(scenario):
+            try:
+                yaml_dump_typed({"": getattr(scenario, item.name)}, schema=dict[str, item.type])  # type: ignore[name-defined]
+            except Exception as error:
+                raise ScenarioError(
+                    f"no file can hold {type(scenario).__name__}.{item.name}, a {_type_name(item.type)}: make it of "
+                    "numbers, texts, lists, dictionaries, dataclasses of them and Drake's configs"
+                ) from error
+        raise
+    Path(path).write_text(text)
+
+
+def _type_name(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
 
 
 def scenario_class(name: str) -> type[Scenario]:

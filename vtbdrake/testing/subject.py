@@ -62,6 +62,10 @@ class Subject:
                 self._outcomes[name] = None
             except (CheckFailedError, CheckSkippedError) as error:
                 self._outcomes[name] = error
+            except FAILURES as error:  # Of the scenario: none of our own functions raises.
+                failure = CheckFailedError(f"an error of the scenario: {error_text(error)}")
+                failure.__cause__ = error
+                self._outcomes[name] = failure
         return self._outcomes[name]
 
     def presuppose(self, *checks: Callable[[Subject], None]) -> None:

@@ -58,8 +58,8 @@ class ArmMotionScenario(Scenario):
 
     plant_config: MultibodyPlantConfig = field(default_factory=plant_config)
     # Joint positions in rad, one per joint of the arm.
-    start: tuple[float, ...] = Servicer().stowed
-    goal: tuple[float, ...] = REACHING
+    start: list[float] = field(default_factory=lambda: list(Servicer().stowed))
+    goal: list[float] = field(default_factory=lambda: list(REACHING))
     # Of the move, in seconds; and the knots of its plan.
     duration: float = 20.0
     knots: int = 9
@@ -121,7 +121,9 @@ class ArmMotionScenario(Scenario):
         rate = np.concatenate((s.speeds, np.full(2, s.finger_speed)))
         idle = np.concatenate((self.start, fingers))
         size = 1 + self.knots * ARM_JOINTS
-        plan = Signal("plan", size=size, unit="s, rad", default=self.initial_plan())
+        # A plan begins at a time of the DPS, which runs for thirty years at most; its knots are turns of joints.
+        limit = np.append(1e9, np.full(size - 1, 2.0 * np.pi))
+        plan = Signal("plan", size=size, unit="s, rad", lower=-limit, upper=limit, default=self.initial_plan())
         return Interface(
             sense=[
                 Signal(

@@ -99,7 +99,11 @@ class ApproachScenario(Scenario):
 
     def interface(self) -> Interface:
         return Interface(
-            sense=[Signal("imu", size=6, unit="rad/s, m/s^2"), Signal("scan", model_value=Scan.empty())], act=[]
+            sense=[
+                Signal("imu", size=6, unit="rad/s, m/s^2", lower=-10.0, upper=10.0),
+                Signal("scan", model_value=Scan.empty()),
+            ],
+            act=[],
         )
 
     def make_dps(self) -> Diagram:

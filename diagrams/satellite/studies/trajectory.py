@@ -178,7 +178,7 @@ def _motions(draw: Callable[[], tuple[Array, Array]]) -> Iterator[ArmMotionScena
     """Yield the motions between drawn poses that are possible."""
     while True:
         start, goal = draw()
-        scenario = ArmMotionScenario(start=tuple(start.tolist()), goal=tuple(goal.tolist()), thinking_time=0.5)
+        scenario = ArmMotionScenario(start=start.tolist(), goal=goal.tolist(), thinking_time=0.5)
         try:
             scenario.validate()
         except ScenarioError:

@@ -86,7 +86,7 @@ def test_search_in_the_full_testbed_starts_from_the_straight_path():
 
 def test_an_arm_whose_straight_path_is_blocked_stays():
     scenario = ArmMotionScenario(
-        start=(-1.6, -1.2, 0.4, 2.1, -0.8, 0.4, 1.5), goal=(1.6, -0.2, 0.7, 2.2, 1.5, -1.0, 1.9), thinking_time=0.2
+        start=[-1.6, -1.2, 0.4, 2.1, -0.8, 0.4, 1.5], goal=[1.6, -0.2, 0.7, 2.2, 1.5, -1.0, 1.9], thinking_time=0.2
     )
     assert "clearance" in scenario.move().excess(scenario.move().straight)
     (plan,) = scenario.interface().commands

@@ -103,7 +103,10 @@ def _repeat_commands(subject: Subject, target: Any, context: Any, feed: Feed, wh
             feed(name, read(expected_context))
         if not switched:
             dps_context = testbed.dps.GetMyContextFromRoot(expected_context)
-            target.write(context, {f"{COMMAND}{name}": port.Eval(dps_context) for name, port in dps_port.items()})
+            for name, port in dps_port.items():
+                address = f"{COMMAND}{name}"
+                value = np.reshape(port.Eval(dps_context), target.variables()[address].shape)
+                target.write(context, {address: value})
         if simulator is None:
             if switched:
                 target.switch(context, "real")

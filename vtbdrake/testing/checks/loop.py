@@ -14,6 +14,7 @@ from vtbdrake.machine.injected_faults import Corrupt, Delay, Drop, Freeze, Injec
 from vtbdrake.testbed import DpsAlone, Scenario
 from vtbdrake.testbed.slow_part import slow_parts
 from vtbdrake.testing.check import CheckFailedError, CheckSkippedError
+from vtbdrake.testing.checks.repetition import check_simulates
 from vtbdrake.testing.lock_step import LockStep
 from vtbdrake.testing.subject import Subject
 
@@ -72,6 +73,8 @@ def check_nan_ends_in_the_fallback(subject: Subject) -> None:
     """
     subject.presuppose(check_silence_ends_in_the_fallback)
     for channel, loop in _faulty(subject, Corrupt(kind="nan")):
+        if not _holds_floats(loop, channel):
+            continue
         _expect_fallback(loop, f"the numbers on {channel} are NaN")
 
 
@@ -119,6 +122,7 @@ def _deploys_by_default(scenario: Scenario) -> bool:
 def _refuse_unsafe(subject: Subject) -> None:
     """Raise a CheckSkippedError if the DPS commands no machine, or cannot be deployed."""
     testbed = subject.testbed
+    subject.presuppose(check_simulates)
     if not testbed.interface.act:
         raise CheckSkippedError("the DPS commands nothing")
     if subject.scenario.deployment().protocol is None:
@@ -163,6 +167,13 @@ def _expect_fallback(loop: LockStep, event: str) -> None:
     loop.runtime.run(cycles=_BEFORE)
     if failures := [fault.reason for fault in guards.log if fault.kind == FaultKind.FALLBACK]:
         raise CheckFailedError(f"{event}, and then the fallback fails: {'; '.join(failures)}")
+
+
+def _holds_floats(loop: LockStep, channel: str) -> bool:
+    """Return whether messages on a channel can hold NaN: integers cannot."""
+    message_type = next(map.type for map in loop.machine.protocol.sense if map.channel == channel)
+    integers = {"int8_t", "int16_t", "int32_t", "int64_t", "boolean", "byte", "string"}
+    return not integers.issuperset(message_type.__typenames__)
 
 
 @contextmanager

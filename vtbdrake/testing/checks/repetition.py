@@ -12,8 +12,6 @@ from typing import Any
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, System
 
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.pickling import dumps
 from vtbdrake.rollout.repeatability import (
     Numbers,
     Trace,
@@ -29,7 +27,8 @@ from vtbdrake.state import Snapshot
 from vtbdrake.state.systems import class_name
 from vtbdrake.state.variables import X
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testing.check import CheckFailedError, CheckSkippedError
+from vtbdrake.testing.check import CheckFailedError
+from vtbdrake.testing.checks.scenario import check_pickle_round_trip, check_yaml_round_trip
 from vtbdrake.testing.subject import Subject
 
 
@@ -51,9 +50,13 @@ def check_state_is_in_the_context(subject: Subject) -> None:
     passes from one rollout to another, and no snapshot has it. Declare it as state, as a parameter or as a cache entry.
     """
     subject.instants  # noqa: B018
-    before = python_attributes(subject.testbed)
-    _consume(trace(subject.runner(1), subject.values), len(subject.reference))
-    changed = [name for name, value in python_attributes(subject.testbed).items() if before.get(name) != value]
+    count, samples = len(subject.reference), trace(subject.runner(1), subject.values)
+    attributes = []
+    for _ in range(2):
+        # In the middle, and at the end.
+        _consume(samples, (count + 1) // 2)
+        attributes.append(python_attributes(subject.testbed))
+    changed = [name for name, value in attributes[1].items() if attributes[0].get(name) != value]
     problems = [f"{name} changes while it is simulated" for name in changed] + list(kept_contexts(subject.testbed))
     if problems:
         raise CheckFailedError(
@@ -88,11 +91,7 @@ def check_processes_agree(subject: Subject) -> None:
     So a study uses all cores, and a cluster. What differs depends on the process: a global variable, the order of a
     set, the time, a file, an environment variable.
     """
-    subject.presuppose(check_runs_repeat)
-    try:
-        dumps(subject.scenario)
-    except FAILURES as error:
-        raise CheckSkippedError(f"the scenario cannot be sent to another process: {error_text(error)}") from error
+    subject.presuppose(check_pickle_round_trip, check_runs_repeat)
     states = [a for a, v in subject.testbed.variables().items() if v.kind == X and not v.derived]
     outputs = [f"dps.{signal.name}" for signal in subject.testbed.interface.act]
     horizon = max(float(subject.reference[-1][0]), subject.task.sample_period)
@@ -149,6 +148,7 @@ def check_snapshot_resumes(subject: Subject) -> None:
     Studies are resumed, and machines started, from files. A codec must keep every bit of an abstract state: do not
     round, and do not leave out what can be computed again.
     """
+    subject.presuppose(check_yaml_round_trip)
     testbed = subject.testbed
     context = subject.started(testbed)
     simulator = testbed.simulator(context)

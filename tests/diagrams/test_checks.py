@@ -1,0 +1,42 @@
+"""Every scenario of the library passes the checks that users' scenarios are put through."""
+
+from vtbdrake.testing import parametrize_with_checks
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.motions import Motion
+from vtbdrake_diagrams.plain.scenario import PlainScenario
+from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
+from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
+from vtbdrake_diagrams.satellite.studies.lighting import LightingScenario
+from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
+from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
+
+SIMULATED_TIME = "its messages tell the time of a simulation, which stands still when the machine is held up"
+
+# With what is set before a simulation, so that something moves.
+SCENARIOS = {
+    ManipulatorScenario: {"u.motion": float(Motion.SWING)},
+    CartPoleScenario: {"sim.sys.cart_pole.pole_pin.position": 0.5},
+    SpaceClimberScenario: {},
+    CraterScenario: {},
+    SatelliteScenario: {},
+    ArmMotionScenario: {},
+    LightingScenario: {},
+    ApproachScenario: {},
+    ForestScenario: {},
+    PlainScenario: {},
+}
+EXPECTED = {
+    ManipulatorScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
+    CartPoleScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
+}
+
+
+@parametrize_with_checks(
+    [kind() for kind in SCENARIOS],
+    values=lambda scenario: SCENARIOS[type(scenario)],
+    expected_failed_checks=lambda scenario: EXPECTED.get(type(scenario), {}),
+)
+def test_scenario(scenario, check):
+    check(scenario)
