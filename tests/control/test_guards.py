@@ -365,6 +365,12 @@ def test_limited_signal_without_start_is_not_sent() -> None:
     assert loop.cycle({"torque": [0.0, 0.0]}).ok
 
 
+def test_first_cycle_comes_after_no_pause() -> None:
+    loop = measured_loop(start=False)
+    assert kinds(loop.cycle({"torque": [0.1, 0.1]})) == [("torque", "not started")]
+    assert not loop.guards.limiters["torque"].has_start
+
+
 def test_signal_back_on_real_needs_new_start() -> None:
     loop = Loop(TORQUE, leave_time=0.0)
     loop.cycle({"torque": [0.0, 0.0]})

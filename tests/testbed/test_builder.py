@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
@@ -293,3 +295,23 @@ def test_a_sensor_without_a_plant_is_rejected():
     builder = VirtualTestbedBuilder(Interface(sense=[Signal("y", size=2)], act=[]))
     with pytest.raises(ValueError, match="call add_plant first"):
         builder.add_sensor("y", PassThrough(2))
+
+
+def test_model_that_is_anchored_in_part_only_is_of_the_robot():
+    arm = """<robot name="arm"><link name="link"><inertial><mass value="1"/>
+      <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="pin" type="continuous"><parent link="world"/><child link="link"/></joint></robot>"""
+    parts = """<robot name="{}"><link name="a"/><link name="b"/></robot>"""
+    interface = Interface([SENSE], [ACT])
+    builder = VirtualTestbedBuilder(interface)
+    plant, _ = builder.add_plant(MultibodyPlantConfig())
+    (arm_model,) = Parser(plant).AddModelsFromString(arm, "urdf")
+    for name in ("tools", "posts"):
+        (model,) = Parser(plant).AddModelsFromString(parts.format(name), "urdf")
+        # One tool is at the arm, and the other one lies on the ground.
+        carrier = plant.GetFrameByName("link", arm_model) if name == "tools" else plant.world_frame()
+        plant.WeldFrames(carrier, plant.GetFrameByName("a", model))
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("b", model))
+    plant.Finalize()
+    roles = builder.plant_roles()
+    assert [roles[name] for name in ("arm", "tools", "posts")] == ["sys", "sys", "env"]

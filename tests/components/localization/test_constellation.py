@@ -88,6 +88,24 @@ def test_exhaustive_search_finds_the_same_pose(seed):
     assert np.abs(error(fix, best.x)) == pytest.approx([0.0, 0.0, 0.0], abs=5e-3)
 
 
+def test_diameters_that_are_said_to_be_exact_are_used():
+    rng = np.random.default_rng(2)
+    places = scattered(rng, side=40.0, count=60, spacing=2.0)
+    diameters = rng.uniform(0.1, 0.6, len(places))
+    X_WH = np.array([20.0, 20.0, 0.7])
+    local = transform(inverse(X_WH), places)
+    near = np.hypot(*local.T) < 12.0
+    covariances = np.tile(0.05**2 * np.eye(2), (len(places), 1, 1))
+    mapped = Landmarks(places, covariances, diameters, np.zeros(len(places)))
+    seen_here = Landmarks(local[near], covariances[near], diameters[near], np.zeros(near.sum()))
+    fix = ConstellationMap(mapped).locate(seen_here)
+    unknown = ConstellationMap(landmarks(places)).locate(landmarks(local[near]))
+    assert fix.is_sure and np.abs(error(fix, X_WH)) == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    # Each diameter of 10 mm deviation among those of 0.1 to 0.6 m adds about ln(0.5 / (sqrt(2 pi) sqrt(2) 0.01)).
+    gain = (fix.log_likelihood - unknown.log_likelihood) / near.sum()
+    assert gain == pytest.approx(np.log(0.5 / (np.sqrt(4.0 * pi) * 0.01)), rel=0.2)
+
+
 def test_places_of_a_stand_are_recognized():
     for seed, name in enumerate(("accurate", "remote", "poor")):
         trial = run(Case("natural", 600.0, name, "inside"), seed=7000 + seed)

@@ -17,6 +17,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+from scipy.optimize import brentq
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -134,6 +135,28 @@ def test_trunk_that_the_right_camera_sees_in_part_may_be_thicker() -> None:
     deviation = np.sqrt(e @ found.covariances[0] @ e / (e @ e))
     # What is unseen is at most as wide as what is seen.
     assert 0.03 < abs(across) < 2.0 * deviation < found.diameters[0] + 0.1
+
+
+@pytest.mark.parametrize("is_left", [True, False])
+def test_diameter_is_known_if_both_cameras_see_all_of_the_trunk(is_left: bool) -> None:
+    """At the left edge, the left camera sees as many columns more as the disparity is."""
+    distance, diameter = 8.0, 0.3
+
+    def edges(slope: float) -> Array:
+        """The columns of the lines of sight that touch the trunk."""
+        half = np.arcsin(0.5 * diameter / (distance * np.hypot(1.0, slope)))
+        return 320.0 + 400.0 * np.tan(np.arctan(slope) + np.array([-half, half]))
+
+    known = []
+    # By so many pixels the trunk lies within what both cameras see. Two pixels beside it must be seen, too.
+    for inside in (0.0, 4.0):
+        column, edge = (120.0 / distance + inside, 0) if is_left else (640.0 - inside, 1)
+        slope = brentq(lambda slope, edge=edge, column=column: edges(slope)[edge] - column, -1.0, 1.0)
+        x, y, _ = LEVEL.translation()
+        tree = np.array([[x + distance, y - slope * distance, diameter]])
+        found = detect_stereo_trunks(disparity(tree, LEVEL, ground=False), CAMERA, EXACT, X_HC=LEVEL)
+        known.append(np.isfinite(found.diameter_deviations).tolist())
+    assert known == [[False], [True]]
 
 
 def test_neither_ground_nor_stumps_nor_walls_are_trunks() -> None:

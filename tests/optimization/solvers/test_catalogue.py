@@ -13,6 +13,7 @@ from pydrake.solvers import MathematicalProgram, NloptSolver, SolverOptions
 from tests.optimization.solvers.driver import ACKLEY, ROSENBROCK, SPHERE, box, drive, evaluation
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import SolverError, known_solvers, make_solver
+from vtbdrake.optimization.solvers.auto import BASIN_RADIUS, LOCAL_RADIUS
 from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS
 
 COUNT = Parameter("count", 1, 6, integer=True)
@@ -264,6 +265,24 @@ def test_auto_searches_locally_with_the_integers_held(continuous, method, short_
     best = max(log, key=lambda e: e.values[0])
     assert best.point == (2, *[pytest.approx(0.2, abs=1e-5)] * continuous)
     assert -best.values[0] < 1e-10
+
+
+def test_local_searches_of_auto_stay_within_their_boxes(short_model):
+    # Wide steps would pay: the valley goes on beyond each box.
+    solver = make_solver("auto", ROSENBROCK.space, budget=400)
+    lower, upper = (np.array([getattr(x, end) for x in ROSENBROCK.space]) for end in ("lower", "upper"))
+    stages: dict[tuple[int, str], list[tuple[float, ...]]] = {}
+    while points := solver.ask():
+        if "LN_BOBYQA" in solver.method:
+            stages.setdefault(solver.changes[-1], []).extend(points)
+        solver.tell([evaluation(p, ROSENBROCK.cost) for p in points])
+    assert len(stages) >= 2
+    for (_, method), searched in stages.items():
+        u = (np.array(searched) - lower) / (upper - lower)
+        # The first point is the start, in the middle of the box, which ends at the range.
+        radius = BASIN_RADIUS if "basin" in method else LOCAL_RADIUS
+        assert (np.abs(u - u[0]).max(axis=0) <= radius * (1.0 + 1e-9)).all()
+        assert (u.max(axis=0) > u[0]).all() and (u.min(axis=0) < u[0]).all()
 
 
 def test_auto_searches_locally_in_a_range_of_two_numbers(short_model):

@@ -139,6 +139,14 @@ def test_exhausted_space_ends_with_success():
     assert (solver.success, solver.message) == (True, "every point of the space is known")
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_space_in_which_all_fails_is_exhausted_too(seed):
+    solver = make_solver("bayesian", (Parameter("i", 1, 30, integer=True),), seed=seed)
+    log = drive(solver, lambda p: p[0], fails=lambda p: True)
+    assert sorted(told.point for told in log) == [(i,) for i in range(1, 31)]
+    assert solver.message == "every point of the space is known"
+
+
 def test_one_parameter_is_enough_for_every_method_of_auto():
     function = Function(lambda p: abs(p[0] - 0.3), (Parameter("x", -1.0, 2.0),), (0.3,))
     solver, best = solve("auto", function)

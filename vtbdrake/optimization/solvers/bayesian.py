@@ -96,8 +96,8 @@ class Bayesian(Solver):
     def _proposals(self) -> list[Point]:
         remembered = self._remembered()
         if not any(evaluation.usable for evaluation in remembered):
-            drawn = (self.search.point(self._rng.random(self.search.size)) for _ in range(self._batch))
-            return [point for point in dict.fromkeys(drawn) if point not in self._evaluations]
+            drawn = (self.search.point(u) for u in self._rng.random((SPREAD, self.search.size)))
+            return list(dict.fromkeys(point for point in drawn if point not in self._evaluations))[: self._batch]
         units = np.array([self.search.unit(evaluation.point) for evaluation in remembered])
         targets = self._targets(remembered)
         X = self._encoded(units)
