@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import re
 import time
 from collections.abc import Callable, Sequence
+from datetime import date
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +86,45 @@ def results_table(results: Sequence[Benchmark | Crash]) -> str:
     rows = [_crash_row(r) if isinstance(r, Crash) else _row(r) for r in results]
     notes = [f"{r.name}: {r.note}" for r in results if isinstance(r, Benchmark) and r.note]
     return "\n".join([table(header, rows), *notes])
+
+
+_PAGE = """\
+# Benchmarks
+
+`make bench` measures every claim of speed as a ratio: what is compared runs in turns in one run, so that a slower
+machine, or other load, changes both. `make bench PAGE=1` writes this page{only}.
+
+Measured on {date}: {machine}.
+
+| benchmark | value | unit | goal | holds | measured beside |
+|---|---|---|---|---|---|
+{rows}
+
+{notes}
+"""
+
+
+def results_page(results: Sequence[Benchmark | Crash], *, only: Sequence[str] = ()) -> str:
+    """Return docs/benchmarks.md: the table in Markdown, with machine and date."""
+    rows = [_crash_row(r) if isinstance(r, Crash) else _row(r) for r in results]
+    notes = [f"* {r.name}: {r.note}" for r in results if isinstance(r, Benchmark) and r.note]
+    return _PAGE.format(
+        only=f"; this one has the rows of `make bench PAGE=1 ONLY='{' '.join(only)}'`" if only else "",
+        date=date.today().isoformat(),
+        machine=machine(),
+        rows="\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows),
+        notes="\n".join(notes),
+    )
+
+
+def machine() -> str:
+    """Return processor, load and versions, in words."""
+    model = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE)
+    return (
+        f"{len(os.sched_getaffinity(0))} cores of {model[1] if model else platform.machine()}, with a load of "
+        f"{os.getloadavg()[2]:.1f} processes (mean of 15 minutes), Python {platform.python_version()}, "
+        f"drake {version('drake')}"
+    )
 
 
 def _row(result: Benchmark) -> tuple[str, ...]:

@@ -30,7 +30,19 @@ version = release = version_of("vtbdrake")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
 include_patterns = ["ARCHITECTURE.md", "CHANGELOG.md", "docs/**"]
-exclude_patterns = [".*", "build", "dist", "out", "vtbdrake*", "diagrams", "benchmarks", "notebooks", "tests", "tools"]
+exclude_patterns = [
+    ".*",
+    "venv*",
+    "build",
+    "dist",
+    "out",
+    "vtbdrake*",
+    "diagrams",
+    "benchmarks",
+    "notebooks",
+    "tests",
+    "tools",
+]
 templates_path = ["_templates"]
 
 html_theme = "furo"
@@ -106,7 +118,7 @@ def page_of_package(name: str, described: set[Any]) -> list[str]:
     lines += ["   :no-members:", ""]
     for path in sorted(Path(str(package.__file__)).parent.glob("*.py")):
         if path.stem != "__init__":
-            lines += [*underlined(f"{name}.{path.stem}", "-"), f".. automodule:: {name}.{path.stem}", ""]
+            lines += [*underlined(path.stem, "-"), f".. automodule:: {name}.{path.stem}", ""]
     return lines
 
 
@@ -150,9 +162,23 @@ def add_navigation(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] += "\n".join(["\n\n```{toctree}", ":hidden:", f":caption: {caption}", "", *entries, "```"])
 
 
+def with_short_arrays(text: str) -> str:
+    """Write the types of arrays as the code does: NDArray[float64]."""
+    array = r"~?numpy\.ndarray\[tuple\[(?:~?typing\.)?Any, \.\.\.\], ~?numpy\.dtype\[(.*?)\]\]"
+    return re.sub(array, r"~numpy.typing.NDArray[\1]", text)
+
+
+def is_field_of_named_tuple(
+    app: Sphinx, what: str, name: str, value: Any, would_skip: bool, options: Any
+) -> bool | None:
+    """Skip the fields of a NamedTuple, which the attributes of its docstring describe."""
+    return True if str(getattr(value, "__doc__", "")).startswith("Alias for field number") else None
+
+
 def mend_docstring(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
     """Show |x| and indented equations as they are written, and the documentation of the fields of configurations."""
     for index, line in enumerate(lines):
+        line = with_short_arrays(line)
         line = re.sub(r"^:(ivar|param) .*?:", lambda match: match[0].replace(", ", "/"), line)  # several names
         lines[index] = re.sub(r"(`[^`]+`)|\|", lambda match: match[1] or r"\|", line)
         following = [*lines[index + 1 : index + 3], "", ""]
@@ -168,8 +194,9 @@ def mend_docstring(app: Sphinx, what: str, name: str, value: Any, options: Any, 
 def mend_signature(
     app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str | None, result: str | None
 ) -> tuple[str | None, str | None]:
-    """Write defaults that a function makes as an ellipsis: without it, a signature cannot be parsed."""
-    return signature and re.sub(r"<[^>]*>", "...", signature), result
+    """Write defaults that a function makes as an ellipsis, which can be parsed, and the types of arrays shortly."""
+    parts = [part and with_short_arrays(re.sub(r"<[^>]*>", "...", part)) for part in (signature, result)]
+    return parts[0], parts[1]
 
 
 def setup(app: Sphinx) -> None:
@@ -183,3 +210,4 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", add_navigation)
     app.connect("autodoc-process-docstring", mend_docstring, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", mend_signature)
+    app.connect("autodoc-skip-member", is_field_of_named_tuple)

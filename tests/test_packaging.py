@@ -1,6 +1,7 @@
 """The sdist holds all that the wheel is built from; the wheel holds the package, compiled, and the example testbeds."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -158,6 +159,18 @@ def test_optional_packages_are_extras(metadata: Message) -> None:
     always = {requirement.split(">")[0] for requirement in requirements if "extra ==" not in requirement}
     assert {"drake", "casadi", "lcm", "cmaes", "click"} <= always
     assert not always & {"opencv-python-headless", "embreex", "optuna", "dask", "distributed", "pandas", "ipywidgets"}
+
+
+def test_no_version_of_a_dependency_is_excluded_from_above(metadata: Message) -> None:
+    requirements = [requirement.partition(";")[0] for requirement in metadata.get_all("Requires-Dist", [])]
+    assert "drake>=1.51.1" in requirements
+    assert not [requirement for requirement in requirements if re.search(r"[<~!]|==", requirement)]
+
+
+def test_entry_point_of_pytest_names_a_module(content: dict[str, str]) -> None:
+    entries = content["vtbdrake-0.1.0.dist-info/entry_points.txt"]
+    module = entries.partition("[pytest11]")[2].split()[2]
+    assert f"{module.replace('.', '/')}.py" in content
 
 
 def test_command_line_entry_point(content: dict[str, str]) -> None:

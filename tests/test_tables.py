@@ -1,6 +1,7 @@
 """The tables of answers and of benchmarks: rows, files, names, and what becomes of errors."""
 
 import json
+import re
 import subprocess
 import sys
 from math import inf, nan
@@ -11,7 +12,7 @@ import pytest
 
 from benchmarks.import_time import import_time
 from benchmarks.measure import Benchmark, interleaved, interleaved_values, ratio
-from benchmarks.report import BENCHMARKS, benchmark_all, results_table, write_results
+from benchmarks.report import BENCHMARKS, benchmark_all, results_page, results_table, write_results
 from vtbdrake_diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
 from vtbdrake_diagrams.tables import Crash, write_json
 
@@ -131,6 +132,15 @@ def test_benchmarks() -> None:
     assert lines[4].split() == ["slow", "inf", "s", "<=", "1", "NO", "nothing"]
     assert lines[5].split()[:3] == ["gone", "-", "NO"]
     assert lines[6:] == ["slow: never arrived"]
+
+
+def test_page_of_benchmarks() -> None:
+    lines = results_page(benchmark_all(registry=BENCHES, echo=quiet), only=["fast", "slow"]).splitlines()
+    assert "| fast | 3 |  | >= 2.5 | yes | rebuilding |" in lines
+    assert "| slow | inf | s | <= 1 | NO | nothing |" in lines
+    assert "* slow: never arrived" in lines
+    assert any("ONLY='fast slow'" in line for line in lines)
+    assert any(re.match(r"Measured on \d{4}-\d\d-\d\d: \d+ cores of .*drake \d", line) for line in lines)
 
 
 def test_benchmarks_file(tmp_path: Path) -> None:

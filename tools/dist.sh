@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # What a release consists of, in dist/: the source distribution, and a wheel for the Python of an environment, built from it.
-# The wheel is then installed into an empty environment, with the tested versions of what it depends on, and the program of
-# the README runs there.
+# The wheel is then installed into an empty environment, with the tested versions of what it depends on, and does there what
+# a new user does first.
 #
 #   tools/dist.sh VENV
 #
@@ -33,11 +33,14 @@ wheel=$(echo "$root"/dist/*-cp"$tag"-*.whl)
 say "installing ${wheel##*/} into an empty environment"
 "$python" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip --quiet --disable-pip-version-check install --constraint "$constraints" "$wheel"
-say "running the program of the README"
-awk '/^```/ { inside = /python$/; next } inside' README.md >"$work/readme.py"
+say "running the programs of README.md and docs/start.md, and a new project"
+for page in README docs/start; do
+    awk '/^```/ { inside = /python$/; next } inside' "$page.md" >"$work/${page##*/}.py"
+done
 cd "$work"
-MPLBACKEND=agg venv/bin/python -I readme.py
-[ -s payload.png ]
-venv/bin/vtbdrake variables vtbdrake_diagrams.cart_pole:CartPoleScenario >/dev/null
+MPLBACKEND=agg venv/bin/python -I README.py
+MPLBACKEND=agg venv/bin/python -I start.py
+[ -s payload.png ] && [ -s first.png ]
+venv/bin/vtbdrake new trial >/dev/null
 cd "$root"
 ls -l dist
