@@ -24,7 +24,7 @@ from vtbdrake.rollout.testbeds import split
 from vtbdrake.settings import check_settings, field_types, schema, setting
 from vtbdrake.testbed import ScenarioError, load_scenario
 from vtbdrake.testbed.scenario_file import compose_yaml, refuse_unknown, resolve_types
-from vtbdrake.testing.campaign_results import CampaignResult, CampaignRollout, RolloutName
+from vtbdrake.testing.campaign_results import ALL, CampaignResult, CampaignRollout, RolloutName
 
 ATTRIBUTE = "campaign"
 """The attribute of a study that names its rollouts and criteria."""
@@ -274,8 +274,8 @@ class Campaign:
                     f"a campaign has {noun}, by their names; {{}} is the condition that changes nothing"
                 )
             for name in parts:
-                if not name or "/" in name:
-                    raise CampaignError(f"{noun} have names without a slash, not {name!r}")
+                if not name or "/" in name or name == ALL:
+                    raise CampaignError(f"{noun} have names without a slash, other than {ALL!r}, not {name!r}")
         if self.seeds.set and self.seeds.draw:
             raise CampaignError("seeds are set at addresses (set) or given to a function (draw), not both")
         if self.seeds.count > 1 and not (self.seeds.set or self.seeds.draw):
@@ -512,15 +512,23 @@ def _typed(kind: type[Any], content: Any, name: str) -> Any:
     if not isinstance(content, Mapping):
         raise CampaignError(f"{name} is a mapping of {', '.join(field_types(kind))}, not {content!r}")
     parts = {"seeds": Seeds, "stop": Stop}
-    values = dict(content)
-    for key, value in content.items():
-        if kind is Campaign and key in parts and value is not None:
+    # A key without content is left out.
+    values = {key: value for key, value in content.items() if value is not None}
+    for key, value in values.items():
+        if kind is Campaign and key in parts:
             values[key] = _typed(parts[key], value, key)
         elif kind is Campaign and key == "criteria" and isinstance(value, Mapping):
-            values[key] = {n: _typed(Criterion, criterion, f"criteria.{n}") for n, criterion in value.items()}
+            values[key] = {str(n): _typed(Criterion, criterion, f"criteria.{n}") for n, criterion in value.items()}
+        elif kind is Campaign and key == "values":
+            values[key] = _with_texts(value)
         elif kind is Campaign and key == "conditions" and isinstance(value, Mapping):
-            values[key] = {str(n): {} if condition is None else condition for n, condition in value.items()}
+            values[key] = {str(n): _with_texts({} if c is None else c) for n, c in value.items()}
     return kind(**values)
+
+
+def _with_texts(values: Any) -> Any:
+    """Return a mapping with texts as keys: YAML has other keys, too, and no address is one."""
+    return {str(key): value for key, value in values.items()} if isinstance(values, Mapping) else values
 
 
 def _text(name: RolloutName) -> str:

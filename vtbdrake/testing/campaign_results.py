@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import isfinite
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -247,7 +248,7 @@ class CampaignResult:
             "scenario": campaign.scenario,
             "met": self.is_met,
             "complete": self.is_complete,
-            "conditions": campaign.conditions,
+            "conditions": _finite(campaign.conditions),
             "seeds": [seeds.start, seeds[-1]],
             "criteria": {name: asdict(criterion) for name, criterion in campaign.criteria.items()},
             "cells": [cell.to_dict() for cell in self.cells()],
@@ -257,7 +258,16 @@ class CampaignResult:
 
     def to_json(self, *, comparisons: Sequence[Comparison] = ()) -> str:
         """Return `to_dict` as JSON."""
-        return json.dumps(self.to_dict(comparisons=comparisons), indent=1) + "\n"
+        return json.dumps(self.to_dict(comparisons=comparisons), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    """Return plain data in which texts stand for the numbers that JSON lacks."""
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return value if not isinstance(value, float) or isfinite(value) else repr(value)
 
 
 @dataclass(frozen=True)
