@@ -20,11 +20,16 @@ from vtbdrake.testing.loop_rules import LoopRules, WatchedBridge
 from vtbdrake.testing.strategies import commands, injected_faults
 
 if TYPE_CHECKING:
+    import hypothesis
     from hypothesis import stateful
     from hypothesis import strategies as st
 else:
+    hypothesis = extra_module("hypothesis", purpose="the state machine of a loop", extra="testing")
     stateful = extra_module("hypothesis.stateful", purpose="the state machine of a loop", extra="testing")
     st = extra_module("hypothesis.strategies", purpose="the state machine of a loop", extra="testing")
+
+EXAMPLES = 20
+"""Number of examples, unless the test case gets other settings."""
 
 START = 30
 """Number of cycles before the first switch: the pace of the messages is known then."""
@@ -168,5 +173,9 @@ def loop_state_machine(
         def rules_are_kept(self) -> None:
             assert not self.loop_rules.violations, "\n".join(self.loop_rules.violations)
 
+    # As Hypothesis has them for state machines, but with fewer examples: each has some hundred cycles.
+    LoopMachine.TestCase.settings = hypothesis.settings(
+        deadline=None, suppress_health_check=list(hypothesis.HealthCheck), max_examples=EXAMPLES
+    )
     LoopMachine.__name__ = LoopMachine.__qualname__ = f"{type(scenario).__name__}Loop"
     return LoopMachine
