@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from xml.etree import ElementTree
 
 from vtbdrake.failures import one_line, safe_text
@@ -74,12 +75,12 @@ def passed_text(result: CampaignResult) -> str:
 
 
 def warning(result: CampaignResult) -> str:
-    """Return what makes the rates meaningless; empty if nothing does."""
+    """Return what may make the rates meaningless; empty if nothing does."""
     if not (conditions := result.unvaried):
         return ""
     return (
-        f"All seeds give the same numbers under: {', '.join(conditions)}. Equal rollouts are no trials, and their "
-        "rates and intervals say nothing: let the seeds change something there, such as noise."
+        f"All seeds give the same numbers under: {', '.join(conditions)}. If they change nothing there, the rollouts "
+        "are one trial, whatever their number, and rates and intervals say nothing."
     )
 
 
@@ -99,12 +100,13 @@ def interval_text(cell: Cell) -> str:
 
 
 def range_text(cell: Cell) -> str:
-    """Return the range of the numbers of a cell with their unit; empty without any."""
+    """Return the range of the numbers of a cell with their unit, and their mean; empty without any."""
     numbers = cell.numbers
     if not numbers:
         return ""
-    ends = dict.fromkeys(f"{number + 0.0:.4g}" for number in (min(numbers), max(numbers)))
-    return f"{' to '.join(ends)} {cell.criterion.unit}".strip()
+    ends = list(dict.fromkeys(f"{number:.4g}" for number in (min(numbers), max(numbers))))
+    words = f"{' to '.join(ends)} {cell.criterion.unit}".strip()
+    return words if len(ends) == 1 else f"{words}, mean {fmean(numbers):.4g}"
 
 
 def reason(cell: Cell, rollout: CampaignRollout) -> str:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
-from statistics import median
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.rollout.task import FAILED
@@ -156,7 +156,7 @@ class Cell:
                 "confidence": confidence,
             }
         if numbers:
-            plain |= {"least": min(numbers), "median": median(numbers), "largest": max(numbers)}
+            plain |= {"least": min(numbers), "mean": fmean(numbers), "largest": max(numbers)}
         return plain
 
 
@@ -207,11 +207,15 @@ class CampaignResult:
 
     @property
     def unvaried(self) -> list[str]:
-        """Return the conditions in which all rollouts have the same numbers: their seeds change nothing."""
+        """Return the conditions in which all rollouts have the same numbers: perhaps their seeds change nothing.
+
+        Whole numbers do not count: many rollouts may have the same count, or be right or wrong alike.
+        """
         conditions = []
         for condition in self.campaign.conditions:
             numbers = [rollout.values for rollout in self.rollouts if rollout.condition == condition and rollout.values]
-            if len(numbers) > 1 and all(values == numbers[0] for values in numbers):
+            is_fine = any(not number.is_integer() for values in numbers[:1] for number in values.values())
+            if len(numbers) > 1 and is_fine and all(values == numbers[0] for values in numbers):
                 conditions.append(condition)
         return conditions
 

@@ -1,10 +1,10 @@
 """Trials of global localization: how often a place is recognized on a map without a guess, and how often wrongly.
 
-``python -m vtbdrake_diagrams.forest.studies.trials [--trials N] [--seed S]`` draws stands, maps with errors and places,
-simulates the detections (`detections`), and prints a table: how often the matching of constellations was sure and
-right, sure and wrong, or not sure, with its errors, consistency and time.
+``vtbdrake campaign trials.yaml``, in the folder of this module, draws stands, maps with errors and places, simulates
+the detections (`detections`), and reports how often the matching of constellations was sure and right, sure and wrong,
+or not sure. Nothing moves: a rollout of a `TrialScenario` is one trial.
 
-The criteria, fixed before any result was seen:
+The criteria, fixed before any result was seen, are those of the file:
 
 * Places and headings are uniform in a stand of 1 ha; in the cases ``inside``, at least `MARGIN` from its edge, and in
   the cases ``edge`` nearer, where fewer trees are within reach: there are none outside of the stand.
@@ -13,66 +13,51 @@ The criteria, fixed before any result was seen:
   turned by less than `LARGEST_TURN`.
 * With the poor map, landmarks are gathered along a drive of 40 m; in a plantation also with the remote one, beside the
   trials from one place.
-* Seeds begin at 100,000. No constant of the matching may be chosen with these trials.
+* Of the places inside of natural stands, a share is right and sure that depends on the map; of all trials, less than
+  one in a thousand is wrong and sure. These are shares of the trials, for which the confidence is 0.5.
+* Seeds begin at 100,000, and no two cases share a stand. No constant of the matching may be chosen with these trials.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import click
 import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from vtbdrake.arrays import Array
-from vtbdrake.cli.output import table
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, wrap
+from vtbdrake.settings import setting
+from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.testbed import Interface, Scenario, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, gathered
-from vtbdrake_diagrams.forest.world.stand import MAPS, Stand
+from vtbdrake_diagrams.forest.world.stand import KINDS, MAPS, Stand
 
-SEED = 100_000
 MARGIN = 10.0
 """The least distance of a place ``inside`` from the edge of the stand, in m."""
 LARGEST_TURN = np.radians(10.0)
 DRIVE = 40.0
 """The length of the drive over which landmarks are gathered, in m."""
-DENSITIES = (300.0, 600.0, 1000.0)
-GOALS = {"accurate": 0.97, "remote": 0.95, "poor": 0.90}
-"""The least share of the places inside that must be recognized: right and sure."""
-LARGEST_WRONG = 1e-3
-"""The limit below which the share of the trials that are wrong and sure must be."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Case:
-    """A kind of trial.
+    """A kind of trial."""
 
-    Attributes:
-        stand: The kind of stand, ``natural`` or ``plantation``.
-        density: Trees per hectare.
-        map: The map, ``accurate``, ``remote`` or ``poor``.
-        place: The place of the carrier, ``inside``, ``edge`` or ``outside``.
-        is_driven: Whether landmarks are gathered along a drive; with the poor map, they always are.
-    """
-
-    stand: str
-    density: float
-    map: str
-    place: str
-    is_driven: bool = False
+    stand: str = setting("natural", "The kind of stand.", choices=KINDS)
+    density: float = setting(600.0, "Trees per hectare.", gt=0.0)
+    map: str = setting("accurate", "The map.", choices=tuple(MAPS))
+    place: str = setting("inside", "The place of the carrier.", choices=("inside", "edge", "outside"))
+    is_driven: bool = setting(
+        False, "Whether landmarks are gathered along a drive; with the poor map, they always are."
+    )
 
     @property
     def way(self) -> float:
         """The distance in m along which landmarks are gathered."""
         return DRIVE if self.is_driven or self.map == "poor" else 0.0
-
-    @property
-    def is_judged(self) -> bool:
-        """Return whether the share of places recognized has a goal in this case."""
-        return self.stand == "natural" and self.place == "inside"
 
 
 @dataclass(frozen=True)
@@ -85,7 +70,6 @@ class Trial:
         position: Error of the position in m.
         heading: Error of the heading in rad.
         nees: Normalized estimation error squared, of 3 degrees of freedom.
-        seconds: CPU time of the matching, the table of the map not included.
     """
 
     is_sure: bool
@@ -93,20 +77,6 @@ class Trial:
     position: float
     heading: float
     nees: float
-    seconds: float
-
-
-def cases() -> list[Case]:
-    """Return all kinds of trials."""
-    natural = [
-        Case("natural", density, name, place)
-        for place in ("inside", "edge", "outside")
-        for name in GOALS
-        for density in DENSITIES
-    ]
-    rows = [Case("plantation", 1000.0, name, place) for place in ("inside", "outside") for name in GOALS]
-    driven = [Case("plantation", 1000.0, "remote", place, is_driven=True) for place in ("inside", "outside")]
-    return natural + rows + driven
 
 
 def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Odometry | None = None) -> Trial:
@@ -131,16 +101,14 @@ def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Od
 
 def judged(constellation: ConstellationMap, local: Landmarks, X_WH: Array, case: Case) -> Trial:
     """Return the result of matching local landmarks whose true pose is known."""
-    begin = time.process_time()
     fix = constellation.locate(local)
-    seconds = time.process_time() - begin
     if not fix.is_sure:
-        return Trial(False, False, np.nan, np.nan, np.nan, seconds)
+        return Trial(False, False, np.nan, np.nan, np.nan)
     error = np.append(fix.pose[:2] - X_WH[:2], wrap(fix.pose[2] - X_WH[2]))
     position, heading = float(np.hypot(*error[:2])), abs(float(error[2]))
     is_near = position < 0.2 + 4.0 * MAPS[case.map].position and heading < LARGEST_TURN
     nees = float(error @ np.linalg.solve(fix.covariance, error))
-    return Trial(True, case.place != "outside" and is_near, position, heading, nees, seconds)
+    return Trial(True, case.place != "outside" and is_near, position, heading, nees)
 
 
 def _stand(case: Case, seed: int) -> Stand:
@@ -168,72 +136,60 @@ def _drive(case: Case, stand: Stand, rng: np.random.Generator) -> Array:
             return np.array([compose(pose, [0.0, 0.0, np.pi]) for pose in back[::-1]])
 
 
-def trials(cases_to_try: Sequence[Case], *, count: int, seed: int = SEED) -> Iterator[tuple[Case, list[Trial]]]:
-    """Run ``count`` trials of each case, and yield them; no two cases share a stand."""
-    for number, case in enumerate(cases_to_try):
-        first = seed + number * count
-        yield case, [run(case, seed=first + k) for k in range(count)]
+@dataclass
+class TrialScenario(Scenario):
+    """A trial as a testbed: a system of the simulated world whose output is the result of a trial; nothing moves."""
+
+    case: Case = field(default_factory=Case)
+
+    def interface(self) -> Interface:
+        return Interface(sense=[], act=[])
+
+    def make_dps(self) -> LeafSystem:
+        return LeafSystem()
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        builder.add("sys", "trial", TrialSystem(self.case))
 
 
-def row(case: Case, trials_of_case: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the row of the table of one case."""
-    right = [trial for trial in trials_of_case if trial.is_right]
-    wrong = sum(trial.is_sure and not trial.is_right for trial in trials_of_case)
-    return (
-        case.stand,
-        f"{case.density:g}",
-        case.map,
-        case.place,
-        f"{case.way:g}",
-        str(len(trials_of_case)),
-        f"{len(right) / len(trials_of_case):.1%}",
-        str(wrong),
-        f"{sum(not trial.is_sure for trial in trials_of_case) / len(trials_of_case):.1%}",
-        _rms([trial.position for trial in right], "{:.3f}"),
-        _rms([float(np.degrees(trial.heading)) for trial in right], "{:.2f}"),
-        f"{np.mean([trial.nees for trial in right]):.1f}" if right else "",
-        f"{1e3 * np.median([trial.seconds for trial in trials_of_case]):.0f}",
-    )
+class TrialSystem(AddressedSystem):
+    """Runs the trial of a seed.
+
+    .. pydrake_system::
+
+        name: TrialSystem
+        output_ports:
+        - result
+
+    The port has [sure, right, error of the position in m, error of the heading in rad], the errors of a pose that is
+    not sure being 0. The seed of the trial is the sum of the parameters ``first`` and ``number``.
+    """
+
+    def __init__(self, case: Case) -> None:
+        super().__init__()
+        self._case = case
+        self._seed = self.declare_parameters(first=Quantity(0.0, "1"), number=Quantity(0.0, "1"))
+        self.DeclareVectorOutputPort(
+            "result", 4, self._calc, prerequisites_of_calc={self.numeric_parameter_ticket(self._seed.index)}
+        )
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        seed = self._seed.view(context)
+        trial = run(self._case, seed=int(seed.first + seed.number))
+        errors = (trial.position, trial.heading) if trial.is_sure else (0.0, 0.0)
+        output.SetFromVector([float(trial.is_sure), float(trial.is_right), *errors])
 
 
-HEADER = (
-    *("stand", "trees/ha", "map", "place", "driven m", "trials"),
-    *("right", "wrong", "not sure", "m", "deg", "NEES", "ms"),
-)
+def right(result: Array) -> float:
+    """Return 1 if the pose is sure and right, else 0; of the ``result`` of a `TrialSystem`."""
+    return float(result[1])
 
 
-def _rms(values: Sequence[float], form: str) -> str:
-    return form.format(np.sqrt(np.mean(np.square(values)))) if values else ""
+def wrong(result: Array) -> float:
+    """Return 1 if the pose is sure and wrong, else 0; of the ``result`` of a `TrialSystem`."""
+    return float(result[0] > result[1])
 
 
-def verdicts(results: Sequence[tuple[Case, Sequence[Trial]]]) -> list[tuple[str, float, float, bool]]:
-    """Return, for each goal, (what, value, goal, whether it is met)."""
-    rows = []
-    for name, goal in GOALS.items():
-        judged_ = [trial for case, trials_ in results if case.is_judged and case.map == name for trial in trials_]
-        if judged_:
-            share = float(np.mean([trial.is_right for trial in judged_]))
-            rows.append((f"right and sure, {name} map", share, goal, share >= goal))
-    every = [trial for _, trials_ in results for trial in trials_]
-    wrong = float(np.mean([trial.is_sure and not trial.is_right for trial in every]))
-    rows.append((f"wrong and sure, of {len(every)}", wrong, LARGEST_WRONG, wrong < LARGEST_WRONG))
-    return rows
-
-
-@click.command(context_settings={"show_default": True})
-@click.option("--trials", "count", default=40, help="Number of trials per case, of which there are 35.")
-@click.option("--seed", default=SEED, help="Seed of the trials.")
-def main(count: int, seed: int) -> None:
-    """Run the trials, and print their table and whether the goals are met."""
-    results, rows = [], []
-    for case, trials_of_case in trials(cases(), count=count, seed=seed):
-        results.append((case, trials_of_case))
-        rows.append(row(case, trials_of_case))
-        print("  ".join(rows[-1]), flush=True)
-    print(table(HEADER, rows))
-    for criterion, value, goal, holds in verdicts(results):
-        print(f"{criterion}: {value:.2%} (goal {goal:.1%}): {'yes' if holds else 'NO'}")
-
-
-if __name__ == "__main__":
-    main()
+def position_error(result: Array) -> float:
+    """Return the error of the position of a right pose in m, else 0; of the ``result`` of a `TrialSystem`."""
+    return float(result[1] * result[2])

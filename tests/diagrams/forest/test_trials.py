@@ -1,12 +1,15 @@
 """Tests of the trials of global localization: their criteria, and a few trials."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import vtbdrake_diagrams.forest.studies
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake_diagrams.forest.studies.trials import GOALS, LARGEST_WRONG, Case, Trial, cases, judged, run, verdicts
+from vtbdrake.testing import Campaign
+from vtbdrake_diagrams.forest.studies.trials import Case, judged, run
 
 pytestmark = pytest.mark.one_python
 
@@ -36,18 +39,35 @@ def test_a_pose_is_right_if_it_is_near() -> None:
     assert not judged(Claim(list(truth)), Landmarks.empty(), truth, replace(INSIDE, place="outside")).is_right
 
 
-def test_verdicts_count_every_wrong_claim() -> None:
-    right, wrong = Trial(True, True, 0.0, 0.0, 3.0, 0.1), Trial(True, False, 9.0, 0.0, 99.0, 0.1)
-    edge, outside = replace(INSIDE, place="edge"), replace(INSIDE, place="outside")
-    results = [(INSIDE, [right] * 97 + [wrong] * 3), (edge, [wrong] * 50), (outside, [wrong] + [right] * 49)]
-    (_, share, goal, is_met), (_, wrongs, limit, _) = verdicts(results)
-    assert (share, goal, is_met) == (0.97, GOALS["accurate"], True)
-    assert (wrongs, limit) == (54 / 200, LARGEST_WRONG)
+@pytest.fixture
+def campaign() -> Campaign:
+    return Campaign.load(Path(vtbdrake_diagrams.forest.studies.__path__[0]) / "trials.yaml")
 
 
-def test_there_are_at_least_a_thousand_trials_by_default() -> None:
-    assert 40 * len(cases()) >= 1000
-    assert sum(case.is_judged for case in cases()) == 9
+def test_a_rollout_of_the_campaign_is_a_trial(campaign: Campaign) -> None:
+    # Seeds of development; those of the file are for the command alone.
+    names = ("natural 600 accurate inside", "plantation 1000 remote inside")
+    conditions = {name: {**campaign.conditions[name], "sim.sys.trial.first": 0} for name in names}
+    criteria = {name: replace(c, conditions=[]) for name, c in campaign.criteria.items()}
+    result = replace(campaign, conditions=conditions, criteria=criteria, seeds=replace(campaign.seeds, count=1)).run(
+        executor="serial", progress=False
+    )
+    for rollout in result.rollouts:
+        kind, density, name, place = rollout.condition.split()
+        trial = run(Case(kind, float(density), name, place), seed=0)
+        assert rollout.values["share that is right and sure"] == trial.is_right
+        assert rollout.values["not wrong and sure"] == (trial.is_sure and not trial.is_right)
+        assert rollout.values["error where it is right"] == (trial.position if trial.is_right else 0.0)
+    assert {rollout.values["share that is right and sure"] for rollout in result.rollouts} == {0.0, 1.0}
+
+
+def test_no_two_conditions_share_a_stand(campaign: Campaign) -> None:
+    count, firsts = campaign.seeds.count, [values["sim.sys.trial.first"] for values in campaign.conditions.values()]
+    assert min(firsts) == 100_000 and min(np.diff(firsts)) >= count
+    assert count * len(firsts) >= 1000
+    judged_conditions = [c for criterion in campaign.criteria.values() for c in criterion.conditions]
+    inside = [name for name in campaign.conditions if name.startswith("natural") and name.endswith("inside")]
+    assert judged_conditions == inside
 
 
 def test_places_inside_are_found_and_others_are_not_claimed() -> None:
