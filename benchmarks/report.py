@@ -20,6 +20,7 @@ from vtbdrake_diagrams.tables import Crash, Registry, run, selected_names, write
 BENCHMARKS: Registry = {
     "import_time": "benchmarks.import_time:import_time",
     "testbed_overhead": "benchmarks.space_climber:testbed_overhead",
+    "station_overhead": "benchmarks.station:station_overhead",
     "sweep_speedup": "benchmarks.space_climber:sweep_speedup",
     "rollout_rtf": "benchmarks.space_climber:rollout_rtf",
     "rollout_ladder": "benchmarks.ladder:rollout_ladder",

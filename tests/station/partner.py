@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from pydrake.lcm import DrakeLcm
 
-from tests.station import plain
+from benchmarks import hardware_sim_loop
 from vtbdrake_diagrams.station import FILE
 
 PERIOD = 0.005
@@ -66,11 +66,12 @@ def main(url: str, key: str, options: str) -> None:
     asked = json.loads(options)
     real_time = asked.pop("real_time")
     if real_time:
-        plain.build(FILE, key, urls={"iiwa": url, "wsg": url}, rate=1.0, **asked).simulator.AdvanceTo(np.inf)
+        urls = {"iiwa": url, "wsg": url}
+        hardware_sim_loop.build(FILE, key, urls=urls, rate=1.0, **asked).simulator.AdvanceTo(np.inf)
     bus = DrakeLcm(url)
     heard: list[bytes] = []
     bus.Subscribe("IIWA_COMMAND", heard.append)
-    sim = plain.build(FILE, key, urls={}, bus=bus, **asked)
+    sim = hardware_sim_loop.build(FILE, key, urls={}, bus=bus, **asked)
     plant, context = sim.plant, sim.plant.GetMyContextFromRoot(sim.simulator.get_context())
     arm, gripper = (plant.GetModelInstanceByName(name) for name in ("iiwa", "wsg"))
     sim.simulator.Initialize()

@@ -15,7 +15,7 @@ from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 import vtbdrake as vtb
-from tests.station import plain
+from benchmarks import hardware_sim_loop
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.station import FILE, HOME, ArmStation
@@ -62,7 +62,7 @@ def test_motion_is_that_of_hardware_sim_bit_for_bit(key: str, opening: float) ->
     grip = lcmt_schunk_wsg_command()
     grip.utime, grip.target_position_mm, grip.force = 1, 1e3 * opening, 30.0
     urls = {"iiwa": "memq://null", "wsg": "memq://wsg"}
-    reference = plain.build(FILE, key, urls=urls, grip=grip, sources=sources(key))
+    reference = hardware_sim_loop.build(FILE, key, urls=urls, grip=grip, sources=sources(key))
     expected = reference.states(TIMES)
 
     testbed = vtb.Station(f"{FILE}#{key}", dps=commander(key, opening, 30.0)).build()

@@ -53,6 +53,7 @@ class StationDriver(ABC):
     Attributes:
         name: The model that it drives.
         sense: The sensor signals that it offers.
+        needed: Those that a deployment needs, whether the DPS reads them or not: for pace, continuity and fallbacks.
         act: The actuator signals that it takes.
         optional: The actuator signals that a DPS may leave out.
         mode: What it takes, in words, for messages.
@@ -61,6 +62,7 @@ class StationDriver(ABC):
 
     name: str
     sense: Sequence[Signal]
+    needed: frozenset[str]
     act: Sequence[Signal]
     optional: frozenset[str] = frozenset()
     mode: str
@@ -73,12 +75,12 @@ class StationDriver(ABC):
         Args:
             builder: The builder of the testbed.
             simulated: What `HardwareSimScenario.add_drivers` has added.
-            used: The actuator signals that the DPS commands.
+            used: The signals of the interface.
         """
 
     @abstractmethod
-    def status(self) -> LcmMap:
-        """Return the map of the messages of the real driver."""
+    def status(self, used: Collection[str]) -> LcmMap:
+        """Return the map of the messages of the real driver, with the signals of the interface."""
 
     @abstractmethod
     def command(self, used: Collection[str]) -> LcmMap:
@@ -138,6 +140,8 @@ class Arm(StationDriver):
         self.sense = self._sensors()
         self.act = self._commands(np.clip(home, limits.lower, limits.upper), motion)
         self.optional = frozenset({f"{name}_torque"} if self._has_position else ())
+        extra = ("position_commanded",) if self._has_position else ("torque_added", "velocity_estimated")
+        self.needed = frozenset(f"{name}_{needed}" for needed in ("position_measured", *extra))
 
     def _sensors(self) -> list[Signal]:
         limits, age = self.limits, AGE * self.period
@@ -198,36 +202,37 @@ class Arm(StationDriver):
         return commands
 
     def connect(self, builder: VirtualTestbedBuilder, simulated: System, used: Collection[str]) -> None:
-        offered = [signal.name.removeprefix(f"{self.name}_") for signal in self.sense]
-        for name in offered:
-            if name != "torque_added":
-                builder.sim_sensor(f"{self.name}_{name}", simulated.GetOutputPort(name))
+        for name in (signal.name for signal in self.sense if signal.name in used):
+            port = name.removeprefix(f"{self.name}_")
+            if port != "torque_added":
+                builder.sim_sensor(name, simulated.GetOutputPort(port))
         if self._has_position:
             builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"))
         if self._torque_alone:
             added = builder.add("act", f"{self.name}_torque", PassThrough(self._size))
-            builder.sim_actuator(f"{self.name}_torque", added.get_input_port())
+            # The driver passes NaN on, and the plant raises.
+            builder.sim_actuator(f"{self.name}_torque", added.get_input_port(), raises_at_nan=True)
             builder.sim_sensor(f"{self.name}_torque_added", added.get_output_port())
             builder.connect(added.get_output_port(), simulated.GetInputPort("torque"))
         elif f"{self.name}_torque" in used:
-            builder.sim_actuator(f"{self.name}_torque", simulated.GetInputPort("torque"))
+            builder.sim_actuator(f"{self.name}_torque", simulated.GetInputPort("torque"), raises_at_nan=True)
         elif self._has_torque:
             nothing = builder.add("act", f"{self.name}_torque", ConstantVectorSource(np.zeros(self._size)))
             builder.connect(nothing.get_output_port(), simulated.GetInputPort("torque"))
 
-    def status(self) -> LcmMap:
+    def status(self, used: Collection[str]) -> LcmMap:
         fields = {
             f"{self.name}_position_measured": "joint_position_measured",
             f"{self.name}_velocity_estimated": "joint_velocity_estimated",
+            f"{self.name}_position_commanded": "joint_position_commanded",
             f"{self.name}_torque_commanded": "joint_torque_commanded",
             f"{self.name}_torque_measured": "joint_torque_measured",
             f"{self.name}_torque_external": "joint_torque_external",
         }
+        fields = {name: path for name, path in fields.items() if name in used}
         channel = f"IIWA_STATUS{self._suffix}"
         if self._has_position:
-            return iiwa_status(
-                {**fields, f"{self.name}_position_commanded": "joint_position_commanded"}, channel=channel
-            )
+            return iiwa_status(fields, channel=channel)
         on_top = {f"{self.name}_torque_added": "joint_torque_measured", self._reported: "joint_torque_commanded"}
         return iiwa_status(fields, on_top=on_top, gravity=gravity_compensation(self.model), channel=channel)
 
@@ -330,26 +335,33 @@ class Gripper(StationDriver):
         ]
         self._force = force
         self.optional = frozenset({f"{name}_force_limit"})
+        self.needed = frozenset({f"{name}_position_measured"})
 
     def connect(self, builder: VirtualTestbedBuilder, simulated: System, used: Collection[str]) -> None:
         state = builder.add("sense", f"{self.name}_state", Demultiplexer(2, 1))
         builder.connect(simulated.GetOutputPort("state_measured"), state.get_input_port())
-        builder.sim_sensor(f"{self.name}_position_measured", state.get_output_port(0))
-        builder.sim_sensor(f"{self.name}_velocity_measured", state.get_output_port(1))
-        builder.sim_sensor(f"{self.name}_force_measured", simulated.GetOutputPort("force_measured"))
-        builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"))
+        ports = {
+            f"{self.name}_position_measured": state.get_output_port(0),
+            f"{self.name}_velocity_measured": state.get_output_port(1),
+            f"{self.name}_force_measured": simulated.GetOutputPort("force_measured"),
+        }
+        for name, port in ports.items():
+            if name in used:
+                builder.sim_sensor(name, port)
+        builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"), raises_at_nan=True)
         if f"{self.name}_force_limit" in used:
-            builder.sim_actuator(f"{self.name}_force_limit", simulated.GetInputPort("force_limit"))
+            builder.sim_actuator(f"{self.name}_force_limit", simulated.GetInputPort("force_limit"), raises_at_nan=True)
         else:
             limit = builder.add("act", f"{self.name}_force_limit", ConstantVectorSource([self._force]))
             builder.connect(limit.get_output_port(), simulated.GetInputPort("force_limit"))
 
-    def status(self) -> LcmMap:
+    def status(self, used: Collection[str]) -> LcmMap:
         fields = {
             f"{self.name}_position_measured": "actual_position_mm",
             f"{self.name}_velocity_measured": "actual_speed_mm_per_s",
             f"{self.name}_force_measured": "actual_force",
         }
+        fields = {name: path for name, path in fields.items() if name in used}
         return wsg_status(fields, channel=f"SCHUNK_WSG_STATUS{self._suffix}")
 
     def command(self, used: Collection[str]) -> LcmMap:

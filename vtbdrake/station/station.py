@@ -17,7 +17,7 @@ from pydrake.manipulation import IiwaDriver, ZeroForceDriver
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
-from pydrake.systems.primitives import PassThrough
+from pydrake.systems.primitives import Multiplexer
 
 from vtbdrake.argument_checks import suggestion
 from vtbdrake.deployment import Deployment, Runtime
@@ -186,22 +186,23 @@ class Station(HardwareSimScenario):
         return system
 
     def make_dps(self) -> Diagram:
-        """Return the DPS: ``impl``, and an end for each sensor signal that it does not read."""
+        """Return the DPS: ``impl``, and an end for the sensor signals that it does not read."""
         interface, builder = self.interface(), DiagramBuilder()
         impl = builder.AddNamedSystem("impl", self.make_impl())
+        unread = [signal for signal in interface.sense if not impl.HasInputPort(signal.name)]
         for signal in [*interface.sense, *interface.commands]:
-            if impl.HasInputPort(signal.name):
+            if signal not in unread:
                 builder.ExportInput(impl.GetInputPort(signal.name), signal.name)
-            else:
-                assert signal.size is not None
-                unread = builder.AddNamedSystem(f"unread_{signal.name}", PassThrough(signal.size))
-                builder.ExportInput(unread.get_input_port(), signal.name)
+        if unread:
+            end = builder.AddNamedSystem("unread", Multiplexer([signal.size or 1 for signal in unread]))
+            for index, signal in enumerate(unread):
+                builder.ExportInput(end.get_input_port(index), signal.name)
         for signal in interface.act:
             builder.ExportOutput(impl.GetOutputPort(signal.name), signal.name)
         return builder.Build()
 
     def interface(self) -> Interface:
-        """Return the signals of the drivers, the images that the DPS reads, and its commands.
+        """Return the sensor signals that the DPS reads or its deployment needs, the actuator signals, the commands.
 
         Raises:
             ScenarioError: The ports of the DPS do not fit the file.
@@ -214,7 +215,8 @@ class Station(HardwareSimScenario):
     def _fitted(self, contents: _Contents, impl: System) -> Interface:
         inputs = [impl.get_input_port(i).get_name() for i in range(impl.num_input_ports())]
         outputs = [impl.get_output_port(i).get_name() for i in range(impl.num_output_ports())]
-        sensors = [signal for driver in contents.drivers for signal in driver.sense]
+        needed = {name for driver in contents.drivers for name in driver.needed}
+        sensors = [s for driver in contents.drivers for s in driver.sense if s.name in needed or s.name in inputs]
         sensors += [signal for camera in contents.cameras.values() for signal in camera.sense if signal.name in inputs]
         offered = [signal.name for sender in contents.senders for signal in sender.sense]
         for name in inputs:
@@ -250,14 +252,13 @@ class Station(HardwareSimScenario):
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         contents = self._read()
         interface = builder.interface
-        commanded = {signal.name for signal in interface.act}
-        read = {signal.name for signal in interface.sense}
+        used = {signal.name for signal in (*interface.sense, *interface.act)}
         simulated = self.add_drivers(builder, self.add_models(builder))
         for driver in contents.drivers:
-            driver.connect(builder, simulated[driver.name], commanded)
-        cameras = self._read_cameras(contents, read)
+            driver.connect(builder, simulated[driver.name], used)
+        cameras = self._read_cameras(contents, used)
         for key, system in self.add_cameras(builder, only=cameras).items():
-            cameras[key].connect(builder, system, read)
+            cameras[key].connect(builder, system, used)
 
     @staticmethod
     def _read_cameras(contents: _Contents, read: Collection[str]) -> dict[str, CameraImages]:
@@ -275,7 +276,7 @@ class Station(HardwareSimScenario):
         commanded = [signal.name for signal in interface.act]
         read = [signal.name for signal in interface.sense]
         pacer = next((driver for driver in contents.drivers if isinstance(driver, Arm)), contents.drivers[0])
-        sense = [(driver.status(), driver.period, driver.name) for driver in contents.drivers]
+        sense = [(driver.status(read), driver.period, driver.name) for driver in contents.drivers]
         cameras = self._read_cameras(contents, read)
         sense += [(camera.images(read), camera.period, key) for key, camera in cameras.items()]
         self._check_channels([(map.channel, name) for map, _, name in sense])

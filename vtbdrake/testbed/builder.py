@@ -76,6 +76,7 @@ class VirtualTestbedBuilder:
         self._dps: System | None = None
         self.sensors: dict[str, OutputPort] = {}
         self.actuators: dict[str, InputPort] = {}
+        self._raising: set[str] = set()  # actuator signals whose systems raise where a command is NaN
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
         self.belief_rules: list[BeliefRule] = []
@@ -155,8 +156,17 @@ class VirtualTestbedBuilder:
         """Offer ``port`` as the simulated sensor signal ``name``."""
         self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort)
 
-    def sim_actuator(self, name: str, port: InputPort) -> None:
-        """Lead the actuator signal ``name`` to ``port`` of the simulated world."""
+    def sim_actuator(self, name: str, port: InputPort, *, raises_at_nan: bool = False) -> None:
+        """Lead the actuator signal ``name`` to ``port`` of the simulated world.
+
+        Args:
+            name: The actuator signal of the interface.
+            port: The port that gets its commands.
+            raises_at_nan: Whether what lies behind the port raises an exception at a command of NaN, as a plant does.
+                Else, a check is added where a command that is not finite would stop the integration.
+        """
+        if raises_at_nan:
+            self._raising.add(name)
         self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort)
 
     def command(self, name: str, port: OutputPort) -> None:
@@ -328,7 +338,7 @@ class VirtualTestbedBuilder:
             self.plant.Finalize()
 
     def _guarded_commands(self) -> dict[str, bool]:
-        """Return the actuator signals whose commands are checked -> whether they enter a plant, which refuses NaN.
+        """Return the actuator signals whose commands are checked -> whether what they enter, as a plant, refuses NaN.
 
         NaN and infinity make the time derivatives of a continuous world useless, and an integrator with error control
         then shortens its step without end, in a loop that nothing can interrupt; CENIC raises instead.
@@ -337,7 +347,7 @@ class VirtualTestbedBuilder:
         if not (continuous and controls_error(self.simulator_config)):
             return {}
         vectors = [signal.name for signal in self.interface.act if signal.is_vector]
-        return {name: is_plant(self.actuators[name].get_system()) for name in vectors}
+        return {name: name in self._raising or is_plant(self.actuators[name].get_system()) for name in vectors}
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
+import numpy as np
 from pydrake.manipulation import (
     MakeMultibodyForceToWsgForceSystem,
     MakeMultibodyStateToWsgStateSystem,
-    SchunkWsgController,
     SchunkWsgDriver,
 )
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import BasicVector, Context, ContinuousState, Diagram, DiagramBuilder
 
 from vtbdrake.state import AddressedSystem, Quantity
 
@@ -29,58 +30,55 @@ def simulated_gripper(config: SchunkWsgDriver) -> Diagram:
     """Return a Schunk WSG's control as Drake simulates it, without its messages.
 
     Its input ports are ``position`` (the desired distance of the fingers in m), ``force_limit`` (N), and the plant's
-    ``state`` and ``generalized_contact_forces``. Its output ports are ``actuation``, ``state_measured`` (distance of
-    the fingers and its speed, in m and m/s) and ``force_measured`` (N, never negative).
+    ``state`` and ``generalized_contact_forces``; commands that are not finite raise a ValueError. Its output ports are
+    ``actuation``, ``state_measured`` (distance of the fingers and its speed, in m and m/s) and ``force_measured`` (N,
+    never negative).
     """
     builder = DiagramBuilder()
-    motion = builder.AddNamedSystem("motion", SchunkWsgMotion())
-    # The controller inside of Drake's driver, of C++ systems alone: its state is in the Context.
-    drakes = SchunkWsgController(*config.pid_gains)
-    (controller,) = (part.Clone() for part in drakes.GetSystems() if part.HasInputPort("desired_grip_state"))
-    controller.set_name("controller")
-    builder.AddSystem(controller)
-    builder.Connect(motion.GetOutputPort("target"), controller.GetInputPort("desired_grip_state"))
-    builder.Connect(motion.GetOutputPort("max_force"), controller.GetInputPort("max_force"))
-    builder.ExportInput(motion.GetInputPort("desired_position"), "position")
-    builder.ExportInput(motion.GetInputPort("force_limit"), "force_limit")
+    kind = SchunkWsgIntegralControl if config.pid_gains[1] else SchunkWsgControl
+    control = builder.AddNamedSystem("control", kind(*config.pid_gains))
+    for port in ("position", "force_limit"):
+        builder.ExportInput(control.GetInputPort(port), port)
     measured = builder.AddNamedSystem("state_measured", MakeMultibodyStateToWsgStateSystem())
     force = builder.AddNamedSystem("force_measured", MakeMultibodyForceToWsgForceSystem())
-    state = builder.ExportInput(motion.GetInputPort("state"), "state")
-    builder.ConnectInput(state, controller.GetInputPort("joint_state"))
+    state = builder.ExportInput(control.GetInputPort("state"), "state")
     builder.ConnectInput(state, measured.get_input_port())
     builder.ExportInput(force.get_input_port(), "generalized_contact_forces")
-    builder.ExportOutput(controller.GetOutputPort("control"), "actuation")
+    builder.ExportOutput(control.get_output_port(), "actuation")
     builder.ExportOutput(measured.get_output_port(), "state_measured")
     builder.ExportOutput(force.get_output_port(), "force_measured")
     return builder.Build()
 
 
-class SchunkWsgMotion(AddressedSystem):
-    """Ramps the grip position of a gripper to its target, by the arithmetic of Drake's `SchunkWsgTrajectoryGenerator`.
+class SchunkWsgControl(AddressedSystem):
+    """Moves the two fingers of a gripper, by the arithmetic of Drake's `SchunkWsgController`.
 
     .. pydrake_system::
 
-        name: SchunkWsgMotion
+        name: SchunkWsgControl
         input_ports:
-        - desired_position
+        - position
         - force_limit
         - state
         output_ports:
-        - target
-        - max_force
+        - actuation
 
-    The ports have sizes 1, 1, 4, 2 and 1. The grip position g = q0 - q1 is minus the distance of the fingers, and
-    ``target`` is [g, dg/dt]. Every 50 ms, a desired position that has changed by more than 0.1 mm begins a new motion
-    from twice the present position of finger 0, at no speed: up to 0.42 m/s with 5 m/s^2.
+    The ports have sizes 1, 1, 4 and 2. With the positions q0 and q1 of the fingers, a PD controller each keeps their
+    mean m = (q0 + q1) / 2 at zero and moves the grip g = q0 - q1, minus the distance of the fingers, along a ramp; the
+    force of the second is limited to half of the force limit in both directions. Every 50 ms, a desired position that
+    has changed by more than 0.1 mm begins a new ramp from 2 q0, at no speed: up to 0.42 m/s with 5 m/s^2.
 
-    Drake's system keeps its motion in itself, where no copy of a context can find it; here it is state.
+    Drake's system keeps the ramp in itself, where no copy of a context can find it; here it is state. And it integrates
+    the errors, whose derivatives evaluate the ramp several times per step, also if their gain is zero: see
+    `SchunkWsgIntegralControl`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kp: float, ki: float, kd: float) -> None:
         super().__init__()
-        self.DeclareVectorInputPort("desired_position", 1)
-        self.DeclareVectorInputPort("force_limit", 1)
-        self.DeclareVectorInputPort("state", 4)
+        self._position_port = self.DeclareVectorInputPort("position", 1)
+        self._force_port = self.DeclareVectorInputPort("force_limit", 1)
+        self._state_port = self.DeclareVectorInputPort("state", 4)
+        self._gains = float(kp), float(ki), float(kd)
         self._motion = self.declare_discrete_state(
             last_position=Quantity(0.0, "m"),
             max_force=Quantity(0.0, "N"),
@@ -89,32 +87,62 @@ class SchunkWsgMotion(AddressedSystem):
             target_position=Quantity(0.0, "m"),
             start_time=Quantity(0.0, "s"),
         )
-        state = self.discrete_state_ticket(self._motion.index)
-        self.DeclareVectorOutputPort("target", 2, self._calc_target, {state, self.time_ticket()})
-        self.DeclareVectorOutputPort("max_force", 1, self._calc_max_force, {state})
+        motion = self.discrete_state_ticket(self._motion.index)
+        self.DeclareVectorOutputPort(
+            "actuation",
+            2,
+            self._calc_actuation,
+            {motion, self.time_ticket(), self.xc_ticket(), self._state_port.ticket()},
+        )
         self.timings = ((_PERIOD, 0.0),)
         self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
 
     def _update(self, context: Context, discrete: Any) -> None:
         before, after = self._motion.view(context), self._motion.mutable(discrete)
-        target = -float(self.GetInputPort("desired_position").Eval(context)[0])
-        position = 2.0 * float(self.GetInputPort("state").Eval(context)[0])
+        target, limit = -float(self._position_port.Eval(context)[0]), float(self._force_port.Eval(context)[0])
+        if not (isfinite(target) and isfinite(limit)):
+            raise ValueError(f"a gripper is commanded with finite numbers, not to {-target} m with {limit} N")
+        position = 2.0 * float(self._state_port.Eval(context)[0])
         after.last_position = position
-        after.max_force = float(self.GetInputPort("force_limit").Eval(context)[0])
+        after.max_force = limit
         if not before.moving or abs(before.target_position - target) > _SMALLEST_CHANGE:
             after.moving, after.start_position, after.target_position = 1.0, position, target
             after.start_time = context.get_time()
 
-    def _calc_target(self, context: Context, output: BasicVector) -> None:
-        motion = self._motion.view(context)
-        if motion.moving:
-            elapsed = context.get_time() - motion.start_time
-            output.SetFromVector(_ramp(elapsed, motion.start_position, motion.target_position))
-        else:
-            output.SetFromVector([motion.last_position, 0.0])
+    def _errors(self, context: Context) -> tuple[float, float, float, float, float]:
+        """Return the errors of mean and grip, those of their rates, and the force limit."""
+        last, limit, moving, start, target, start_time = self._motion.array(context).tolist()
+        grip, rate = _ramp(context.get_time() - start_time, start, target) if moving else (last, 0.0)
+        q0, q1, v0, v1 = self._state_port.Eval(context).tolist()
+        return -(0.5 * q0 + 0.5 * q1), grip - (q0 - q1), -(0.5 * v0 + 0.5 * v1), rate - (v0 - v1), limit
 
-    def _calc_max_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self._motion.view(context).max_force])
+    def _integrals(self, context: Context) -> tuple[float, float]:
+        """Return the integrals of the errors of mean and grip."""
+        return 0.0, 0.0
+
+    def _calc_actuation(self, context: Context, output: BasicVector) -> None:
+        kp, ki, kd = self._gains
+        mean, grip, mean_rate, grip_rate, limit = self._errors(context)
+        mean_integral, grip_integral = self._integrals(context)
+        mean_force = kp * mean + kd * mean_rate + ki * mean_integral
+        grip_force = min(max(kp * grip + kd * grip_rate + ki * grip_integral, -0.5 * limit), 0.5 * limit)
+        output.SetFromVector([0.5 * mean_force + grip_force, 0.5 * mean_force - grip_force])
+
+
+class SchunkWsgIntegralControl(SchunkWsgControl):
+    """A `SchunkWsgControl` with the integrals of the errors as continuous state."""
+
+    def __init__(self, kp: float, ki: float, kd: float) -> None:
+        super().__init__(kp, ki, kd)
+        self._integral = self.declare_continuous_state(integral=Quantity(np.zeros(2), "m s"))
+
+    def _integrals(self, context: Context) -> tuple[float, float]:
+        mean, grip = self._integral.view(context).integral
+        return mean, grip
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        mean, grip, *_ = self._errors(context)
+        derivatives.get_mutable_vector().SetFromVector([mean, grip])
 
 
 def _ramp(time: float, start: float, target: float) -> tuple[float, float]:
@@ -142,11 +170,9 @@ def _ramp(time: float, start: float, target: float) -> tuple[float, float]:
             (ramp_time + cruise_time, target - (ramp * sign), _MAX_SPEED * sign),
             (ramp_time + cruise_time + ramp_time, target, 0.0),
         ]
-    # As PiecewisePolynomial does: its segments are [t0, t1), and it is evaluated at its ends beyond them.
+    # As PiecewisePolynomial does: a part lasts until the next one begins, and beyond its ends the motion is constant.
     time = min(max(time, 0.0), knots[-1][0])
-    segment = 0
-    while segment < len(knots) - 2 and time >= knots[segment + 1][0]:
-        segment += 1
-    (t0, p0, v0), (t1, p1, v1) = knots[segment : segment + 2]
+    part = sum(begin <= time for begin, _, _ in knots[1:-1])
+    (t0, p0, v0), (t1, p1, v1) = knots[part : part + 2]
     dt, length = time - t0, t1 - t0
     return p0 + dt * ((p1 - p0) / length), v0 + dt * ((v1 - v0) / length)
