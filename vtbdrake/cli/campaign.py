@@ -99,17 +99,18 @@ def campaign(
     evidence: bool,
     running: dict[str, Any],
 ) -> None:
-    """Run the campaign of FILE: all its conditions with all its seeds, judged by its criteria.
+    """Run the campaign of FILE: how often does it work?
 
-    Rollouts are recorded in a study, so that the same command resumes a campaign that was interrupted or killed, or
-    that has got more seeds. The folder gets index.html, junit.xml, results.json, and of failures logs and animations.
-    FILE names functions and a scenario, whose code is run.
+    All conditions are simulated with all seeds, and judged by the criteria. Rollouts are recorded in a study, so that
+    the same command resumes a campaign that was interrupted or killed, or that has got more seeds. The folder gets
+    index.html, junit.xml, results.json, and of failures logs and animations. FILE names functions and a scenario, whose
+    code is run.
 
     The exit code is 0 if all criteria are met, 1 if not, 2 if the input cannot be used.
 
     \b
     Example:
-      vtbdrake campaign walking.yaml --workers 4 --against walking/baseline.db
+      vtbdrake campaign walking.yaml --workers 4 --against baseline.yaml
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     stated = Campaign.load(file)
