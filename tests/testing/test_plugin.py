@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,21 @@ def test_plugin_loads_nothing_of_drake():
     code = "import sys, vtbdrake.testing.plugin; print([m for m in sys.modules if m.partition('.')[0] == 'pydrake'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_checks_need_no_pytest():
+    code = """
+        import sys
+        sys.modules["pytest"] = None
+        from tests.testbeds import AcrobotScenario
+        from vtbdrake.testing import check_scenario
+        if __name__ == "__main__":
+            limits = {"check_signals_have_limits": "Drake's model of it has none"}
+            print(check_scenario(AcrobotScenario(), horizon=0.05, expected_failed_checks=limits).ok)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "True"
 
 
 def test_unknown_check_is_refused_with_the_nearest():

@@ -234,19 +234,6 @@ def test_there_is_no_belief_without_a_pose(drive: tuple[VirtualTestbed, list[Sca
         testbed.start_from_belief(testbed.default_context())
 
 
-def test_drive_continues_exactly_from_a_fork(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
-    testbed, _, _ = drive
-    context = testbed.default_context()
-    simulator = testbed.simulator(context)
-    simulator.AdvanceTo(0.53)
-    fork = testbed.fork(simulator)
-    other = testbed.default_context()
-    testbed.restore(other, fork)
-    testbed.simulator(other, restored=True).AdvanceTo(1.0)
-    simulator.AdvanceTo(1.0)
-    assert not testbed.snapshot(other).compare(testbed.snapshot(context))
-
-
 @pytest.mark.parametrize("make", [ForestScenario, PlainScenario])
 def test_detectors_have_the_angles_between_rays(make: type[CarrierScenario]) -> None:
     scanner, accuracy = make().scanner, make().scanner_accuracy()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from math import inf
-from pathlib import Path
 from typing import Any
 
 import lcm
@@ -21,7 +20,6 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
-from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
@@ -29,45 +27,6 @@ from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
 
 PATIENCE = 30.0  # s
-
-
-def commands(scenario: ManipulatorScenario, snapshot: Snapshot, *, alone: bool, cycles: int) -> np.ndarray:
-    """Torques, while the sensors tell of a motion about the arm's pose in the snapshot."""
-    at_rest = {signal.name: np.zeros(signal.size or 0) for signal in scenario.interface().sense}
-    pose = snapshot["dps.env.joint_position"]
-    torque = snapshot["dps.impl.torque"]
-
-    def sensors(t: float) -> dict[str, Any]:
-        swing = 0.01 * np.sin(20.0 * t + np.arange(7))
-        measured = {"joint_position": pose + swing, "joint_velocity": 5.0 * swing, "joint_torque_measured": torque}
-        return {**at_rest, **measured, "wrench": np.array([0.0, 0.0, 0.0, 1.0, 2.0, np.sin(9.0 * t)])}
-
-    clock = SimulatedClock()
-    bridge = ScriptedBridge(scenario.interface(), clock, sensors)
-    target = DpsAlone(scenario) if alone else scenario.build()
-    context = target.default_context()
-    target.restore(context, snapshot)
-    runtime: Runtime = Deployment.of(scenario, pace="").runtime(target, bridge, context=context, clock=clock)
-    bridge.poll()
-    runtime.switch("real")
-    runtime.run(cycles=cycles)
-    assert runtime.guards.latched == ()
-    return np.array([sent["joint_torque"] for _, sent in bridge.sent])
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_alone_from_a_snapshot_it_commands_what_the_whole_testbed_does(law: str, tmp_path: Path) -> None:
-    scenario = ManipulatorScenario(law=law)
-    testbed = scenario.build()
-    simulator = testbed.simulator()
-    testbed.write(simulator.get_mutable_context(), {"u.motion": float(Motion.CIRCLE)})
-    simulator.AdvanceTo(0.1)
-    testbed.snapshot(simulator.get_context()).save(tmp_path / "s")
-    snapshot = Snapshot.load(tmp_path / "s")
-    alone = commands(scenario, snapshot, alone=True, cycles=60)
-    whole = commands(scenario, snapshot, alone=False, cycles=60)
-    assert np.array_equal(alone, whole)
-    assert np.ptp(alone, axis=0).max() > 0.1
 
 
 def test_refused_reset_is_accepted_after_its_remedy() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,11 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake.testbed import ScenarioError, VirtualTestbed
+from vtbdrake.testing import Subject
+from vtbdrake.testing.checks.boundary import check_dps_alone_commands_the_same, check_dps_cannot_tell_the_switch
+from vtbdrake.testing.checks.scenario import check_yaml_round_trip
+from vtbdrake.testing.checks.signals import check_parameters_have_bounds, check_variables_do_not_overlap
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
@@ -55,12 +60,6 @@ def test_bad_fields_are_refused(fields: dict, message: str) -> None:
         ManipulatorScenario(**fields).build()
 
 
-def test_scenario_comes_back_from_its_file(tmp_path: Path) -> None:
-    scenario = rough()
-    scenario.save(tmp_path / "arm.yaml")
-    assert load_scenario(tmp_path / "arm.yaml") == scenario
-
-
 def test_signals_fit_the_robots_messages() -> None:
     interface = ManipulatorScenario().interface()
     assert [(s.name, s.size) for s in interface.sense] == [*((name, 7) for name in SIGNALS[:3]), ("wrench", 6)]
@@ -87,29 +86,19 @@ def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_dps_cannot_tell_real_from_sim(law: str) -> None:
-    """The same values through the real ports give the same commands, whatever the simulated world does meanwhile."""
-    testbed = rough(law).build()
-    context = start(testbed, Motion.SWING)
-    simulator = testbed.simulator(context)
-    sensed, commanded = [], []
-    for k in range(200):
-        sensed.append({name: testbed.read(context, f"T_sense.{name}.value") for name in SIGNALS})
-        simulator.AdvanceTo((k + 1) * T)
-        commanded.append(testbed.read(context, "dps.joint_torque"))
-
-    real = start(testbed, Motion.SWING)
-    testbed.write(real, {"sim.sys.arm.joint_2.position": 0.0})
-    for name in SIGNALS:
-        testbed.diagram.GetInputPort(f"real.sense.{name}").FixValue(real, sensed[0][name])
-    testbed.switch(real, "real")
-    simulator = testbed.simulator(real)
-    for k in range(200):
-        for name in SIGNALS:
-            testbed.diagram.GetInputPort(f"real.sense.{name}").FixValue(real, sensed[k][name])
-        simulator.AdvanceTo((k + 1) * T)
-        command = testbed.diagram.GetOutputPort("real.act.joint_torque").Eval(real)
-        assert command.tobytes() == commanded[k].tobytes()
+@pytest.mark.parametrize(
+    "check",
+    [
+        check_yaml_round_trip,
+        check_parameters_have_bounds,
+        check_variables_do_not_overlap,
+        check_dps_cannot_tell_the_switch,
+        check_dps_alone_commands_the_same,
+    ],
+    ids=lambda check: check.__name__,
+)
+def test_every_law_passes_with_every_error(law: str, check: Callable[[Subject], None]) -> None:
+    check(Subject(rough(law), values={"u.motion": float(Motion.SWING), "sim.act.drives.delay": 2.0}, horizon=0.2))
 
 
 def test_simulated_arm_starts_from_what_the_dps_perceives() -> None:

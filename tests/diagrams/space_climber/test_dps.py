@@ -77,19 +77,6 @@ def test_stands_still_from_the_start() -> None:
         np.testing.assert_allclose(dps.get_output_port().Eval(simulator.get_context()), STANCE, atol=1e-12)
 
 
-def test_copied_contexts_continue_alike() -> None:
-    dps = make_dps(period=PERIOD)
-    imu = [0.01, -0.02, 0.03, 0.1, 0.05, 1.6]
-    first = Simulator(dps, fixed(dps, walk=[1.0], imu=imu))
-    first.AdvanceTo(1.0)
-    second = Simulator(dps, first.get_context().Clone())
-    outputs = []
-    for simulator in (first, second):
-        simulator.AdvanceTo(2.0)
-        outputs.append(dps.get_output_port().Eval(simulator.get_context()))
-    np.testing.assert_array_equal(*outputs)
-
-
 def test_low_pass_reaches_63_percent_after_its_time_constant() -> None:
     dps = make_dps(period=PERIOD)
     context = fixed(dps, imu=[1.0, 0, 0, 0, 0, 1.62])

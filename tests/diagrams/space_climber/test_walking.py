@@ -97,11 +97,6 @@ def test_walk_command_of_zero_stands() -> None:
     np.testing.assert_allclose(track.position[-1, :2], 0.0, atol=1e-3)
 
 
-def test_repeats_bit_for_bit() -> None:
-    first, second = (simulate(duration=2.0, gravity=3.71) for _ in range(2))
-    np.testing.assert_array_equal(first.position, second.position)
-
-
 def test_an_imu_that_is_mounted_askew_feels_gravity_askew() -> None:
     testbed = SpaceClimberScenario(payload=False).build()
     root = testbed.default_context()

@@ -35,7 +35,7 @@ from vtbdrake.testing.subject import Subject
 def check_simulates(subject: Subject) -> None:
     """Check that the first part of a simulation does not fail.
 
-    The error is that of the system that raised, or says that the state has become infinite or NaN: look at the
+    The error is that of the system that raised, or says that the state has become infinite or NaN. Look at the
     integrator, at its step, and at units.
     """
     subject.testbed  # noqa: B018

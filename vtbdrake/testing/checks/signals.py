@@ -98,7 +98,8 @@ def check_parameters_have_bounds(subject: Subject) -> None:
 def check_variables_do_not_overlap(subject: Subject) -> None:
     """Check that no two variables lie in one place of the Context.
 
-    Setting one of them would silently set the other: two systems or two declarations name the same numbers.
+    Setting one of them would silently set the other. Give every number one name: a declaration of part of a group, and
+    one of the whole, are two.
     """
     addresses: dict[tuple[str, str, int, int], str] = {}
     problems = []
@@ -116,8 +117,8 @@ def check_variables_do_not_overlap(subject: Subject) -> None:
 def check_values_fit_their_signals(subject: Subject) -> None:
     """Check that simulated measurements and the DPS's commands keep the types, sizes and limits of their signals.
 
-    On the machine, guards reject what does not: a simulated sensor that shows more than the real one ever could, or a
-    DPS that commands more than the actuator can, has been developed in another world.
+    On the machine, guards reject measurements outside, and cut commands: a DPS that lives on either was developed in
+    another world. Limit the command in the DPS, and let the simulated sensor saturate as the real one does.
     """
     testbed = subject.testbed
     for t, sensed, commanded in subject.signal_values(testbed):
