@@ -371,6 +371,7 @@ SMALL = STATED["criteria"]["small angle"]
         ({"seeds": {"count": 3}}, "3 seeds change nothing"),
         ({"seeds": {"count": 0, "set": [RATE]}}, "count must be a whole number of at least 1, not 0"),
         ({"seeds": {"set": ["nowhere"], "count": 2}}, "nowhere"),
+        ({"seeds": {"draw": "builtins:draw"}}, "builtins has no function 'draw'"),
         ({"seeds": {"draw": "builtins:len"}}, "builtins:len(0) raises TypeError"),
         ({"seeds": {"draw": "builtins:abs"}}, "returns {address: value}, not 0"),
         ({"horizon": "long"}, "horizon must be a finite number above 0 s, not 'long'"),

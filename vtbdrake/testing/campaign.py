@@ -122,6 +122,11 @@ class Seeds:
         "", "A function package.module:function of the seed that returns what is set, {address: value}, instead."
     )
 
+    @property
+    def numbers(self) -> range:
+        """Return all seeds."""
+        return range(self.first, self.first + self.count)
+
 
 @dataclass
 class Stop:
@@ -198,8 +203,7 @@ class Campaign:
     @property
     def rollout_names(self) -> list[RolloutName]:
         """Return condition and seed of all rollouts; further seeds come behind."""
-        seeds = range(self.seeds.first, self.seeds.first + self.seeds.count)
-        return [(name, seed) for seed in seeds for name in self.conditions]
+        return [(name, seed) for seed in self.seeds.numbers for name in self.conditions]
 
     @cached_property
     def problem(self) -> Problem:
@@ -241,7 +245,7 @@ class Campaign:
     def _all_values(self) -> list[dict[str, Any]]:
         """Return what each rollout sets, address -> value."""
         _, common = split(self.values)
-        by_seed = {seed: self._seed_values(seed) for _, seed in self.rollout_names}
+        by_seed = {seed: self._seed_values(seed) for seed in self.seeds.numbers}
         all_values = []
         for name, seed in self.rollout_names:
             condition = {**common, **self.conditions[name]}
@@ -255,8 +259,9 @@ class Campaign:
     def _seed_values(self, seed: int) -> dict[str, Any]:
         if not self.seeds.draw:
             return dict.fromkeys(self.seeds.set, seed)
+        draw = named_function(self.seeds.draw)
         try:
-            drawn = named_function(self.seeds.draw)(seed)
+            drawn = draw(seed)
         except FAILURES as error:
             raise CampaignError(f"seeds.draw: {self.seeds.draw}({seed}) raises {error_text(error)}") from error
         if not isinstance(drawn, Mapping):
@@ -436,10 +441,9 @@ class Campaign:
             CampaignError: There is no such rollout.
         """
         if (condition, seed) not in self.rollout_names:
-            first, last = self.seeds.first, self.seeds.first + self.seeds.count - 1
             raise CampaignError(
                 f"there is no rollout {condition}/{seed}: the conditions are {', '.join(self.conditions)}, the seeds "
-                f"{first} to {last}"
+                f"{self.seeds.numbers[0]} to {self.seeds.numbers[-1]}"
             )
         problem, addresses = self.problem, [a for c in self.criteria.values() for a in c.addresses]
         state = [_PLANT_STATE] if problem.testbed.plant is not None else []

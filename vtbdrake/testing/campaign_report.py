@@ -206,7 +206,7 @@ def html_page(
     summary = (
         f"{met} of {len(judged)} requirements met. {passed_text(result)}. {result.count} of {len(result.rollouts)} "
         f"rollouts of <code>{html.escape(campaign.scenario)}</code>: {len(campaign.conditions)} conditions, seeds "
-        f"{campaign.seeds.first} to {campaign.seeds.first + campaign.seeds.count - 1}."
+        f"{campaign.seeds.numbers[0]} to {campaign.seeds.numbers[-1]}."
     )
     sections = [
         f'<h1>{title} <span class="{word}">{"met" if result.is_met else "not met"}</span></h1><p>{summary}</p>',

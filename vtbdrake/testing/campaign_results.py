@@ -246,14 +246,13 @@ class CampaignResult:
     def to_dict(self, *, comparisons: Sequence[Comparison] = ()) -> dict[str, Any]:
         """Return the results as plain data, which do not depend on when and where the rollouts were run."""
         campaign = self.campaign
-        seeds = range(campaign.seeds.first, campaign.seeds.first + campaign.seeds.count)
         return {
             "campaign": campaign.path.name,
             "scenario": campaign.scenario,
             "met": self.is_met,
             "complete": self.is_complete,
             "conditions": _finite(campaign.conditions),
-            "seeds": [seeds.start, seeds[-1]],
+            "seeds": [campaign.seeds.numbers[0], campaign.seeds.numbers[-1]],
             "criteria": {name: asdict(criterion) for name, criterion in campaign.criteria.items()},
             "cells": [cell.to_dict() for cell in self.cells()],
             "rollouts": [{**asdict(rollout), "status": self.status(rollout)} for rollout in self.rollouts],
