@@ -85,7 +85,7 @@ def test_nan_is_out_of_bounds() -> None:
 def test_assertion_without_content_is_an_error() -> None:
     with pytest.raises(ValueError, match="give lower= or upper="):
         assert_bounded(ramp(), "x")
-    with pytest.raises(TraceError, match="no sample after 2 s"):
+    with pytest.raises(TraceError, match="x has no value 2 s after the first sample, or later"):
         assert_bounded(ramp(), "x", upper=1.0, after=2.0)
     with pytest.raises(TraceError, match="z has not been recorded"):
         assert_bounded(ramp(), "z", upper=1.0)
@@ -258,6 +258,21 @@ def test_log_is_a_trace(log: Path) -> None:
     assert_settles(read_log(log), "sent.velocity", to=[0.05, 0.0], within=29 * PERIOD, tolerance=1e-12)
     text = failure(lambda: assert_bounded(log, "dps.seen", lower=1.0))
     assert "dps.seen[0] leaves its bounds" in text
+
+
+def test_nothing_is_asserted_where_nothing_was_commanded(log: Path) -> None:
+    """The first ten cycles have no command."""
+    assert np.isnan(read_log(log).sent["velocity"][:10]).all()
+    assert_bounded(log, "sent.velocity", lower=0.0, upper=1.0)
+    text = failure(lambda: assert_bounded(log, "act.velocity", upper=[0.0, 1.0]))
+    assert "act.velocity[0] leaves its bounds at t = 0.001 s: 0.05 m/s" in text
+
+
+def test_nan_that_was_commanded_is_a_value(log: Path) -> None:
+    recorded = read_log(log)
+    recorded.actuation["velocity"][20] = np.nan
+    text = failure(lambda: assert_bounded(recorded, "act.velocity", upper=1.0))
+    assert "nan m/s instead of a number" in text
 
 
 def test_log_replays_and_a_changed_dps_does_not(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,7 +50,7 @@ def assert_bounded(
         raise ValueError(f"give lower= or upper= of {address}: nothing is asserted without bounds")
     trace = trace_of(source, address)
     values = trace[address]
-    asserted = _from(trace, after)
+    asserted = _from(trace, address, after)
     wrong = ~((values >= np.asarray(lower)) & (values <= np.asarray(upper)))
     place = _first(wrong, asserted)
     if place is None:
@@ -82,7 +82,7 @@ def assert_settles(source: Source, address: str, *, to: ArrayLike, within: float
     __tracebackhide__ = True
     trace = trace_of(source, address)
     values = trace[address]
-    asserted = _from(trace, within)
+    asserted = _from(trace, address, within)
     wrong = ~(np.abs(values - np.asarray(to)) <= np.asarray(tolerance))
     place = _first(wrong, asserted)
     if place is None:
@@ -369,12 +369,14 @@ def _statistics(source: Runtime | LoopStatistics | MachineStatistics) -> LoopSta
     return statistics
 
 
-def _from(trace: Trace, after: float) -> np.ndarray:
-    """Return which samples lie at least ``after`` seconds behind the first one, shape (n,)."""
-    if not len(trace.times) or trace.times[-1] - trace.times[0] < after - 1e-9:
-        length = trace.times[-1] - trace.times[0] if len(trace.times) else 0.0
-        raise TraceError(f"there are {length:g} s only, and no sample after {after:g} s: nothing is asserted")
-    return trace.times - trace.times[0] >= after - 1e-9
+def _from(trace: Trace, address: str, after: float) -> np.ndarray:
+    """Return which samples have a value and lie at least ``after`` seconds behind the first one, shape (n,)."""
+    asserted = trace.times - trace.times[:1] >= after - 1e-9
+    if address in trace.absent:
+        asserted = asserted & ~trace.absent[address]
+    if not asserted.any():
+        raise TraceError(f"{address} has no value {after:g} s after the first sample, or later: nothing is asserted")
+    return np.asarray(asserted)
 
 
 def _first(wrong: np.ndarray, asserted: np.ndarray) -> tuple[int, ...] | None:

@@ -168,7 +168,7 @@ class Phase:
             self._run_cycle()
             sample()
         columns = {address: np.array([row[i] for row in rows]) for i, address in enumerate(addresses)}
-        return Trace(np.array(times), columns, units_of(runtime.target, addresses), self.log)
+        return Trace(np.array(times), columns, units_of(runtime.target, addresses), log=self.log)
 
     def _note(self, cycle: Cycle) -> None:
         self._cycle = cycle
@@ -208,8 +208,10 @@ class Phase:
         return runtime
 
     def _on_machine(self, stack: ExitStack) -> Runtime:
-        # The last message of the machine's cycle.
-        signal = self._deployment.pace or protocol_of(self.scenario).sense[-1].signals[0]
+        protocol = protocol_of(self.scenario)
+        # The last message that the machine sends in every cycle.
+        channels = [m for m in protocol.sense if protocol.periods.get(m.channel, 0.0) < 1.5 * self.period]
+        signal = self._deployment.pace or channels[-1].signals[0]
         deployment = self._deployment.in_lock_step(signal, wait=PATIENCE)
         hub = stack.enter_context(Hub(port=0))
         options = {**self._machine_options, "lock_step": True}

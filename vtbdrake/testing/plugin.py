@@ -11,13 +11,17 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pytest
+from vtbdrake.lazy import extra_module
 
 if TYPE_CHECKING:
+    import pytest
+
     from vtbdrake.machine import MachineProcess
     from vtbdrake.testbed import Scenario, VirtualTestbed
     from vtbdrake.testing.mutants import Mutant, MutationScore
     from vtbdrake.testing.phase import Phase
+else:
+    pytest = extra_module("pytest", purpose="the plugin", extra="testing")
 
 
 def parametrize_with_checks(

@@ -34,12 +34,15 @@ class Trace:
         times: Times in seconds, shape (n,).
         values: Values at these times by address, shape (n, ...).
         units: Units by address, where they are known.
+        absent: By address, at which times there is no value, shape (n,): nothing was received yet, or nothing was
+            commanded. Nothing is asserted there.
         log: The log of the loop that they come from, if there is one.
     """
 
     times: np.ndarray
     values: Mapping[str, np.ndarray]
     units: Mapping[str, str] = field(default_factory=dict)
+    absent: Mapping[str, np.ndarray] = field(default_factory=dict)
     log: Path | None = None
 
     def __getitem__(self, address: str) -> np.ndarray:
@@ -81,6 +84,7 @@ def trace_of(source: Source, addresses: str | Sequence[str]) -> Trace:
 def _of_log(log: ControlLog, addresses: Sequence[str]) -> Trace:
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
+    absent: dict[str, np.ndarray] = {}
     for side, recorded, signals in (
         ("sense", log.fed, log.header.sense),
         ("act", log.actuation, log.header.act),
@@ -88,10 +92,13 @@ def _of_log(log: ControlLog, addresses: Sequence[str]) -> Trace:
     ):
         values |= {f"{side}.{name}": numbers for name, numbers in recorded.items()}
         units |= {f"{side}.{signal.name}": signal.unit for signal in signals}
+        absent |= {f"{side}.{name}": np.isnan(numbers).all(axis=1) for name, numbers in recorded.items()}
+    # NaN that was commanded is a value.
+    absent |= {f"act.{name}": ~log.commanded[name] for name in log.actuation}
     others = [address for address in addresses if address not in values]
     if others:
         values |= replay(log, record=others).record
-    return Trace(log.times, values, units, log.path)
+    return Trace(log.times, values, units, absent, log.path)
 
 
 def reader_of(target: VirtualTestbed | DpsAlone, address: str) -> Callable[[Context], Any]:
