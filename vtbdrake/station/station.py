@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
 from math import inf
@@ -19,7 +20,6 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.argument_checks import suggestion
 from vtbdrake.deployment import Deployment, Runtime
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.settings import setting
@@ -118,7 +118,7 @@ class Station(HardwareSimScenario):
         for name, value in {**({"dps": dps} if dps else {}), **values}.items():
             names = [item.name for item in fields(self)]
             if name not in names:
-                raise ScenarioError(f"{type(self).__name__} has no field {name!r}{suggestion(name, names)}")
+                raise ScenarioError(f"{type(self).__name__} has no field {name!r}{_near(name, names)}")
             setattr(self, name, value)
 
     @classmethod
@@ -141,6 +141,15 @@ class Station(HardwareSimScenario):
         if "_contents" in self.__dict__:  # What has been read is not changed: both can use it.
             copied.__dict__["_contents"] = self.__dict__["_contents"]
         return copied
+
+    def validate(self) -> None:
+        """Check the fields, and the models and drivers that they describe.
+
+        Raises:
+            ScenarioError: A driver does not fit its model, or a model cannot be read.
+        """
+        super().validate()
+        self._read()
 
     def signals(self) -> dict[str, Signal]:
         """Return all signals that the drivers and the cameras of the file offer, by name."""
@@ -219,13 +228,6 @@ class Station(HardwareSimScenario):
         sensors = [s for driver in contents.drivers for s in driver.sense if s.name in needed or s.name in inputs]
         sensors += [signal for camera in contents.cameras.values() for signal in camera.sense if signal.name in inputs]
         offered = [signal.name for sender in contents.senders for signal in sender.sense]
-        for name in inputs:
-            if name not in offered and name not in self.commands:
-                raise ScenarioError(
-                    f"the DPS has an input port {name!r}, but {self.where('model_drivers')} offers no such sensor "
-                    f"signal{suggestion(name, offered)}: rename it, or declare it as a command, "
-                    f"commands={{{name!r}: StationCommand(default=[...])}}"
-                )
         modes = ", ".join(f"{driver.name} ({driver.mode})" for driver in contents.drivers) or "no driver"
         actuators = {signal.name: signal for signal in contents.actuators}
         for name in outputs:
@@ -243,6 +245,13 @@ class Station(HardwareSimScenario):
                         f"{', '.join(outputs) or 'none'}. Add it, change the control_mode, or make {driver.name} a "
                         "!ZeroForceDriver"
                     )
+        for name in inputs:
+            if name not in offered and name not in self.commands:
+                raise ScenarioError(
+                    f"the DPS has an input port {name!r}, but {self.where('model_drivers')} offers no such sensor "
+                    f"signal{_near(name, offered)}: rename it, or declare it as a command, "
+                    f"commands={{{name!r}: StationCommand(default=[...])}}"
+                )
         return Interface(
             sense=sensors,
             act=[signal for name, signal in actuators.items() if name in outputs],
@@ -313,9 +322,10 @@ class Station(HardwareSimScenario):
         """
         contents = self._read()
         cameras = self._read_cameras(contents, [signal.name for signal in self.interface().sense])
-        buses = {self._bus_name(self.model_drivers[driver.name].lcm_bus) for driver in contents.drivers}
-        buses |= {self._bus_name(self.cameras[key].lcm_bus) for key in cameras}
-        urls = {self.lcm_buses[bus].lcm_url or os.environ.get("LCM_DEFAULT_URL") or _DEFAULT_URL for bus in buses}
+        users: list[Any] = [self.model_drivers[driver.name] for driver in contents.drivers]
+        users += [self.cameras[key] for key in cameras]
+        default = os.environ.get("LCM_DEFAULT_URL") or _DEFAULT_URL
+        urls = {self._bus(user, self.where()).lcm_url or default for user in users}
         if len(urls) != 1 or next(iter(urls)).startswith("memq:"):
             raise ScenarioError(
                 f"{self.where('lcm_buses')}: the drivers are on {', '.join(sorted(urls)) or 'no bus'}, and a "
@@ -329,13 +339,13 @@ class Station(HardwareSimScenario):
         """Connect the DPS to the machine, see `Scenario.deploy`; by default on the bus of the file."""
         return super().deploy(url or self.url(), record=record, **options)
 
-    def _bus_name(self, name: str) -> str:
-        if name not in self.lcm_buses:
+    def _bus(self, user: Any, where: str) -> DrakeLcmParams:
+        """Return the bus of a driver or a camera."""
+        if user.lcm_bus not in self.lcm_buses:
             raise ScenarioError(
-                f"{self.where('lcm_buses')} has no bus {name!r}, which a driver or camera names; it has: "
-                f"{', '.join(self.lcm_buses) or 'none'}"
+                f"{where}: there is no bus {user.lcm_bus!r} in lcm_buses, but: {', '.join(self.lcm_buses) or 'none'}"
             )
-        return name
+        return self.lcm_buses[user.lcm_bus]
 
     def _read(self) -> _Contents:
         """Return what the fields describe; what was read before, if they are the same."""
@@ -356,14 +366,14 @@ class Station(HardwareSimScenario):
             where = self.where(f"model_drivers.{name}")
             if isinstance(driver, ZeroForceDriver):
                 continue
-            bus = self.lcm_buses[self._bus_name(driver.lcm_bus)]
+            bus = self._bus(driver, where)
             if isinstance(driver, IiwaDriver):
                 drivers.append(Arm(name, driver, plant, by_name, bus=bus, motion=motion, where=where))
             else:
                 drivers.append(Gripper(name, driver, plant, by_name, bus=bus, where=where))
         cameras = {
-            camera: CameraImages(config, bus=self.lcm_buses[self._bus_name(config.lcm_bus)])
-            for camera, config in self.cameras.items()
+            name: CameraImages(config, bus=self._bus(config, self.where(f"cameras.{name}")))
+            for name, config in self.cameras.items()
         }
         return _Contents(key, drivers, cameras)
 
@@ -384,6 +394,11 @@ class _Contents:
     @property
     def actuators(self) -> list[Signal]:
         return [signal for driver in self.drivers for signal in driver.act]
+
+
+def _near(name: str, names: Sequence[str]) -> str:
+    matches = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    return f"; did you mean {matches[0]}?" if matches else f"; there are: {', '.join(names) or 'none'}"
 
 
 def function_name(function: Callable[..., Any]) -> str:

@@ -272,6 +272,8 @@ def _remedy(error: str) -> str:
     """Return what to do about an error of Drake's parser."""
     if "does not exist" in error or "could not resolve" in error or "unknown package" in error:
         return "; correct the path in the file, or put the mesh or model there (package:// needs a ROS package.xml)"
+    if "unrecognized type" in error:
+        return "; Drake knows revolute, continuous, prismatic, fixed, floating, ball, planar and universal joints"
     return ""
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import Frame
     from pydrake.systems.framework import DiagramBuilder
+    from pydrake.systems.sensors import CameraConfig
 
     from vtbdrake.components.environment import Haze, Light
 
@@ -123,6 +125,7 @@ class Camera(AddressedSystem):
         X_FC: RigidTransform | None = None,
         clipping_near: float = 0.05,
         clipping_far: float = 200.0,
+        depth_range: tuple[float, float] = (0.0, inf),
         supersampling: int = 1,
         photon_noise: float = 0.0,
         stream: int | None = None,
@@ -140,6 +143,8 @@ class Camera(AddressedSystem):
             X_FC: Pose of the camera in F; by default the two are the same.
             clipping_near: Distance along z_C in metres below which nothing is seen.
             clipping_far: Distance along z_C in metres beyond which nothing is seen.
+            depth_range: The least and the largest distance along z_C in metres that the depth image tells: what is
+                closer is 0 in it, what is farther is infinite.
             supersampling: How many points across and down a pixel is the mean of.
             photon_noise: Standard deviation of the shot noise at full scale, in counts.
             stream: Number of the random stream, as in `SampledSensor`.
@@ -161,6 +166,8 @@ class Camera(AddressedSystem):
                 "Camera: clipping_near and clipping_far are distances in m, 0 < clipping_near < clipping_far, not "
                 f"{clipping_near!r} and {clipping_far!r}"
             )
+        if not 0.0 <= depth_range[0] < depth_range[1]:
+            raise ValueError(f"Camera: depth_range is two distances in m, the smaller one first, not {depth_range!r}")
         if not (supersampling >= 1 and supersampling == int(supersampling)):
             raise ValueError(f"Camera: supersampling is a whole number of points, at least 1, not {supersampling!r}")
         if not (isfinite(photon_noise) and photon_noise >= 0.0):
@@ -171,6 +178,7 @@ class Camera(AddressedSystem):
         self._width, self._height = info.width(), info.height()
         self._period, self._stream = float(period), random_stream(self, stream)
         self._clipping_near, self._clipping_far = float(clipping_near), float(clipping_far)
+        self._depth_range = float(depth_range[0]), float(depth_range[1])
         self._supersampling = int(supersampling)
         # The number of the frame, because the id of a plant keeps it alive.
         self._frame_number = plant.GetBodyFrameIdOrThrow(frame.body().index()).get_value()
@@ -219,6 +227,57 @@ class Camera(AddressedSystem):
             black = np.zeros((longest, self._height, self._width, 4), np.uint8)
             far = np.zeros((longest, self._height, self._width) if depth else (longest, 0, 0), np.float32)
             self._transit = self.DeclareAbstractState(Value(ImagesInTransit(black, far)))
+
+    @classmethod
+    def from_config(cls, config: CameraConfig, plant: MultibodyPlant, **options: Any) -> Self:
+        """Return the camera that Drake's config describes: size, intrinsics, pose, ranges, period and delay.
+
+        It is rendered as this class renders: ``renderer_name`` does not matter, and a light takes the place of the
+        lights of a ``renderer_class``.
+
+        Args:
+            config: The config; ``depth`` asks for a depth image.
+            plant: The plant with the base frame of its ``X_PB``.
+            options: Further arguments of the constructor, such as ``errors`` and ``supersampling``.
+
+        Raises:
+            ValueError: The config asks for something that this camera does not have.
+        """
+        from pydrake.geometry import RenderEngineVtkParams
+        from pydrake.multibody.parsing import GetScopedFrameByName
+
+        delay = config.output_delay * config.fps
+        X_BC, X_BD = config.X_BC.GetDeterministicValue(), config.X_BD.GetDeterministicValue()
+        is_vtk = config.renderer_class in ("", "RenderEngineVtk") or isinstance(
+            config.renderer_class, RenderEngineVtkParams
+        )
+        for refused, remedy in (
+            (config.label, "label images: set label to false, or take an RgbdSensorDiscrete"),
+            (config.capture_offset != 0.0, f"a capture_offset ({config.capture_offset:g} s): set it to 0"),
+            (abs(delay - round(delay)) > 1e-9, f"an output_delay of {delay:g} periods: give a whole number of periods"),
+            (not is_vtk, "this renderer_class: take RenderEngineVtk"),
+            (config.background != type(config)().background, "a background: leave it out"),
+            (config.depth and not X_BC.IsNearlyEqualTo(X_BD, 1e-12), "two poses: set X_BC and X_BD to the same"),
+        ):
+            if refused:
+                raise ValueError(f"the CameraConfig {config.name!r} asks a Camera for what it does not have: {remedy}")
+        if round(delay):
+            options["errors"] = replace(options.get("errors") or ErrorModel(), latency=round(delay))
+        color, depth = config.MakeCameras()
+        clipping, reach = color.core().clipping(), depth.depth_range()
+        base = config.X_PB.base_frame
+        return cls(
+            plant,
+            GetScopedFrameByName(plant, base) if base else plant.world_frame(),
+            period=1.0 / config.fps,
+            info=color.core().intrinsics(),
+            depth=config.depth,
+            X_FC=config.X_PB.GetDeterministicValue() @ X_BC,
+            clipping_near=clipping.near(),
+            clipping_far=clipping.far(),
+            depth_range=(reach.min_depth(), reach.max_depth()),
+            **options,
+        )
 
     @property
     def period(self) -> float:
@@ -285,7 +344,10 @@ class Camera(AddressedSystem):
             airlight = FULL_SCALE * illumination.exposure * haze.airlight
             veiled = hazed(expected, distance=distance, extinction=haze.extinction, airlight=airlight)
             expected = veiled.astype(np.float32)
-        return expected, depth if self._depth is not None else None
+        if depth is None or self._depth is None:
+            return expected, None
+        nearest, farthest = self._depth_range
+        return expected, np.where(depth < nearest, 0.0, np.where(depth > farthest, inf, depth)).astype(np.float32)
 
     def _check_outside(self, view: QueryObject, p_WC: NDArray[np.float64]) -> None:
         for signed_distance in view.ComputeSignedDistanceToPoint(p_WC, 0.0):
