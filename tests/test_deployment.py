@@ -19,6 +19,7 @@ from tests.machine.looking import LookingScenario
 from vtbdrake.control.bridge import Bridge, BridgeError
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import Hold, Silence
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment, DeploymentError
@@ -117,6 +118,18 @@ def test_signals_without_max_age_are_refused_outside_of_lock_step() -> None:
         deployment.check_interface(ageless)
     deployment.check_interface(interface)
     deployment.in_lock_step("speed").check_interface(ageless)
+
+
+@pytest.mark.parametrize("lock_step", [False, True])
+def test_samples_may_be_late_in_lock_step(lock_step: bool) -> None:
+    """The time of the machine stands still between two messages: its stamps say nothing about their way."""
+    deployment = Deployment(continuity=CONTINUITY, guards={"max_delay": {"speed": 0.01}})
+    guards = Machine(deployment.in_lock_step("speed") if lock_step else deployment).runtime.guards
+    faults: list[str] = []
+    for k, (sent, arrived) in enumerate([(100.0, 5.0), (100.01, 5.5)]):
+        sample = ReceivedSignal(value=np.array([0.3, 0.0]), sent=sent, arrived=arrived, count=k + 1)
+        faults += guards.sensor_faults("speed", arrived, sample)
+    assert ["is stale" in fault for fault in faults] == ([] if lock_step else [True])
 
 
 def test_signal_that_is_not_sent_in_every_cycle_is_refused_in_lock_step() -> None:

@@ -51,7 +51,7 @@ BELOW["lru"] = set()
 BELOW["drake_version"] = set()
 BELOW["state"].add("drake_version")
 BELOW["child_process"].add("drake_version")
-BELOW["project"] = {"state", "components", "failures"}
+BELOW["project"] = {"state", "testbed", "components", "station", "failures"}
 BELOW["visualization"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

@@ -67,7 +67,8 @@ class Deployment:
         released_by: Returns whether the machine behind a bridge confirms that it does without commands, see `Runtime`.
         pace: The sensor signal whose messages begin the cycles. If empty, the clock does.
         patience: The number of periods without such a message after which the clock begins a cycle.
-        check_age: False accepts sensor values of any age, for a machine whose time stops between two messages.
+        check_age: False accepts sensor values of any age and delay, for a machine whose time stops between two
+            messages.
         residuals: How measurements are compared with predictions.
     """
 
@@ -136,9 +137,11 @@ class Deployment:
                 )
 
     def _guards(self, interface: Interface) -> Guards:
+        options = dict(self.guards)
         if not self.check_age:
             interface = replace(interface, sense=[replace(signal, max_age=inf) for signal in interface.sense])
-        return Guards(interface, self.period, **self.guards)
+            options.pop("max_delay", None)
+        return Guards(interface, self.period, **options)
 
     def in_lock_step(self, signal: str, *, wait: float = 60.0) -> Self:
         """Return this deployment for a machine in lock-step, which waits for an actuator command in each cycle.

@@ -11,10 +11,8 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.studies.lighting import LightingScenario
 from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
-from vtbdrake_diagrams.station import HOME, ArmStation
 
 SIMULATED_TIME = "its messages tell the time of a simulation, which stands still when the machine is held up"
-NOT_SAMPLED = "Drake's drivers do not sample: beside them, the DPS sees the plant after its step of the same instant"
 
 # With what is set before a simulation, so that something moves.
 SCENARIOS = {
@@ -28,16 +26,10 @@ SCENARIOS = {
     ApproachScenario: {},
     ForestScenario: {},
     PlainScenario: {},
-    ArmStation: {"u.target": HOME + 0.1},
 }
 EXPECTED = {
     ManipulatorScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
     CartPoleScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
-    ArmStation: {
-        "check_dps_cannot_tell_the_switch": NOT_SAMPLED,
-        "check_dps_alone_commands_the_same": NOT_SAMPLED,
-        "check_late_samples_end_in_the_fallback": SIMULATED_TIME,
-    },
 }
 
 

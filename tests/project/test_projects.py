@@ -10,7 +10,8 @@ import pydrake
 import pytest
 
 from tests.cli.program import ROOT, error_of, run
-from vtbdrake.project import SMALL_ARM, read_robot, write_project
+from vtbdrake.project import SMALL_ARM, read_robot, read_station, write_project
+from vtbdrake_diagrams.station import FILE
 
 MODELS = Path(__file__).parent / "models"
 EXAMPLES = Path(pydrake.getDrakePath()) / "examples"
@@ -31,6 +32,8 @@ ROBOTS = {
     "desk": EXAMPLES / "kuka_iiwa_arm" / "models" / "desk" / "transcendesk55inch.sdf",
 }
 
+STATIONS = {"torque_station": "Torque", "position_station": "Position", "mixed_station": "PositionAndTorque"}
+
 
 @pytest.fixture(scope="module")
 def projects(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -38,6 +41,8 @@ def projects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("projects")
     for name, path in ROBOTS.items():
         write_project(folder, f"my_{name}", read_robot(path))
+    for name, key in STATIONS.items():
+        write_project(folder, f"my_{name}", read_station(f"{FILE}#{key}"))
     return folder
 
 
@@ -63,9 +68,9 @@ def test_projects_pass_ruff(projects: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("name", ["small_arm", "hand"])
+@pytest.mark.parametrize("name", ["small_arm", "hand", "torque_station"])
 def test_robots_hold_and_move_by_the_projects_tests(projects: Path, name: str) -> None:
-    check_tests_pass(projects / f"my_{name}", "-k", "holds or moves")
+    check_tests_pass(projects / f"my_{name}", "-k", "hold or move")
 
 
 def test_dps_of_a_project_drives_its_machine(projects: Path) -> None:
@@ -73,7 +78,7 @@ def test_dps_of_a_project_drives_its_machine(projects: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", [*ROBOTS, *STATIONS])
 def test_projects_pass_their_tests(projects: Path, name: str) -> None:
     check_tests_pass(projects / f"my_{name}")
 
@@ -109,6 +114,27 @@ def test_new_writes_a_project_and_says_what_is_assumed(tmp_path: Path) -> None:
     assert "assumed: effort, range, speed" in (tmp_path / "head" / "head" / "robot.py").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["head"]  # nothing else is left
     assert json.loads((tmp_path / "head" / "head.ipynb").read_text())["nbformat"] == 4
+
+
+@pytest.mark.one_python
+def test_new_writes_a_project_for_a_station(tmp_path: Path) -> None:
+    result = run("new", "lab", "--station", f"{FILE}#Torque", cwd=tmp_path)
+    assert result.exit_code == 0 and "station.yaml#Torque with iiwa, wsg" in result.stdout
+    models = tmp_path / "lab" / "lab" / "models"
+    names = {path.relative_to(models).as_posix() for path in models.rglob("*") if path.is_file()}
+    assert names == {
+        "package.xml",
+        "station.yaml",
+        *(f"models/{m}" for m in ("iiwa14.urdf", "wsg.sdf", "table.sdf")),
+    } | {"models/block.sdf"}
+
+
+@pytest.mark.one_python
+def test_stations_without_an_arm_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty.yaml").write_text("model_drivers: {}\n")
+    message = error_of("new", "lab", "--station", "empty.yaml", cwd=tmp_path)
+    assert "empty.yaml has no !IiwaDriver" in message and "--urdf" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["empty.yaml"]
 
 
 @pytest.mark.one_python

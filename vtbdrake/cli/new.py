@@ -12,7 +12,8 @@ from vtbdrake.cli.options import option
 @click.command()
 @click.argument("name")
 @option("--urdf FILE", "The robot: a URDF, SDF or MJCF file, or package://...  [default: a small arm]", name="file")
-def new(name: str, file: str | None) -> None:
+@option("--station FILE", "Instead of a robot, a station: a YAML file of Drake's hardware_sim, or FILE#KEY.")
+def new(name: str, file: str | None, station: str | None) -> None:
     """Write a project for a robot into the new folder NAME.
 
     It has a testbed with a controller that holds the robot, sensors, tests, an optimization of the gains, a run on a
@@ -21,17 +22,19 @@ def new(name: str, file: str | None) -> None:
     \b
     Example:
       vtbdrake new arm --urdf my_arm.urdf
+      vtbdrake new lab --station my_station.yaml#Demo
     """
-    from vtbdrake.project import SMALL_ARM, check_name, read_robot, resolve, write_project
+    from vtbdrake.project import SMALL_ARM, check_name, read_robot, read_station, resolve, write_project
 
+    if file and station:
+        raise click.UsageError("a project is for a robot (--urdf) or for a station (--station), not for both")
     folder = Path.cwd()
     check_name(name, folder)
-    robot = read_robot(resolve(file) if file else SMALL_ARM)
-    project = write_project(folder, name, robot)
-    for note in robot.notes:
+    source = read_station(station) if station else read_robot(resolve(file) if file else SMALL_ARM)
+    project = write_project(folder, name, source)
+    for note in source.notes:
         click.echo(f"note: {note}", err=True)
-    drives = f"{len(robot.driven)} of {len(robot.joints)} joints driven"
-    click.echo(f"{project.name}/ written, {drives}. Next:")
+    click.echo(f"{project.name}/ written, for {source}. Next:")
     click.echo(f"  cd {name}")
     click.echo("  python -m pytest")
     click.echo(f"  python -m {name}.drive")

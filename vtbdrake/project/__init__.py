@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from vtbdrake.project.robot_file import Robot, RobotFileError, read_robot, replace_servo, resolve
+from vtbdrake.project.station_file import StationFile, StationFileError, read_station
 from vtbdrake.project.writer import ProjectError, check_name, write_project
 
 SMALL_ARM = Path(__file__).parent / "arm.urdf"
@@ -13,8 +14,11 @@ __all__ = [
     "ProjectError",
     "Robot",
     "RobotFileError",
+    "StationFile",
+    "StationFileError",
     "check_name",
     "read_robot",
+    "read_station",
     "replace_servo",
     "resolve",
     "write_project",

@@ -106,6 +106,9 @@ class Robot:
     touching: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return f"{self.model.name}, {len(self.driven)} of its {len(self.joints)} joints driven"
+
 
 def resolve(text: str) -> Path:
     """Return the path of a model file that is given by its path or as ``package://...``.
@@ -466,7 +469,7 @@ class _Reader:
     def _files(self) -> tuple[dict[Path, Path], bool]:
         """Return the files of the model by their paths in the project, and whether it refers to packages."""
         roots = _package_roots(self._path, self._text)
-        sources = _closure(self._path, roots)
+        sources = closure(self._path, roots)
         homeless = [path for path in sources if not any(path.is_relative_to(root) for root in roots.values())]
         top = _common_folder(homeless)
         files = {path.relative_to(top): path for path in homeless}
@@ -549,7 +552,7 @@ def _package_roots(path: Path, text: str) -> dict[str, Path]:
     return roots
 
 
-def _closure(path: Path, roots: dict[str, Path]) -> list[Path]:
+def closure(path: Path, roots: dict[str, Path]) -> list[Path]:
     """Return a model file and the files that it needs, directly or through others."""
     files, waiting = [path], [path]
     while waiting:

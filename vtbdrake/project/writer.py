@@ -16,22 +16,24 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from vtbdrake.project.robot_file import PRISMATIC, Robot, RobotJoint
+from vtbdrake.project.station_file import StationFile
 
 TEMPLATES = Path(__file__).parent / "templates"
 # Template -> file of the project.
-_FILES = {
+_COMMON = {"pyproject.toml": "pyproject.toml", "gitignore": ".gitignore", "ci.yml": ".github/workflows/tests.yml"}
+_ROBOT = {
+    **_COMMON,
     "README.md": "README.md",
-    "pyproject.toml": "pyproject.toml",
-    "gitignore": ".gitignore",
-    "ci.yml": ".github/workflows/tests.yml",
     "notebook.ipynb": "{name}.ipynb",
     "test.py": "tests/test_{name}.py",
-    "package/__init__.py": "{name}/__init__.py",
-    "package/robot.py": "{name}/robot.py",
-    "package/dps.py": "{name}/dps.py",
-    "package/scenario.py": "{name}/scenario.py",
-    "package/optimize.py": "{name}/optimize.py",
-    "package/drive.py": "{name}/drive.py",
+    **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("__init__", "robot", "dps", "scenario")},
+    **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("optimize", "drive")},
+}
+_STATION = {
+    **_COMMON,
+    "station/README.md": "README.md",
+    "station/test.py": "tests/test_{name}.py",
+    **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("__init__", "dps", "scenario", "optimize", "drive")},
 }
 _LONGEST_LINE = 120
 
@@ -62,43 +64,51 @@ def check_name(name: str, folder: Path) -> None:
         raise ProjectError(f"{folder} is a folder that you cannot write to: change to one of yours")
 
 
-def write_project(folder: Path, name: str, robot: Robot) -> Path:
+def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
     """Write a project whole, or not at all, and return its folder.
 
     Args:
         folder: The folder in which it becomes ``folder/name``.
         name: A name that `check_name` accepts.
-        robot: The robot, from `read_robot`.
+        source: The robot, from `read_robot`, or the station, from `read_station`.
 
     Raises:
         ProjectError: See `check_name`.
     """
     check_name(name, folder)
-    values = _values(name, robot)
+    if isinstance(source, Robot):
+        templates, values = _ROBOT, _robot_values(source)
+    else:
+        templates, values = _STATION, _station_values(source)
+    values |= {
+        "name": name,
+        "NAME": name.upper(),
+        "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")),
+        "notes": "".join(["\n## What is assumed\n\n", *(f"* {note}\n" for note in source.notes)])
+        if source.notes
+        else "",
+    }
     with tempfile.TemporaryDirectory(dir=folder, prefix=f".{name}-") as temporary:
         project = Path(temporary) / name
-        for template, path in _FILES.items():
+        for template, path in templates.items():
             text = Template((TEMPLATES / f"{template}.template").read_text(encoding="utf-8")).substitute(values)
             file = project / path.format(name=name)
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text, encoding="utf-8")
-        for relative, source in robot.files.items():
+        for relative, original in source.files.items():
             file = project / name / "models" / relative
             file.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, file)
+            shutil.copyfile(original, file)
         project.rename(folder / name)
     return folder / name
 
 
-def _values(name: str, robot: Robot) -> dict[str, str]:
+def _robot_values(robot: Robot) -> dict[str, str]:
     joints = {joint.name: joint for joint in robot.joints}
-    drives = [joints[name] for name in robot.driven]
+    drives = [joints[driven] for driven in robot.driven]
     is_exact = len(drives) == len(joints) and not robot.has_constraints
     names = ["DRIVEN", "JOINTS", *(["TOUCHING"] if robot.touching else []), "B", "add_robot", "limits"]
     return {
-        "name": name,
-        "NAME": name.upper(),
-        "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")),
         "model_file": robot.model.name,
         "model_path": robot.model.as_posix(),
         "robot_imports": _robot_imports(robot),
@@ -132,7 +142,6 @@ def _values(name: str, robot: Robot) -> dict[str, str]:
         "scene_graph": "scene_graph" if robot.touching else "_",
         "filter": _FILTER if robot.touching else "",
         "tolerance": "0.02" if is_exact else "0.2",
-        "notes": "".join(["\n## What is assumed\n\n", *(f"* {note}\n" for note in robot.notes)]) if robot.notes else "",
     }
 
 
@@ -222,3 +231,19 @@ def _pose(X: RigidTransform) -> str:
     angles, p = RollPitchYaw(X.rotation()).vector(), X.translation()
     numbers = [", ".join(_number(value) for value in np.where(np.abs(v) < 1e-12, 0.0, v)) for v in (angles, p)]
     return f"RigidTransform(RollPitchYaw({numbers[0]}), [{numbers[1]}])"
+
+
+def _station_values(station: StationFile) -> dict[str, str]:
+    path, _, key = station.file.partition("#")
+    return {
+        "model_file": Path(path).name,
+        "station_path": path,
+        "station_key": f"#{key}" if key else "",
+        "home": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.home])},' for arm in station.arms),
+        "away": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.away])},' for arm in station.arms),
+        "opening": json.dumps(station.grippers),
+        "period": _number(station.period),
+        "expected": ""
+        if all(arm.takes_positions for arm in station.arms)
+        else '    "check_silence_ends_in_the_fallback": "a brake without a velocity gives way to zero torques",\n',
+    }

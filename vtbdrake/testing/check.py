@@ -118,7 +118,7 @@ def check_scenario(
 
     Raises:
         ScenarioCheckError: A check failed that was not expected to, or passed although it was expected to fail.
-        ValueError: ``scenario`` is no scenario, or there is no check of an expected name, or no variable of an address.
+        ValueError: ``scenario`` is no scenario, or there is no check of an expected name.
     """
     from vtbdrake.testing.subject import Subject
 
