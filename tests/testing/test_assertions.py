@@ -14,8 +14,9 @@ import pytest
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.control.clock import SimulatedClock
-from vtbdrake.control.statistics import LoopStatistics
+from vtbdrake.control.statistics import Histogram, LoopStatistics
 from vtbdrake.deployment import Deployment
+from vtbdrake.machine import MachineStatistics
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.rollout import RolloutRunner, RolloutTask
@@ -220,6 +221,7 @@ def test_budget_is_a_share_of_the_period() -> None:
     assert_cycle_budget(slower, at_most=2.1, percentile=50.0, against=statistics)
     with pytest.raises(AssertionError, match="times the other loop's"):
         assert_cycle_budget(slower, at_most=1.9, percentile=50.0, against=statistics)
+    assert_cycle_budget(MachineStatistics(statistics, Histogram(), 0.0), at_most=0.21, percentile=95.0)
     with pytest.raises(ValueError, match="has run no cycle"):
         assert_cycle_budget(LoopStatistics(1e-3), at_most=1.0)
 
@@ -301,3 +303,25 @@ def test_jump_at_the_switch_is_named(log: Path) -> None:
     assert_continuous_at_switch(log, at_most={"velocity": 2.0 * PERIOD})
     text = failure(lambda: assert_continuous_at_switch(log, at_most={"velocity": [1e-3, 1.0]}))
     assert "sent.velocity[0] jumps where a switch is thrown" in text and "0.002 m/s away from sense.speed" in text
+
+
+def test_jump_where_a_sensor_is_switched_is_named(tmp_path: Path) -> None:
+    """The command goes on from the one before, by its rate of 2 m/s^2 in a period."""
+    scenario, clock, path = ContinuousServo(), SimulatedClock(), tmp_path / "servo.lcm"
+
+    def sensors(t: float) -> dict[str, Any]:
+        return {"position": [0.0, 0.0], "speed": [0.0, 0.0]}
+
+    bridge = ScriptedBridge(scenario.interface(), clock, sensors)
+    runtime = scenario.deployment().runtime(scenario.build(), bridge, clock=clock)
+    with runtime, Recorder(runtime, path) as recorder:
+        recorder.wait_until_ready()
+        runtime.run(cycles=10)
+        runtime.switch("real")
+        runtime.run(cycles=10)
+        runtime.write({"u.target": [0.01, 0.0]})
+        runtime.switch(sense={"speed": "sim"})
+        runtime.run(cycles=10)
+    assert_continuous_at_switch(path)
+    text = failure(lambda: assert_continuous_at_switch(path, at_most={"velocity": 1e-3}))
+    assert "sent.velocity[0] jumps where a switch is thrown" in text and "away from the command before" in text

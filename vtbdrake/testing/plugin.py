@@ -108,6 +108,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 # -- fixtures
 
+_LOG = pytest.StashKey["Path"]()
+
 
 @pytest.fixture
 def scenario() -> Scenario:
@@ -141,9 +143,11 @@ def machine(scenario: Scenario, machine_options: Mapping[str, Any]) -> Iterator[
 
 
 @pytest.fixture
-def log_file(tmp_path: Path) -> Path:
+def log_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Return a new file for ``record=``: if the test fails, it is kept, and the report says how to replay it."""
-    return tmp_path / "loop.lcm"
+    log = tmp_path / "loop.lcm"
+    request.node.stash[_LOG] = log
+    return log
 
 
 @pytest.fixture(params=["sim", "shadow", "machine"])
@@ -185,10 +189,10 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Keep the log of a failed test, and report how to replay it."""
     report = yield
-    arguments = getattr(item, "funcargs", None) or {}
-    log, folder = arguments.get("log_file"), _folder(item)
-    if call.when == "call" and report.failed and isinstance(log, Path) and folder is not None:
-        report.sections.append(("log of the loop", _kept_log(log, folder, arguments.get("phase"))))
+    log, folder = item.stash.get(_LOG, None), _folder(item)
+    if call.when == "call" and report.failed and log is not None and folder is not None:
+        loop = getattr(item, "funcargs", {}).get("phase")
+        report.sections.append(("log of the loop", _kept_log(log, folder, loop)))
     return report
 
 
@@ -236,9 +240,11 @@ class _Mutants:
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, object, object]:
         """Take note of the scenario of every test; one that is parametrized by its scenario has no fixture."""
         result = yield
+        from vtbdrake.testbed import Scenario
+
         scenario = getattr(item, "funcargs", {}).get("scenario")
         parameters = item.callspec.params if hasattr(item, "callspec") else {}
-        if self.mutant is None and scenario is not None and "scenario" not in parameters:
+        if self.mutant is None and isinstance(scenario, Scenario) and "scenario" not in parameters:
             self.scenarios.append((item, scenario))
         return result
 
