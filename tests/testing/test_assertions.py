@@ -306,7 +306,7 @@ def test_jump_at_the_switch_is_named(log: Path) -> None:
 
 
 def test_jump_where_a_sensor_is_switched_is_named(tmp_path: Path) -> None:
-    """The command goes on from the one before, by its rate of 2 m/s^2 in a period."""
+    """The command goes on from the one before, by its rate of 2 m/s^2 in a period; the DPS answers a cycle later."""
     scenario, clock, path = ContinuousServo(), SimulatedClock(), tmp_path / "servo.lcm"
 
     def sensors(t: float) -> dict[str, Any]:

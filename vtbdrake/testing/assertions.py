@@ -182,7 +182,7 @@ def assert_continuous_at_switch(
 
     Where an actuator signal goes to real, its first sent command is compared with the sensor signal that tells what
     acts there, see ``continuity`` of the scenario's `Deployment`. Where another switch is thrown while it is on real,
-    it is compared with the command before.
+    it is compared with the command before; and so is the second command, since a DPS that samples answers late.
 
     Args:
         log: A log, or the path of its file.
@@ -208,30 +208,34 @@ def assert_continuous_at_switch(
                 continue
             name, sent = signal.name, log.sent[signal.name]
             step = np.asarray(signal.rate) * log.header.period
+            steady = limits.get(name, step if np.isfinite(step).all() else None)
+            # (cycle, what its command continues, where that comes from, largest difference)
+            pairs: list[tuple[int, np.ndarray, str, Any]] = []
             if i > 0 and np.isfinite(sent[i - 1]).all():
-                reference, source = sent[i - 1], "the command before"
-                limit = limits.get(name, step if np.isfinite(step).all() else None)
+                if steady is None:
+                    raise ValueError(
+                        f"the rate of {name} is not limited: give at_most={{{name!r}: largest difference}}"
+                    )
+                pairs.append((i, sent[i - 1], "the command before", steady))
             elif name in continuity and positions.get(f"act.{name}", Position.SIM) != Position.SIM:
                 sensor, largest = continuity[name]
-                reference, source = log.fed[sensor][i], f"sense.{sensor}"
                 limit = limits.get(name, largest + np.where(np.isfinite(step), step, 0.0))
-            else:
-                continue  # It stays on sim, or it may jump, as the deployment says.
-            if limit is None:
-                raise ValueError(f"the rate of {name} is not limited: give at_most={{{name!r}: largest difference}}")
-            if np.isnan(sent[i]).all():
-                continue  # Nothing was sent.
-            gap = np.abs(sent[i] - reference)
-            if (wrong := np.flatnonzero(~(gap <= limit * (1.0 + 1e-9)))).size:
-                k = int(wrong[0])
-                most = float(np.broadcast_to(limit, gap.shape)[k])
-                trace = trace_of(log, f"sent.{name}")
-                fail(
-                    f"sent.{name}[{k}] jumps where a switch is thrown, at {_when(trace, (i,))}: {sent[i][k]:.6g} is "
-                    f"{gap[k]:.3g} {signal.unit} away from {source}; {most:.3g} is allowed",
-                    name="continuous_at_switch",
-                    draw=partial(_draw, trace=trace, address=f"sent.{name}", place=(i, k)),
-                )
+                pairs.append((i, log.fed[sensor][i], f"sense.{sensor}", limit))
+            if pairs and i + 1 < len(sent) and steady is not None:
+                # A DPS that samples may answer in the next cycle only.
+                pairs.append((i + 1, sent[i], "the command before", steady))
+            for cycle, reference, source, limit in pairs:
+                gap = np.abs(sent[cycle] - reference)  # NaN if nothing was sent.
+                if (wrong := np.flatnonzero(gap > limit * (1.0 + 1e-9))).size:
+                    k = int(wrong[0])
+                    most = float(np.broadcast_to(limit, gap.shape)[k])
+                    trace = trace_of(log, f"sent.{name}")
+                    fail(
+                        f"sent.{name}[{k}] jumps where a switch is thrown, at {_when(trace, (cycle,))}: "
+                        f"{sent[cycle][k]:.6g} is {gap[k]:.3g} {signal.unit} away from {source}; {most:.3g} is allowed",
+                        name="continuous_at_switch",
+                        draw=partial(_draw, trace=trace, address=f"sent.{name}", place=(cycle, k)),
+                    )
 
 
 def assert_succeeds(
