@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from math import ceil, inf, log
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from vtbdrake.machine import MachineStatistics
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.replay import Target
 from vtbdrake.recording.replay import replay as replay_log
+from vtbdrake.testbed import Signal
 from vtbdrake.testbed.switch import Position
 from vtbdrake.testing.failure import fail
 from vtbdrake.testing.trace import ENERGY, Source, Trace, TraceError, trace_of
@@ -195,47 +196,55 @@ def assert_continuous_at_switch(
     """
     __tracebackhide__ = True
     log = log if isinstance(log, ControlLog) else read_log(log)
+    for signal, cycle, reference, source, limit in _continued_commands(log, at_most or {}):
+        sent = log.sent[signal.name][cycle]
+        gap = np.abs(sent - reference)  # NaN if nothing was sent.
+        if (wrong := np.flatnonzero(gap > limit * (1.0 + 1e-9))).size:
+            k, address = int(wrong[0]), f"sent.{signal.name}"
+            trace = trace_of(log, address)
+            fail(
+                f"{address}[{k}] jumps where a switch is thrown, at {_when(trace, (cycle,))}: {sent[k]:.6g} is "
+                f"{gap[k]:.3g} {signal.unit} away from {source}; {limit[k]:.3g} is allowed",
+                name="continuous_at_switch",
+                draw=partial(_draw, trace=trace, address=address, place=(cycle, k)),
+            )
+
+
+def _continued_commands(
+    log: ControlLog, at_most: Mapping[str, ArrayLike]
+) -> Iterator[tuple[Signal, int, np.ndarray, str, np.ndarray]]:
+    """Yield the commands that have to continue something, because a switch was thrown.
+
+    Each is an actuator signal, the index of a cycle, what the command of that cycle continues, where that comes from,
+    and the largest difference of each entry.
+    """
+    scenario = log.scenario
+    interface = scenario.interface()
+    continuity = checked_continuity(interface, scenario.deployment().continuity, period=log.header.period)
     switches = [(i, change.values) for i, change in log.changes if change.kind == ChangeKind.SWITCH]
     if not switches:
         raise ValueError(f"{log.path} has no switch: nothing is asserted")
-    scenario = log.scenario
-    interface, deployment = scenario.interface(), scenario.deployment()
-    continuity = checked_continuity(interface, deployment.continuity, period=log.header.period)
-    limits = {name: np.asarray(limit, float) for name, limit in (at_most or {}).items()}
     for i, positions in switches:
-        for signal in interface.act:
-            if not signal.is_vector:
-                continue
+        for signal in filter(lambda signal: signal.is_vector, interface.act):
             name, sent = signal.name, log.sent[signal.name]
-            step = np.asarray(signal.rate) * log.header.period
-            steady = limits.get(name, step if np.isfinite(step).all() else None)
-            # (cycle, what its command continues, where that comes from, largest difference)
-            pairs: list[tuple[int, np.ndarray, str, Any]] = []
+            step = signal.vector(signal.rate) * log.header.period
+            steady = signal.vector(at_most[name]) if name in at_most else step if np.isfinite(step).all() else None
             if i > 0 and np.isfinite(sent[i - 1]).all():
                 if steady is None:
                     raise ValueError(
                         f"the rate of {name} is not limited: give at_most={{{name!r}: largest difference}}"
                     )
-                pairs.append((i, sent[i - 1], "the command before", steady))
+                yield signal, i, sent[i - 1], "the command before", steady
             elif name in continuity and positions.get(f"act.{name}", Position.SIM) != Position.SIM:
                 sensor, largest = continuity[name]
-                limit = limits.get(name, largest + np.where(np.isfinite(step), step, 0.0))
-                pairs.append((i, log.fed[sensor][i], f"sense.{sensor}", limit))
-            if pairs and i + 1 < len(sent) and steady is not None:
+                departure = largest + np.where(np.isfinite(step), step, 0.0)
+                limit = signal.vector(at_most[name]) if name in at_most else departure
+                yield signal, i, log.fed[sensor][i], f"sense.{sensor}", limit
+            else:
+                continue  # It stays on sim, or it may jump, as the deployment says.
+            if i + 1 < len(sent) and steady is not None:
                 # A DPS that samples may answer in the next cycle only.
-                pairs.append((i + 1, sent[i], "the command before", steady))
-            for cycle, reference, source, limit in pairs:
-                gap = np.abs(sent[cycle] - reference)  # NaN if nothing was sent.
-                if (wrong := np.flatnonzero(gap > limit * (1.0 + 1e-9))).size:
-                    k = int(wrong[0])
-                    most = float(np.broadcast_to(limit, gap.shape)[k])
-                    trace = trace_of(log, f"sent.{name}")
-                    fail(
-                        f"sent.{name}[{k}] jumps where a switch is thrown, at {_when(trace, (cycle,))}: "
-                        f"{sent[cycle][k]:.6g} is {gap[k]:.3g} {signal.unit} away from {source}; {most:.3g} is allowed",
-                        name="continuous_at_switch",
-                        draw=partial(_draw, trace=trace, address=f"sent.{name}", place=(cycle, k)),
-                    )
+                yield signal, i + 1, sent[i], "the command before", steady
 
 
 def assert_succeeds(
