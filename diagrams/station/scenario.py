@@ -51,8 +51,8 @@ class JointControl(AddressedSystem):
             self.DeclareVectorInputPort(name, size)
         self.DeclareVectorInputPort("opening", 1)
         self._gains = self.declare_parameters(
-            stiffness=Quantity(_STIFFNESS, "N m/rad", (0.0, np.inf)),
-            damping=Quantity(_DAMPING, "N m s/rad", (0.0, np.inf)),
+            stiffness=Quantity(_STIFFNESS, "N m/rad", (0.0, 1e4)),
+            damping=Quantity(_DAMPING, "N m s/rad", (0.0, 1e3)),
         )
         self._reference = self.declare_discrete_state(reference=Quantity(HOME, "rad"))
         self._speed = self.declare_discrete_state(speed=Quantity(np.zeros(size), "rad/s"))

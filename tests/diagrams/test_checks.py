@@ -11,8 +11,12 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.studies.lighting import LightingScenario
 from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
+from vtbdrake_diagrams.station import ArmStation
 
 SIMULATED_TIME = "its messages tell the time of a simulation, which stands still when the machine is held up"
+SAMPLED_PORTS = (
+    "Drake's plants with sampled output ports advance before the systems that sample them at the same instant"
+)
 
 # With what is set before a simulation, so that something moves.
 SCENARIOS = {
@@ -26,10 +30,12 @@ SCENARIOS = {
     ApproachScenario: {},
     ForestScenario: {},
     PlainScenario: {},
+    ArmStation: {"u.opening": 0.1},
 }
 EXPECTED = {
     ManipulatorScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
     CartPoleScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
+    ArmStation: dict.fromkeys(("check_dps_cannot_tell_the_switch", "check_dps_alone_commands_the_same"), SAMPLED_PORTS),
 }
 
 

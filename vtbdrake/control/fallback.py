@@ -136,6 +136,8 @@ class Brake(Fallback):
             )
 
     def command(self, last_sent: Any, sensed: Mapping[str, Any], samples: Mapping[str, Sample], dt: float) -> Any:
+        if self.velocity not in sensed:
+            return self.otherwise.command(last_sent, sensed, samples, dt)
         return -self.gain * sensed[self.velocity][self.entries]
 
 

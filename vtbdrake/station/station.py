@@ -23,7 +23,7 @@ from pydrake.systems.primitives import Multiplexer
 from vtbdrake.deployment import Deployment, Runtime
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.settings import setting
-from vtbdrake.station.drivers import Arm, CameraImages, Gripper, Motion, StationDriver
+from vtbdrake.station.drivers import AGE, Arm, CameraImages, Gripper, Motion, StationDriver
 from vtbdrake.station.models import JointLimits
 from vtbdrake.testbed import HardwareSimScenario, Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.scenario_file import file_and_key, is_imported, read_fields
@@ -299,7 +299,10 @@ class Station(HardwareSimScenario):
                 periods={map.channel: period for map, period, _ in sense if period != pacer.period},
             ),
             period=pacer.period,
-            guards={"fallback": {name: each[name] for each in fallbacks for name in each if name in commanded}},
+            guards={
+                "fallback": {name: each[name] for each in fallbacks for name in each if name in commanded},
+                "max_delay": {driver.sense[0].name: AGE * driver.period for driver in contents.drivers},
+            },
             continuity={name: each[name] for each in starts for name in each if name in commanded},
             pace=pacer.sense[0].name,
         )
