@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,3 +133,23 @@ def test_images_come_from_drakes_camera_as_from_the_simulated_one() -> None:
     np.testing.assert_array_equal(received["camera_0_color_image"], color)
     np.testing.assert_array_equal(received["camera_0_depth_image"], depth)
     assert len(np.unique(depth)) > 20
+
+
+@pytest.mark.slow
+def test_station_drives_hardware_sim_in_real_time(tmp_path: Path) -> None:
+    scenario = ArmStation(f"{FILE}#Position")
+    # A busy computer misses deadlines, which is not the question here.
+    deployment = vtb.Deployment.of(scenario)
+    deployment = replace(deployment, guards={**deployment.guards, "max_missed": 10_000}, check_age=False)
+    with (
+        vtb.Hub(port=0) as hub,
+        HardwareSim(hub.url, "Position", real_time=True),
+        scenario.deploy(hub.url, deployment=deployment, record=tmp_path / "log") as runtime,
+    ):
+        runtime.take_over(timeout=60.0)
+        runtime.write({"u.target": HOME + 0.05, "u.opening": 0.08})
+        runtime.run(seconds=3.0)
+        assert runtime.guards.latched == ()
+        np.testing.assert_allclose(runtime.read("real.sense.iiwa_position_measured"), HOME + 0.05, atol=0.01)
+        assert runtime.read("real.sense.wsg_position_measured") == pytest.approx(0.08, abs=0.002)
+    assert vtb.replay(tmp_path / "log").identical

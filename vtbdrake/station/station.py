@@ -183,7 +183,9 @@ class Station(HardwareSimScenario):
                     f"{self.where('dps')} names the function {self.dps}, and to import its module runs its code: "
                     f"import {module} first, if that is what you want"
                 )
-            function = getattr(sys.modules[module], name, None)
+            function = sys.modules[module]
+            for part in name.split("."):
+                function = getattr(function, part, None)
         if not callable(function):
             raise ScenarioError(
                 f"{type(self).__name__} has no DPS: give it dps=, a function of the station that returns a System"
