@@ -1,5 +1,12 @@
 """The public names of calibration and validation."""
 
+from vtbdrake.calibration.calibration import Calibration as Calibration
+from vtbdrake.calibration.calibration import calibrate as calibrate
+from vtbdrake.calibration.filtering import JointRecording as JointRecording
+from vtbdrake.calibration.filtering import Noise as Noise
+from vtbdrake.calibration.model import CalibrationError as CalibrationError
+from vtbdrake.calibration.model import Inertia as Inertia
+from vtbdrake.calibration.model import JointModel as JointModel
 from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
 from vtbdrake.calibration.validation import Tolerance as Tolerance

@@ -70,8 +70,8 @@ class Series:
     def at(self, times: ArrayLike) -> Array:
         """Return the newest sample at each of the times (m,), (m, size); NaN before the first."""
         indices = np.searchsorted(self.times, np.asarray(times, dtype=float), side="right") - 1
-        held: Array = np.where((indices >= 0)[:, np.newaxis], self.values[np.maximum(indices, 0)], np.nan)
-        return held
+        samples: Array = np.where((indices >= 0)[:, np.newaxis], self.values[np.maximum(indices, 0)], np.nan)
+        return samples
 
     def between(self, start: float, end: float) -> Series:
         """Return the samples from ``start`` to below ``end``, in s; a LogError if there is none."""

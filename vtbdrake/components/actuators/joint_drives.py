@@ -127,6 +127,11 @@ class JointDrives(AddressedSystem):
         self._kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
+    @property
+    def period(self) -> float:
+        """Return the sample period T in seconds."""
+        return self._period
+
     def resume(self, context: Context, command: ArrayLike) -> None:
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""
         torque = np.asarray(command, dtype=float)

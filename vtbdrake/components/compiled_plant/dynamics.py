@@ -8,7 +8,7 @@ crf(V). The world accelerates with -g, so that weight needs no force.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi
@@ -133,6 +133,11 @@ class PlantDynamics:
         values = [casadi.densify(value) for value in results.values()]
         return casadi.Function(name, [*arguments, *self._symbols.values()], values, names, list(results), {"cse": True})
 
+    def substituted(self, results: Sequence[Expression], values: Mapping[str, Expression]) -> list[Expression]:
+        """Return results of the methods below with expressions, by address, in place of the inputs."""
+        symbols = list(self._symbols.values())
+        return list(casadi.substitute(list(results), symbols, [casadi.densify(values[name]) for name in self.inputs]))
+
     # -- dynamics
 
     def acceleration(self, q: Expression, v: Expression, tau: Expression, *, period: float = 0.0) -> Expression:
@@ -198,6 +203,18 @@ class PlantDynamics:
             if link.parent >= 0:
                 forces[link.parent] += move.X.T @ forces[k]
         return tau
+
+    def damping_torque(self, v: Expression) -> Expression:
+        """Return D v, the torques by which the joints' damping resists."""
+        torque = casadi.SX(self.nv, 1)
+        for link in self._links:
+            torque[link.v] = link.damping * v[link.v]
+        return torque
+
+    def mass_matrix(self, q: Expression) -> Expression:
+        """Return M(q), with the reflected inertias."""
+        a = casadi.SX.sym("a", self.nv)
+        return casadi.jacobian(self.inverse_dynamics(q, casadi.SX(self.nv, 1), a, gravity=False), a)
 
     def energy(self, q: Expression, v: Expression, *, rotors: bool = True) -> tuple[Expression, Expression]:
         """Return the kinetic and the potential energy, in J; ``rotors`` as in `inverse_dynamics`."""

@@ -1,0 +1,210 @@
+"""The real double pendulum: calibrated with some recordings, and what that predicts of the others.
+
+``python -m vtbdrake_diagrams.double_pendulum.reality FOLDER`` prints it. FOLDER holds the repository
+dfki-ric-underactuated-lab/double_pendulum (BSD-3): its excitation runs of 2023-06-29 of the design C.1, each with
+positions and torques that were measured at 500 Hz for 10 s, and three published sets of parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import click
+import numpy as np
+import yaml
+
+import vtbdrake as vtb
+from vtbdrake.arrays import Array
+from vtbdrake.calibration import Calibration, JointModel, JointRecording, calibrate
+from vtbdrake.recording import DrivenScenario, Log
+from vtbdrake_diagrams.double_pendulum.scenario import JOINTS, LINKS, DoublePendulumScenario
+
+POSITION, TORQUE = "joint_position", "torque"
+PENDULUM, DRIVES = "sim.sys.pendulum", "sim.act.drives"
+HORIZON = 0.5
+"""Duration of a prediction, in s."""
+
+# The time between two positions of the fit, in s: faster, what the model lacks (elastic belts, uneven sampling) counts.
+_FIT_PERIOD = 0.01
+# The runs of the fit; the others are predicted.
+_FITTED = slice(0, None, 2)
+_LENGTH, _SUBSTEPS = 0.2, 4
+
+Derivative = Callable[[Array, Array], Array]
+
+
+def recordings(folder: Path) -> list[Log]:
+    """Return the excitation runs, in the order of their times.
+
+    Raises:
+        FileNotFoundError: The folder has none.
+    """
+    paths = sorted(folder.glob("data/experiment_records/design_C.1/sys_id/*/*/trajectory.csv"))
+    if not paths:
+        raise FileNotFoundError(f"{folder} has no data/experiment_records/design_C.1/sys_id")
+    return [
+        vtb.read_table(
+            path,
+            sense={POSITION: ["pos_meas1", "pos_meas2"]},
+            act={TORQUE: ["tau_meas1", "tau_meas2"]},
+        )
+        for path in paths
+    ]
+
+
+def calibrated(logs: Sequence[Log]) -> Calibration:
+    """Return the calibration of all that the motion in a plane depends on, but for the upper link's mass.
+
+    With its moment and its centre of mass, this mass is not seen: it is left at the guess.
+    """
+    ranges = {
+        f"{PENDULUM}.upper.center_of_mass[2]": (-0.5, 0.0),
+        f"{PENDULUM}.upper.inertia[1]": (1e-4, 0.2),
+        f"{PENDULUM}.lower.center_of_mass[2]": (-0.6, 0.0),
+        f"{PENDULUM}.lower.mass": (0.1, 2.0),
+        f"{PENDULUM}.lower.inertia[1]": (1e-5, 0.1),
+        **{f"{DRIVES}.viscous[{i}]": (0.0, 0.2) for i in (0, 1)},
+        **{f"{DRIVES}.coulomb[{i}]": (0.0, 1.0) for i in (0, 1)},
+    }
+    parameters = [vtb.Parameter(address, *ends) for address, ends in ranges.items()]
+    return calibrate(
+        DoublePendulumScenario(),
+        logs,
+        parameters,
+        position=POSITION,
+        torque=TORQUE,
+        measured_torque=True,
+        period=_FIT_PERIOD,
+    )
+
+
+def determined(values: Mapping[str, float], upper_mass: float) -> dict[str, float]:
+    """Return the combinations that the motion in a plane depends on: m1 r1 + m2 l1 and m2 r2 (kg m), I2 (kg m^2)."""
+    m2 = values[f"{PENDULUM}.lower.mass"]
+    r1, r2 = (-values[f"{PENDULUM}.{link}.center_of_mass[2]"] for link in LINKS)
+    return {
+        "m1 r1 + m2 l1": upper_mass * r1 + m2 * _LENGTH,
+        "m2 r2": m2 * r2,
+        "I2": values[f"{PENDULUM}.lower.inertia[1]"] + m2 * r2**2,
+    }
+
+
+def published(folder: Path) -> dict[str, dict[str, float]]:
+    """Return the published sets of parameters, by their names."""
+    paths = sorted(folder.glob("data/system_identification/identified_parameters/design_C.1/*/model_parameters.yml"))
+    return {path.parent.name: yaml.safe_load(path.read_text()) for path in paths}
+
+
+def published_model(p: dict[str, float]) -> Derivative:
+    """Return the equation of motion of the authors' software, (x, tau) -> xdot, with its law of friction."""
+
+    def derivative(x: Array, tau: Array) -> Array:
+        q1, q2, v1, v2 = x
+        c2, s2, l1, gear = np.cos(q2), np.sin(q2), p["l1"], p["gr"]
+        first, second = p["m1"] * p["r1"], p["m2"] * p["r2"]
+        coupling = p["I2"] + l1 * second * c2 - gear * p["Ir"]
+        M = np.array(
+            [
+                [p["I1"] + p["I2"] + p["m2"] * l1**2 + 2.0 * l1 * second * c2 + (gear**2 + 1.0) * p["Ir"], coupling],
+                [coupling, p["I2"] + gear**2 * p["Ir"]],
+            ]
+        )
+        bias = l1 * second * s2 * np.array([-2.0 * v1 * v2 - v2**2, v1**2])
+        end = second * np.sin(q1 + q2)
+        weight = -p["g"] * np.array([(first + p["m2"] * l1) * np.sin(q1) + end, end])
+        friction = np.array([p["b1"], p["b2"]]) * x[2:] + np.array([p["cf1"], p["cf2"]]) * np.arctan(100.0 * x[2:])
+        return np.concatenate([x[2:], np.linalg.solve(M, tau - bias + weight - friction)])
+
+    return derivative
+
+
+def published_prediction(p: dict[str, float], x: Array, times: Array, torques: Array) -> Array:
+    """Return the positions (n, 2) that a published model predicts from the state x (4,), by Runge-Kutta steps."""
+    derivative, positions = published_model(p), [x[:2]]
+    for h, tau in zip(np.diff(times), torques, strict=False):
+        for _ in range(_SUBSTEPS):  # Its friction is steep.
+            step = h / _SUBSTEPS
+            k1 = derivative(x, tau)
+            k2 = derivative(x + 0.5 * step * k1, tau)
+            k3 = derivative(x + 0.5 * step * k2, tau)
+            k4 = derivative(x + step * k3, tau)
+            x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        positions.append(x[:2])
+    return np.array(positions)
+
+
+class TestbedPrediction:
+    """The positions that the testbed itself predicts, as a world that the log drives.
+
+    Args:
+        values: Values of variables by address.
+        log: The recording.
+    """
+
+    def __init__(self, values: Mapping[str, float], log: Log) -> None:
+        scenario = DoublePendulumScenario()
+        self._testbed = DrivenScenario(scenario=scenario, log=log, start=log.start, period=scenario.period).build()
+        self._values, self._start = dict(values), log.start
+
+    def __call__(self, x: Array, times: Array, torques: Array) -> Array:
+        testbed = self._testbed
+        context = testbed.default_context()
+        testbed.write(context, self._values)
+        context.SetTime(times[0] - self._start)
+        for k, joint in enumerate(JOINTS):
+            testbed.write(context, {f"{PENDULUM}.{joint}.position": x[k], f"{PENDULUM}.{joint}.velocity": x[2 + k]})
+        simulator, positions = testbed.simulator(context), []
+        for time in times:
+            simulator.AdvanceTo(time - self._start)
+            positions.append([float(testbed.read(context, f"{PENDULUM}.{joint}.position")) for joint in JOINTS])
+        return np.array(positions)
+
+
+def prediction_errors(log: Log, predict: Callable[[Array, Array, Array], Array]) -> Array:
+    """Return the root mean squares in rad of the errors of predictions over `HORIZON`, all along a recording.
+
+    Args:
+        log: The recording.
+        predict: A function of the state (4,) at the begin, times (n,) in s and torques (n, 2) -> positions (n, 2).
+    """
+    recording = JointRecording.of(log, JointModel(DoublePendulumScenario().build()), position=POSITION, torque=TORQUE)
+    q, v, _ = recording.smoothed()
+    steps, errors = round(HORIZON / recording.period), []
+    for k in range(10, len(q) - steps - 10, steps):
+        span = slice(k, k + steps)
+        positions = predict(np.concatenate([q[k], v[k]]), recording.times[span], recording.u[span])
+        errors.append(np.sqrt(np.mean((positions - recording.q[span]) ** 2)))
+    return np.array(errors)
+
+
+@click.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+def main(folder: Path) -> None:
+    """Calibrate the double pendulum with half of the runs in FOLDER, and predict the others."""
+    logs = recordings(folder)
+    fitted, held_out = logs[_FITTED], [log for log in logs if log not in logs[_FITTED]]
+    calibration = calibrated(fitted)
+    print(calibration, "\n")
+    values = {address: each.value for address, each in calibration.parameters.items()}
+    sets = published(folder)
+    print(f"{'':12}" + "".join(f"{name:>16}" for name in ("m1 r1 + m2 l1", "m2 r2", "I2")))
+    rows = {"calibrated": determined(values, DoublePendulumScenario().masses[0])}
+    for name, p in sets.items():
+        rows[name] = {"m1 r1 + m2 l1": p["m1"] * p["r1"] + p["m2"] * p["l1"], "m2 r2": p["m2"] * p["r2"], "I2": p["I2"]}
+    for name, row in rows.items():
+        print(f"{name:12}" + "".join(f"{value:16.4f}" for value in row.values()))
+    print(f"\nRMS error in rad of predictions over {HORIZON:g} s, of {len(held_out)} runs that were not fitted:")
+    predictions: dict[str, Callable[[Log], Callable[..., Array]]] = {
+        "calibrated": lambda log: TestbedPrediction(values, log),
+        **{name: lambda log, p=p: partial(published_prediction, p) for name, p in sets.items()},  # type: ignore[misc]
+    }
+    for name, make in predictions.items():
+        errors = np.concatenate([prediction_errors(log, make(log)) for log in held_out])
+        median, most = np.quantile(errors, [0.5, 0.9])
+        print(f"{name:12} median {median:.4f}, 90 % within {most:.4f} ({len(errors)} predictions)")
+
+
+if __name__ == "__main__":
+    main()
