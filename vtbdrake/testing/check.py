@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -74,7 +75,14 @@ class Report(tuple[CheckResult, ...]):
         return not any(result.status in ("failed", "xpass") for result in self)
 
     def __str__(self) -> str:
-        return "\n".join(map(str, self))
+        counts = Counter(result.status for result in self)
+        slowest = max(self, key=lambda result: result.seconds)
+        summary = (
+            f"{len(self)} checks: {', '.join(f'{count} {status}' for status, count in counts.items())}; "
+            f"{sum(result.seconds for result in self):.1f} s of processor time, "
+            f"{slowest.seconds:.1f} s of them for {slowest.name}"
+        )
+        return "\n".join([*map(str, self), summary])
 
 
 def check_names() -> dict[str, str]:

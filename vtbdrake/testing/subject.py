@@ -73,7 +73,7 @@ class Subject:
         for check in checks:
             error = self.outcome(check)
             if isinstance(error, CheckFailedError):
-                raise CheckSkippedError(f"see {check.__name__}: {error}")
+                raise CheckSkippedError(f"it presupposes {check.__name__}, which fails")
             if error is not None:
                 raise error
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.control.bridge import reported_signals
 from vtbdrake.control.limits import Bounds
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
@@ -27,20 +28,21 @@ def check_sim_and_real_alike(subject: Subject) -> None:
     """
     protocol = _protocol(subject.scenario)
     interface = subject.testbed.interface
-    signals = {signal.name: signal for signal in interface.sense}
-    maps = [
-        ([signals[name] for name in map.signals if name in signals], map)
-        for map in protocol.sense
-        if all(name in signals for name in map.signals) and all(signals[name].is_vector for name in map.signals)
-    ]
+    carriers = reported_signals(interface, protocol.reported)
+    signals = {signal.name: signal for signal in (*interface.sense, *carriers.values())}
+    maps = [map for map in protocol.sense if all(signals[name].is_vector for name in map.signals)]
     if not maps:
-        raise CheckSkippedError("no message carries nothing but sensor signals that are vectors")
-    coders = [(carried, map.encoder(carried), map.decoder(carried)) for carried, map in maps]
-    for t, sensed, _ in subject.signal_values(subject.testbed):
+        raise CheckSkippedError("every message of a sensor carries an image, a scan or another abstract signal")
+    coders = []
+    for map in maps:
+        carried = [signals[name] for name in map.signals]
+        coders.append((carried, map.encoder(carried), map.decoder(carried)))
+    for t, sensed, commanded in subject.signal_values(subject.testbed):
+        values = sensed | {carrier.name: commanded[name] for name, carrier in carriers.items()}
         for carried, encode, decode in coders:
-            _, received = decode(encode({signal.name: sensed[signal.name] for signal in carried}, round(1e6 * t)))
+            _, received = decode(encode({signal.name: values[signal.name] for signal in carried}, round(1e6 * t)))
             for signal in carried:
-                expected, actual = np.asarray(sensed[signal.name]), np.asarray(received[signal.name])
+                expected, actual = np.asarray(values[signal.name]), np.asarray(received[signal.name])
                 # What leaves its limits is the business of another check.
                 if Bounds(signal).violation(expected):
                     continue
