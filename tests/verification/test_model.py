@@ -195,7 +195,7 @@ def test_imu_on_a_turning_link(verify: Verify) -> None:
         gyro = R_FB w,   accelerometer = R_FB (sinc(w T / 2) w x (w x r) - R_BW(t - T/2) g)
 
     sinc(x) = sin(x) / x is the mean of the centripetal acceleration over the sample period T, seen from its middle.
-    Reference: this closed form. Tolerance: the accuracy 1e-11 of the integrator, divided by T = 0.01 s.
+    Reference: this closed form. Tolerance: rounding, 1e-11 of a velocity over T = 0.01 s.
     """
     scenario = ImuWorld()
     run = Run(scenario, {"hinge.velocity": 2.0})
@@ -219,7 +219,7 @@ def test_imu_in_free_fall(verify: Verify, w: tuple[float, float, float]) -> None
 
         gyro = R_FB w,   accelerometer = R' ((v(t) - v(t - T)) / T - g) = 0
 
-    Reference: zero, and the constant w. Tolerance: the accuracy 1e-11 of the integrator, divided by T = 0.01 s.
+    Reference: zero, and the constant w. Tolerance: rounding, 1e-11 of a velocity over T = 0.01 s.
     """
     scenario = ImuWorld(hinged=False)
     # The ball's inertia is the same about all axes.
