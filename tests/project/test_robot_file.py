@@ -42,7 +42,7 @@ def test_drives_follow_the_order_of_the_actuators() -> None:
 def test_a_joint_without_actuator_moves_freely() -> None:
     robot = read_robot(EXAMPLES / "acrobot" / "Acrobot.urdf")
     assert robot.driven == ("elbow",)
-    assert any("shoulder has no actuator" in note and "Acrobot.urdf:66" in note for note in robot.notes)
+    assert any("Acrobot.urdf:66: no actuator of shoulder" in note for note in robot.notes)
 
 
 def test_all_joints_are_driven_where_the_file_has_no_actuators() -> None:
@@ -72,6 +72,13 @@ def test_a_joint_that_follows_another_has_no_drive_of_its_own() -> None:
     assert robot.driven == ("left_finger",)
     assert [(c.joint, c.leader, c.multiplier) for c in robot.couplings] == [("right_finger", "left_finger", 1.0)]
     assert robot.without_drive == ("right_finger",)
+
+
+def test_a_closed_loop_moves_as_its_geometry_says() -> None:
+    """In a parallelogram crank and rocker turn alike, and the coupler stays level."""
+    robot = read_robot(MODELS / "fourbar.sdf")
+    assert [joint.name for joint in robot.joints] == ["crank_joint", "coupler_joint", "rocker_joint"]
+    np.testing.assert_allclose(robot.motions, [[1.0], [-1.0], [1.0]], atol=1e-3)
 
 
 def test_motors_of_mujoco_act_by_their_gear() -> None:

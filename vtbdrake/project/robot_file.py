@@ -19,6 +19,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
@@ -86,6 +87,8 @@ class Robot:
         sets_efforts: Whether the effort limits of some actuators are not those of the file.
         has_constraints: Whether there are constraints between joints or bodies.
         couplings: The joints that follow driven ones.
+        motions: Where other constraints close loops: the velocities of all joints by those of the driven ones, at home,
+            shape (joints, driven); otherwise None.
         touching: The names of bodies that touch each other at home.
         notes: What is missing or unusual in the file, and what is done about it.
     """
@@ -103,6 +106,7 @@ class Robot:
     sets_efforts: bool = False
     has_constraints: bool = False
     couplings: tuple[Coupling, ...] = ()
+    motions: NDArray[np.float64] | None = None
     touching: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
 
@@ -168,6 +172,8 @@ class _Reader:
         self._choose_drives(plant, joints, robot)
         plant, scene_graph, diagram = self._as_in_project(robot, [joint.name() for joint in joints])
         self._read_limits(plant, joints, robot)
+        if robot.has_constraints and plant.num_constraints() > len(robot.couplings):
+            robot.motions = self._motions(robot)
         robot.touching = self._touching(plant, scene_graph, diagram, robot)
         robot.notes = self._notes
         return robot
@@ -177,6 +183,10 @@ class _Reader:
     def _load(self) -> tuple[MultibodyPlant, SceneGraph, DiagramBuilder]:
         builder = DiagramBuilder()
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+        self._parse(plant)
+        return plant, scene_graph, builder
+
+    def _parse(self, plant: MultibodyPlant) -> None:
         parser = Parser(plant)
         for root in _package_roots(self._path, self._text).values():
             parser.package_map().AddPackageXml(str(root / "package.xml"))
@@ -184,7 +194,6 @@ class _Reader:
             parser.AddModels(str(self._path))
         except RuntimeError as error:
             raise self._error(one_line(error)) from error
-        return plant, scene_graph, builder
 
     def _finalize(self, plant: MultibodyPlant) -> None:
         try:
@@ -300,20 +309,15 @@ class _Reader:
         passive = [j.name() for j in joints if j.name() not in driven and j.name() not in followers]
         if passive:
             self._notes.append(
-                f"{self._place(passive[0])}: {_listed(passive)} {'has' if len(passive) == 1 else 'have'} no actuator, "
-                "and moves freely: it is measured, not controlled. Give it an actuator in the file if it has a drive"
+                f"{self._place(passive[0])}: no actuator of {_listed(passive)}, which moves freely: measured, but not "
+                "controlled. Give it an actuator in the file if it has a drive"
             )
 
     def _as_in_project(self, robot: Robot, joint_names: list[str]) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
         """Return the plant of the project's world: as the file has it, with the changes that ``robot`` lists."""
         with self._warnings():
             plant, scene_graph, builder = self._load()
-            for name, X_WB in robot.welded.items():
-                plant.WeldFrames(plant.world_frame(), plant.GetBodyByName(name).body_frame(), X_WB)
-            for name in robot.without_drive:
-                plant.RemoveJointActuator(plant.GetJointActuatorByName(name))
-            for name in robot.servos:
-                replace_servo(plant, name)
+            self._change(plant, robot)
             followers = {coupling.joint for coupling in robot.couplings}
             for name in joint_names if robot.adds_drives else ():
                 if name not in followers:
@@ -325,27 +329,59 @@ class _Reader:
             self._check_model(robot)
             return plant, scene_graph, builder.Build()
 
+    @staticmethod
+    def _change(plant: MultibodyPlant, robot: Robot) -> None:
+        """Make the changes that ``robot`` lists, but for the drives that are added."""
+        for name, X_WB in robot.welded.items():
+            plant.WeldFrames(plant.world_frame(), plant.GetBodyByName(name).body_frame(), X_WB)
+        for name in robot.without_drive:
+            plant.RemoveJointActuator(plant.GetJointActuatorByName(name))
+        for name in robot.servos:
+            replace_servo(plant, name)
+
     def _check_model(self, robot: Robot) -> None:
         """Check that the controller can compute with the model, without the constraints."""
         plant = self._load()[0]
-        for name, X_WB in robot.welded.items():
-            plant.WeldFrames(plant.world_frame(), plant.GetBodyByName(name).body_frame(), X_WB)
-        for name in robot.servos:
-            replace_servo(plant, name)
+        self._change(plant, robot)
         for constraint in plant.GetConstraintIds():
             plant.RemoveConstraint(constraint)
         self._finalize(plant)
-        loops = robot.has_constraints and len(robot.couplings) == 0
-        if loops:
-            self._notes.append(
-                f"{self._shown} has constraints between bodies or joints: Drake simulates them, the model of the "
-                "controller leaves them out, so that the robot may sag a little"
-            )
         context = plant.CreateDefaultContext()
         try:
             PlantDynamics(plant, context)
         except UnsupportedPlantError as error:
             raise RobotFileError(f"{self._shown}: the controller needs a model of the robot, but {error}") from error
+
+    def _motions(self, robot: Robot) -> NDArray[np.float64]:
+        """Return the velocities at home that a small torque of each drive causes, by those of the driven joints.
+
+        Drake's solver keeps the constraints, without gravity and contact.
+        """
+        plant = MultibodyPlant(0.001)
+        plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+        self._parse(plant)
+        self._change(plant, robot)
+        for name in robot.driven if robot.adds_drives else ():
+            plant.AddJointActuator(name, plant.GetJointByName(name))
+        self._finalize(plant)
+        index_of = {joint.name: k for k, joint in enumerate(robot.joints)}
+        velocities = []
+        for k in range(len(robot.driven)):
+            context = plant.CreateDefaultContext()
+            plant.SetPositions(context, [joint.home for joint in robot.joints])
+            effort = np.zeros(len(robot.driven))
+            effort[k] = 1e-3 * robot.joints[index_of[robot.driven[k]]].effort
+            plant.get_actuation_input_port().FixValue(context, effort)
+            simulator = Simulator(plant, context)
+            simulator.AdvanceTo(plant.time_step())
+            velocities.append(plant.GetVelocities(context))
+        V = np.transpose(velocities)
+        motions: NDArray[np.float64] = V @ np.linalg.inv(V[[index_of[name] for name in robot.driven]])
+        self._notes.append(
+            f"{self._shown} closes loops by constraints: the controller takes their motion at home (B in robot.py), "
+            "and may be less accurate far from it"
+        )
+        return motions
 
     # -- numbers
 

@@ -106,7 +106,7 @@ def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
 def _robot_values(robot: Robot) -> dict[str, str]:
     joints = {joint.name: joint for joint in robot.joints}
     drives = [joints[driven] for driven in robot.driven]
-    is_exact = len(drives) == len(joints) and not robot.has_constraints
+    is_exact = len(drives) == len(joints)
     names = ["DRIVEN", "JOINTS", *(["TOUCHING"] if robot.touching else []), "B", "add_robot", "limits"]
     return {
         "model_file": robot.model.name,
@@ -116,6 +116,7 @@ def _robot_values(robot: Robot) -> dict[str, str]:
         "joints": "\n".join(map(_joint, robot.joints)),
         "driven": _list("DRIVEN = ", [json.dumps(name) for name in robot.driven]),
         "away": _list("AWAY = ", [_number(value) for value in robot.away]),
+        "B": _motions(robot),
         "couplings": "".join(
             f"B[list(JOINTS).index({json.dumps(c.joint)}), DRIVEN.index({json.dumps(c.leader)})] = "
             f"{_number(c.multiplier)}  # it follows\n"
@@ -150,6 +151,21 @@ _FILTER = """\
         touching = plant.CollectRegisteredGeometries([plant.GetBodyByName(name) for name in TOUCHING])
         scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(touching))
 """
+
+
+_SELECTION = """\
+# The velocities of all joints are B times those of the driven ones.
+B = np.array([[float(name == driven) for driven in DRIVEN] for name in JOINTS])
+"""
+
+
+def _motions(robot: Robot) -> str:
+    if robot.motions is None:
+        return _SELECTION
+    rows = [", ".join(map(_number, np.round(row, 3))) for row in robot.motions]
+    lines = "".join(f"        [{row}],\n" for row in rows)
+    comment = "# Near home, the velocities of all joints are B times those of the driven ones."
+    return f"{comment}\nB = np.array(\n    [\n{lines}    ]\n)\n"
 
 
 def _number(value: float) -> str:
