@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -236,10 +237,10 @@ class ContinuousServo(ServoScenario):
         return Deployment(continuity={"velocity": ("speed", 0.1)})
 
 
-@pytest.fixture
-def log(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def recorded_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of two axes that are switched to real in cycle 10, and stand still until then."""
-    scenario, clock, path = ContinuousServo(), SimulatedClock(), tmp_path / "servo.lcm"
+    scenario, clock, path = ContinuousServo(), SimulatedClock(), tmp_path_factory.mktemp("log") / "servo.lcm"
 
     def sensors(t: float) -> dict[str, Any]:
         return {"position": [0.0, 0.0], "speed": [0.0, 0.0]}
@@ -253,6 +254,11 @@ def log(tmp_path: Path) -> Path:
         runtime.write({"u.target": [0.01, 0.0]})
         runtime.run(cycles=30)
     return path
+
+
+@pytest.fixture
+def log(recorded_log: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(recorded_log, tmp_path))
 
 
 def test_log_is_a_trace(log: Path) -> None:
