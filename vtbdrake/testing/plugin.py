@@ -56,14 +56,18 @@ def parametrize_with_checks(
     from vtbdrake.testing.checks import CHECKS
     from vtbdrake.testing.subject import Subject
 
+    # The subject of one scenario at a time: a testbed with its contexts can be large.
+    present: dict[int, Subject] = {}
     cases = []
     for number, scenario in enumerate(scenarios):
         expected = checked_expectations(_of(scenario, expected_failed_checks))
-        subject = Subject(scenario, values=_of(scenario, values), horizon=horizon)
         for check in CHECKS:
 
-            def run(scenario: Scenario, check: Any = check, subject: Subject = subject) -> None:
-                error = subject.outcome(check)
+            def run(scenario: Scenario, check: Any = check, number: int = number) -> None:
+                if number not in present:
+                    present.clear()
+                    present[number] = Subject(scenario, values=_of(scenario, values), horizon=horizon)
+                error = present[number].outcome(check)
                 if isinstance(error, CheckSkippedError):
                     pytest.skip(str(error))
                 if error is not None:
