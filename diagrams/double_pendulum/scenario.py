@@ -14,7 +14,7 @@ from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import ErrorModel, JointEncoders
 from vtbdrake.settings import setting
-from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
@@ -39,13 +39,25 @@ class DoublePendulumScenario(Scenario):
     period: float = setting(0.002, "The sample period of sensors, DPS and drives.", unit="s", gt=0)
     torque_limit: float = setting(10.0, "The largest torque of a motor.", unit="N m", gt=0)
     upper_length: float = setting(0.2, "From the shoulder to the elbow.", unit="m", gt=0)
-    masses: tuple[float, float] = setting((0.6, 0.6), "Masses of the links.", unit="kg", gt=0)
-    centers: tuple[float, float] = setting((0.15, 0.2), "From the joint to the link's centre of mass.", unit="m", ge=0)
-    moments: tuple[float, float] = setting((0.01, 0.01), "Moments about the centre of mass.", unit="kg m^2", gt=0)
+    masses: list[float] = setting(doc="Masses of the links.", unit="kg", gt=0, default_factory=lambda: [0.6, 0.6])
+    centers: list[float] = setting(
+        doc="From the joint to the link's centre of mass.", unit="m", ge=0, default_factory=lambda: [0.15, 0.2]
+    )
+    moments: list[float] = setting(
+        doc="Moments about the centre of mass.", unit="kg m^2", gt=0, default_factory=lambda: [0.01, 0.01]
+    )
     rotor_inertia: float = setting(5e-5, "Of each motor, before its gear.", unit="kg m^2", ge=0)
     viscous: float = setting(1e-3, "Viscous friction of each drive.", unit="N m s/rad", ge=0)
     coulomb: float = setting(0.1, "Coulomb friction of each drive.", unit="N m", ge=0)
     errors: ErrorModel = field(default_factory=ErrorModel)
+
+    def validate(self) -> None:
+        super().validate()
+        for name in ("masses", "centers", "moments"):
+            if len(getattr(self, name)) != len(LINKS):
+                raise ScenarioError(
+                    f"DoublePendulumScenario.{name} has one value per link, two, not {getattr(self, name)}"
+                )
 
     def interface(self) -> Interface:
         limit = self.torque_limit

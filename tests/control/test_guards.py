@@ -513,6 +513,45 @@ def test_pause_begins_after_eleven_periods(periods: float, departs: bool) -> Non
     assert abs(loop.cycle({"torque": [2.0, 2.0]}).actuation["torque"] - start).max() <= RATE * T + 1e-9
 
 
+@pytest.mark.parametrize(
+    ("pause", "max_age", "departs"),
+    [(11.0, 4.0, False), (12.0, 4.0, True), (12.0, 12.0, False), (13.0, 12.0, True)],
+)
+def test_pause_begins_beyond_eleven_periods_and_the_age_of_the_measurement(
+    pause: float, max_age: float, departs: bool
+) -> None:
+    """Times in periods of 2^-10 s, whose sums have no rounding."""
+    period = 2.0**-10
+    signal = Signal("torque", size=1, lower=-10.0, upper=10.0, rate=1.0, idle=0.0)
+    acting = Signal("acting", size=1, max_age=max_age * period)
+    guards = Guards(Interface(sense=[acting], act=[signal]), period, fallback={"torque": Hold()})
+    guards.measured_by = {"torque": "acting"}
+    guards.start("torque", [0.0])
+    received = {"acting": ReceivedSignal(value=np.zeros(1), arrived=0.0, count=1)}
+    guards.judge(0.0, received, {"torque": [0.0]})
+    received["acting"] = ReceivedSignal(value=np.array([5.0]), arrived=pause * period, count=2)
+    guards.judge(pause * period, received, {"torque": [5.0]})
+    assert guards.limiters["torque"].last_sent == pytest.approx([5.0 if departs else period])
+
+
+def test_signal_goes_on_from_its_last_command_while_another_is_lost() -> None:
+    """Even if no lost command is allowed."""
+    sense = [Signal("acting", size=2), Signal("at", size=1)]
+    guards = Guards(Interface(sense=sense, act=[TORQUE, POSITION]), T, max_missed=0)
+    guards.measured_by = {"torque": "acting", "position": "at"}
+    commands = {"torque": [0.0, 0.0], "position": [0.0]}
+    for name, command in commands.items():
+        guards.start(name, command)
+    measured = {"acting": np.zeros(2), "at": np.array([0.5])}
+    for k in range(3):
+        received = {name: ReceivedSignal(value=value, arrived=k * T, count=k + 1) for name, value in measured.items()}
+        verdict = guards.judge(k * T, received, commands)
+        guards.note_unsent(["torque"] if k == 1 else [])
+    # The torque is lost in the second cycle. In the first one, both departed from what is measured.
+    assert kinds(verdict) == [("torque", "not sent")]
+    assert 0.5 - 4.0 * T < verdict.actuation["position"][0] < 0.5 - 1e-4
+
+
 @pytest.mark.parametrize("measures", [True, False])
 def test_command_after_outage_departs_from_measurement_or_last_sent(measures: bool) -> None:
     loop = measured_loop(fallback={"torque": Hold()})

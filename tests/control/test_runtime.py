@@ -15,8 +15,8 @@ from vtbdrake.control.pace import SETTLED
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import LoopStatistics
-from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.testbed import DpsAlone, Interface
+from vtbdrake.control.switching import SwitchRefusedError, checked_continuity
+from vtbdrake.testbed import DpsAlone, Interface, Signal
 
 TARGET = np.array([0.2, -0.1])
 
@@ -883,6 +883,19 @@ def test_invalid_settings_are_rejected(settings, message):
     clock = SimulatedClock()
     with pytest.raises(ValueError, match=message):
         Runtime(scenario.build(), ScriptedBridge(scenario.interface(), clock, still), clock=clock, **settings)
+
+
+def test_continuity_of_each_signal_is_checked_and_may_be_none_or_exact():
+    act = [Signal(name, size=2, unit="m/s", idle=0.0) for name in ("free", "exact", "near")]
+    interface = Interface(sense=[Signal("speed", size=2)], act=act)
+    continuity = {"free": None, "exact": ("speed", 0.0), "near": ("speed", [0.1, 0.2])}
+    checked = checked_continuity(interface, continuity, period=PERIOD)
+    assert {name: (sensor, limit.tolist()) for name, (sensor, limit) in checked.items()} == {
+        "exact": ("speed", [0.0, 0.0]),
+        "near": ("speed", [0.1, 0.2]),
+    }
+    with pytest.raises(ValueError, match="not from 'near' to 'sped'"):
+        checked_continuity(interface, {**continuity, "near": ("sped", 0.1)}, period=PERIOD)
 
 
 def test_paced_loop_on_simulated_clock_is_rejected():

@@ -2,6 +2,7 @@
 
 from vtbdrake.testing import parametrize_with_checks
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.motions import Motion
@@ -11,12 +12,10 @@ from vtbdrake_diagrams.satellite.studies.arm_motion import ArmMotionScenario
 from vtbdrake_diagrams.satellite.studies.lighting import LightingScenario
 from vtbdrake_diagrams.satellite.studies.scan_frequency import ApproachScenario
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
-from vtbdrake_diagrams.station import ArmStation
+from vtbdrake_diagrams.station import HOME, ArmStation
 
 SIMULATED_TIME = "its messages tell the time of a simulation, which stands still when the machine is held up"
-SAMPLED_PORTS = (
-    "Drake's plants with sampled output ports advance before the systems that sample them at the same instant"
-)
+NOT_SAMPLED = "Drake's drivers do not sample: beside them, the DPS sees the plant after its step of the same instant"
 
 # With what is set before a simulation, so that something moves.
 SCENARIOS = {
@@ -30,12 +29,16 @@ SCENARIOS = {
     ApproachScenario: {},
     ForestScenario: {},
     PlainScenario: {},
-    ArmStation: {"u.opening": 0.1},
+    ArmStation: {"u.target": HOME + 0.1, "u.opening": 0.1},
+    DoublePendulumScenario: {"u.torques": [0.5, 0.3]},
 }
 EXPECTED = {
     ManipulatorScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
     CartPoleScenario: {"check_late_samples_end_in_the_fallback": SIMULATED_TIME},
-    ArmStation: dict.fromkeys(("check_dps_cannot_tell_the_switch", "check_dps_alone_commands_the_same"), SAMPLED_PORTS),
+    ArmStation: {
+        "check_dps_cannot_tell_the_switch": NOT_SAMPLED,
+        "check_dps_alone_commands_the_same": NOT_SAMPLED,
+    },
 }
 
 

@@ -126,7 +126,7 @@ def check_scenario(
 
     Raises:
         ScenarioCheckError: A check failed that was not expected to, or passed although it was expected to fail.
-        ValueError: ``scenario`` is no scenario, or there is no check of an expected name.
+        ValueError: ``scenario`` is no scenario, or there is no check of an expected name, or no variable of an address.
     """
     from vtbdrake.testing.subject import Subject
 

@@ -133,6 +133,7 @@ class LockStep(AbstractContextManager["LockStep"]):
         machine: The machine; `Machine.begin` injects faults.
         clock: The clock of the loop, which advances by a period per cycle.
         bridge: The connection of the two.
+        deployment: How the DPS runs.
         runtime: The loop.
 
     Raises:
@@ -153,11 +154,11 @@ class LockStep(AbstractContextManager["LockStep"]):
         self.clock = SimulatedClock()
         self.bridge = MachineBridge(self.machine, self.clock)
         # By the clock: where messages began the cycles, those that fail to come would stop it.
-        deployment = Deployment.of(scenario, pace="")
+        self.deployment = Deployment.of(scenario, pace="")
         target = target or DpsAlone(scenario)
         context = target.default_context()
         target.write(context, values or {})
-        self.runtime: Runtime = deployment.runtime(
+        self.runtime: Runtime = self.deployment.runtime(
             target, self.bridge, context=context, clock=self.clock, watchers=watchers
         )
 

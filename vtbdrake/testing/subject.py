@@ -54,7 +54,14 @@ class Subject:
         self._outcomes: dict[str, CheckFailedError | CheckSkippedError | None] = {}
 
     def outcome(self, check: Callable[[Subject], None]) -> CheckFailedError | CheckSkippedError | None:
-        """Return the error of a check, or None if it passes; it runs once."""
+        """Return the error of a check, or None if it passes; it runs once.
+
+        Raises:
+            ValueError: The testbed has no variable of an address in ``values``.
+        """
+        if isinstance(self.built, VirtualTestbed):
+            for address in self.values:
+                self.built.variables()[address]
         name = check.__name__
         if name not in self._outcomes:
             try:
@@ -99,7 +106,7 @@ class Subject:
     def started(self, testbed: VirtualTestbed) -> Context:
         """Return a new context of ``testbed`` with the values set."""
         context = testbed.default_context()
-        testbed.write(context, {a: value for a, value in self.values.items() if a in testbed.variables()})
+        testbed.write(context, self.values)
         return context
 
     @cached_property

@@ -57,7 +57,8 @@ def check_dps_cannot_tell_the_switch(subject: Subject) -> None:
     """Check that the same measurements through the real ports give the same commands.
 
     Then what was developed in the simulation holds on the machine. A DPS that can tell has another way to the simulated
-    world: a command that comes from there, or an object in Python that both know.
+    world (a command that comes from there, an object in Python that both know), or a sensor that is not sampled: beside
+    a discrete plant it shows the plant after the step of the same instant. Sample it.
     """
     testbed = subject.testbed
     _refuse_continuous(testbed)
@@ -70,7 +71,7 @@ def check_dps_alone_commands_the_same(subject: Subject) -> None:
     """Check that the DPS without the simulated world gives the same commands for the same measurements.
 
     So it runs on the machine. A DPS that does not has read what building or simulating the world leaves behind: give it
-    what it needs by fields of the scenario.
+    what it needs by fields of the scenario. Or a simulated sensor is not sampled, see the check of the switch.
     """
     testbed = subject.testbed
     _refuse_continuous(testbed)

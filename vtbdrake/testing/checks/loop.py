@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import ceil, isfinite
 
+from vtbdrake.control.fallback import chain, default_fallback
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
@@ -165,8 +166,13 @@ def _expect_fallback(loop: LockStep, event: str) -> None:
     if not guards.latched:
         raise CheckFailedError(f"{event}, and after {loop.clock.now():.3g} s the DPS still commands")
     loop.runtime.run(cycles=_BEFORE)
-    if failures := [fault.reason for fault in guards.log if fault.kind == FaultKind.FALLBACK]:
-        raise CheckFailedError(f"{event}, and then the fallback fails: {'; '.join(failures)}")
+    fallbacks = loop.deployment.guards.get("fallback", {})
+    for signal in interface.act:
+        links = chain(fallbacks.get(signal.name) or default_fallback(signal), signal, interface=interface)
+        failures = [f.reason for f in guards.log if f.kind == FaultKind.FALLBACK and f.signal == signal.name]
+        # That one hands over to the next is in order.
+        if len(failures) >= len(links):
+            raise CheckFailedError(f"{event}, and then every fallback fails: {'; '.join(failures)}")
 
 
 def _holds_floats(loop: LockStep, channel: str) -> bool:

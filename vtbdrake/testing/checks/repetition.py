@@ -31,6 +31,8 @@ from vtbdrake.testing.check import CheckFailedError
 from vtbdrake.testing.checks.scenario import check_pickle_round_trip, check_yaml_round_trip
 from vtbdrake.testing.subject import Subject
 
+_NOISE = 3  # objects that Python itself may make meanwhile
+
 
 def check_simulates(subject: Subject) -> None:
     """Check that the first part of a simulation does not fail.
@@ -201,7 +203,7 @@ def check_runs_keep_no_memory(subject: Subject) -> None:
         counts.append(len(gc.get_objects()))
     # The first runs fill caches.
     grown = [after - before for before, after in pairwise(counts[1:])]
-    if min(grown) > 0:
+    if min(grown) > _NOISE:
         raise CheckFailedError(
             f"every simulation of {count} samples leaves {min(grown)} objects of Python behind: something outside of "
             "the Context keeps them"
