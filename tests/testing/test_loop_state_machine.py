@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import run_state_machine_as_test
 from pydrake.systems.framework import System
+from pydrake.systems.primitives import ConstantVectorSource
 
 from tests.control.scripted import PERIOD, Servo, ServoScenario
 from tests.control.servo_machine import ServoMachineScenario
@@ -20,7 +21,7 @@ from vtbdrake.control.limits import Bounds, PassThrough
 from vtbdrake.lcm.protocol import ProtocolError
 from vtbdrake.machine import Delay, Machine
 from vtbdrake.machine.injected_faults import ACT, SENSE
-from vtbdrake.testbed import Interface, Scenario, Signal, WorldAlone
+from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder, WorldAlone
 from vtbdrake.testing.lock_step import MachineBridge
 from vtbdrake.testing.stateful import loop_state_machine
 from vtbdrake.testing.strategies import bad_samples, commands, injected_faults, samples, sensor_samples
@@ -74,6 +75,20 @@ def test_cart_pole_keeps_the_rules() -> None:
 @pytest.mark.parametrize("alone", [False, True])
 def test_arm_keeps_the_rules(alone: bool) -> None:
     run(ManipulatorScenario(), examples=4, alone=alone, values=FOLLOW)
+
+
+@dataclass
+class GuidedServo(MovedServo):
+    """Two axes whose target comes from inside the testbed."""
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        super().add_world(builder)
+        target = builder.add("env", "target", ConstantVectorSource([0.1, 0.0]))
+        builder.command("target", target.get_output_port())
+
+
+def test_commands_from_inside_are_not_written() -> None:
+    run(GuidedServo(), examples=5)
 
 
 # -- loops that break one

@@ -167,7 +167,9 @@ def loop_state_machine(
 
         @stateful.rule(values=commands(interface))
         def command(self, values: dict[str, Any]) -> None:
-            self.runtime.write(values)
+            # Some commands may come from inside the testbed.
+            variables = self.runtime.target.variables()
+            self.runtime.write({address: value for address, value in values.items() if address in variables})
 
         @stateful.invariant()
         def rules_are_kept(self) -> None:
