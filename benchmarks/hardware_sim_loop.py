@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from drake import lcmt_schunk_wsg_command
-from pydrake.common.value import Value
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.geometry import SceneGraphConfig
 from pydrake.lcm import DrakeLcm, DrakeLcmParams
@@ -23,9 +22,8 @@ from pydrake.manipulation import (
 from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from pydrake.systems.framework import DiagramBuilder, System, TriggerType
-from pydrake.systems.lcm import ApplyLcmBusConfig, LcmBuses, LcmInterfaceSystem, LcmPublisherSystem
-from pydrake.systems.primitives import ConstantValueSource
+from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.lcm import ApplyLcmBusConfig, LcmBuses, LcmInterfaceSystem
 from pydrake.systems.sensors import ApplyCameraConfig, CameraConfig
 
 
@@ -59,10 +57,12 @@ class Plain:
     Attributes:
         simulator: Its Simulator.
         plant: Its plant.
+        bus: Its bus, if it is not one of the file.
     """
 
     simulator: Simulator
     plant: MultibodyPlant
+    bus: DrakeLcm | None
 
     def states(self, times: np.ndarray) -> np.ndarray:
         """Advance to each of the times, and return the plant's states there."""
@@ -112,13 +112,14 @@ def build(
     for name, url in urls.items():
         scenario.model_drivers[name].lcm_bus = f"bus_{name}"
         scenario.lcm_buses[f"bus_{name}"] = DrakeLcmParams(lcm_url=url)
-    if bus is None:
-        scenario.lcm_buses.pop("default")
-        buses = ApplyLcmBusConfig(lcm_buses=scenario.lcm_buses, builder=builder)
-    else:
-        builder.AddSystem(LcmInterfaceSystem(bus))
-        buses = LcmBuses()
-        buses.Add("default", bus)
+    scenario.lcm_buses.pop("default")
+    # What is to be published here needs a bus in Python.
+    own, name = (bus, "default") if grip is None else (DrakeLcm(urls["wsg"]), "bus_wsg")
+    scenario.lcm_buses.pop(name, None)
+    buses = ApplyLcmBusConfig(lcm_buses=scenario.lcm_buses, builder=builder) if scenario.lcm_buses else LcmBuses()
+    if own is not None:
+        builder.AddSystem(LcmInterfaceSystem(own))
+        buses.Add(name, own)
     ApplyDriverConfigs(
         driver_configs=scenario.model_drivers,
         sim_plant=plant,
@@ -133,22 +134,11 @@ def build(
     for name, source in (sources or {}).items():
         builder.AddSystem(source)
         builder.Connect(source.get_output_port(), builder.GetSubsystemByName("iiwa").GetInputPort(name))
-    if grip is not None:
-        message = builder.AddSystem(ConstantValueSource(Value(grip)))
-        publisher = builder.AddSystem(
-            LcmPublisherSystem.Make(
-                channel="SCHUNK_WSG_COMMAND",
-                lcm_type=lcmt_schunk_wsg_command,
-                lcm=buses.Find("the test", "bus_wsg"),
-                publish_triggers={TriggerType.kForced},
-            )
-        )
-        builder.Connect(message.get_output_port(), publisher.get_input_port())
     simulator = Simulator(builder.Build())
     ApplySimulatorConfig(scenario.simulator_config, simulator)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     arm = plant.GetModelInstanceByName("iiwa")
     plant.SetPositions(context, arm, plant.GetPositions(context, arm) + offset)
-    if grip is not None:
-        publisher.ForcedPublish(publisher.GetMyContextFromRoot(simulator.get_context()))
-    return Plain(simulator, plant)
+    if own is not None and grip is not None:
+        own.Publish("SCHUNK_WSG_COMMAND", grip.encode())
+    return Plain(simulator, plant, own)
