@@ -307,6 +307,19 @@ def _downhill(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("settings", ["lagged", "cenic", "sap", "similar"])
+def test_ball_rests_on_its_springs(verify: Verify, settings: str) -> None:
+    """Resting ball: where the contact of two materials carries its weight, it stays.
+
+        m g = k x,   1 / k = 1 / k_ball + 1 / k_ground,   x = 0.981 mm
+
+    Reference: this depth, after 0.5 s, with k_ball = 30 kN/m and k_ground = 15 kN/m. Tolerance: 1e-9 m, 1e-6 of it.
+    """
+    depth = G / 1e4
+    run = Run(_with_contact(Ball, settings, stiffness=1e4), {}).to(0.5)
+    verify("depth", 0.1 - run.pose("ball").translation()[2], depth, tolerance=1e-9, unit="m")
+
+
+@pytest.mark.parametrize("settings", ["lagged", "cenic", "sap", "similar"])
 @pytest.mark.parametrize("friction", [0.5, 0.08], ids=["mu 0.5", "mu 0.08"])
 def test_ball_rolls_down_a_slope(verify: Verify, settings: str, friction: float) -> None:
     """Rolling ball: on a slope of 15 deg it rolls, for which it needs mu >= 2/7 tan(15 deg) = 0.0766.

@@ -517,7 +517,11 @@ def _slope(plant: MultibodyPlant, angle: float, properties: ProximityProperties)
 
 @dataclass
 class Ball(World):
-    """A ball on a slope; it starts where the contact carries its weight."""
+    """A ball on a slope; it starts where the contact carries its weight.
+
+    Ball and ground are of different materials: in series their stiffness is ``stiffness``, and the harmonic mean of
+    their friction coefficients is ``friction``.
+    """
 
     plant_config: MultibodyPlantConfig = field(default_factory=lambda: discrete(1e-3))
     angle_deg: float = 0.0
@@ -532,10 +536,11 @@ class Ball(World):
         ball = plant.AddRigidBody(
             "ball", instance, SpatialInertia(self.mass, np.zeros(3), UnitInertia(gyration, gyration, gyration))
         )
-        # Two equal springs in series.
-        properties = material(self.friction, 2.0 * self.stiffness)
-        plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(self.radius), "ball", properties)
-        _slope(plant, np.radians(self.angle_deg), properties)
+        # 1 / 3 + 1 / 1.5 = 1, and 2 / (1 / 1.5 + 1 / 0.75) = 1.
+        of_ball = material(1.5 * self.friction, 3.0 * self.stiffness)
+        of_ground = material(0.75 * self.friction, 1.5 * self.stiffness)
+        plant.RegisterCollisionGeometry(ball, RigidTransform(), Sphere(self.radius), "ball", of_ball)
+        _slope(plant, np.radians(self.angle_deg), of_ground)
         normal = RotationMatrix.MakeYRotation(np.radians(self.angle_deg)).col(2)
         sunk = self.mass * G * normal[2] / self.stiffness
         plant.SetDefaultFloatingBaseBodyPose(ball, RigidTransform((self.radius - sunk) * normal))
