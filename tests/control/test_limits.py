@@ -115,8 +115,9 @@ def test_command_that_cannot_stop_is_reduced(acceleration: float, upper: float, 
 
 @pytest.mark.parametrize("limits", [{"acceleration": 1.0 / T**2}, {"rate": 1.0 / T}])
 def test_command_at_the_limit_passes_without_rounding(limits: dict[str, float]) -> None:
-    one = limiter(-1.0, **limits, upper=0.0)
-    assert one.limit([-1e-300]).item() == -1e-300
+    for side in (1.0, -1.0):
+        one = limiter(-side, **limits, lower=min(-side, 0.0), upper=max(-side, 0.0))
+        assert one.limit([-side * 1e-300]).item() == -side * 1e-300
 
 
 @given(st.lists(st.floats(-0.999, 0.999), min_size=1, max_size=60))
