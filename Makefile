@@ -19,11 +19,7 @@ STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
-<<<<<<< HEAD
-.PHONY: help python setup demo demo-control test check docs dist answers bench clean stale
-=======
-.PHONY: help python setup demo demo-control test verify check docs answers bench clean stale
->>>>>>> 79a6266 (make verify: 41 cases with known answers, in four groups, with tolerances from the orders of the integrators; docs/verification.md)
+.PHONY: help python setup demo demo-control test verify check docs dist answers bench clean stale
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
