@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.testing.check import CheckFailedError, CheckSkippedError
 from vtbdrake.testing.subject import Subject, command_readers
 
+_SAME_INSTANT = 1e-12  # s
 _ROUNDING = 1e-6  # of a value: many messages carry 32 bits
 
 
@@ -97,7 +99,7 @@ def _repeat_commands(subject: Subject, target: Any, context: Any, feed: Feed, wh
     expected = testbed.simulator(expected_context)
     expected.Initialize()
     sense, commands = subject.readers(testbed)
-    for instant in subject.instants.tolist():
+    for instant in _event_times(testbed, float(subject.instants[-1])):
         if instant > expected_context.get_time():
             expected.AdvanceTo(instant)
             assert simulator is not None
@@ -122,6 +124,16 @@ def _repeat_commands(subject: Subject, target: Any, context: Any, feed: Feed, wh
                     f"with the measurements of the simulation, the DPS {where} commands another {name} from "
                     f"t = {instant:g} s on: {_text(same)} instead of {_text(command)}"
                 )
+
+
+def _event_times(testbed: VirtualTestbed, end: float) -> list[float]:
+    """Return 0 and the times of all periodic updates up to ``end``: between two, no sampled value changes."""
+    times = {0.0, end}
+    for period, offset in testbed.event_timings():
+        times.update(offset + n * period for n in range(int((end - offset) / period) + 1))
+    in_order = sorted(time for time in times if 0.0 <= time <= end)
+    # Two ways to compute one instant differ in the last bits; Drake stops at the first.
+    return [0.0, *(time for before, time in pairwise(in_order) if time - before > _SAME_INSTANT)]
 
 
 def _refuse_continuous(testbed: VirtualTestbed) -> None:
