@@ -127,8 +127,7 @@ def test_torques_of_the_straight_iiwa(verify: Verify) -> None:
     torques. Tolerance: 1e-10 of 1000 rad/s^2, rounding.
     """
     m_2, m_5, g = 6.35, 3.5, 9.8
-    tau = [1.0, g * (0.0003 * m_2 + 0.0001 * m_5) * 0, 1.0, 0.0, 1.0, 0.0, 1.0]
-    tau[1], tau[3] = g * (0.0003 * m_2 + 0.0001 * m_5), -g * 0.0001 * m_5
+    tau = [1.0, g * (0.0003 * m_2 + 0.0001 * m_5), 1.0, -g * 0.0001 * m_5, 1.0, 0.0, 1.0]
     run = Run(Iiwa(), {"u.force": tau})
     accelerations = [run.derivative(f"joint_{k}") for k in range(1, 8)]
     verify("accelerations", accelerations, [0, 0, 0, 0, 0, 0, 1000.0], tolerance=1e-7, unit="rad/s^2")
