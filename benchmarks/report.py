@@ -93,7 +93,8 @@ _PAGE = """\
 # Benchmarks
 
 `make bench` measures every claim of speed as a ratio: what is compared runs in turns in one run, so that a slower
-machine, or other load, changes both. `make bench PAGE=1` writes this page{only}.
+machine changes both. Other load spoils ratios of some per cent, and everything about real time. `make bench PAGE=1`
+writes this page{only}.
 
 Measured on {date}: {machine}.
 
@@ -110,7 +111,7 @@ def results_page(results: Sequence[Benchmark | Crash], *, only: Sequence[str] = 
     rows = [_crash_row(r) if isinstance(r, Crash) else _row(r) for r in results]
     notes = [f"* {r.name}: {r.note}" for r in results if isinstance(r, Benchmark) and r.note]
     return _PAGE.format(
-        only=f"; this one has the rows of `make bench PAGE=1 ONLY='{' '.join(only)}'`" if only else "",
+        only=f"; this one has only the rows of\n`ONLY='{' '.join(only)}'`" if only else "",
         date=date.today().isoformat(),
         machine=machine(),
         rows="\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows),

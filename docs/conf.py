@@ -62,8 +62,9 @@ maximum_signature_line_length = 100
 napoleon_use_ivar = True
 
 API = Path(__file__).parent / "_api"  # written by each build
-# The command line has a page of its own; messages are made by lcm-gen; the parent lists the names of `live`.
-WITHOUT_PAGE = ("vtbdrake.cli", "vtbdrake.recording.lcm_types", "vtbdrake.monitoring.live")
+# The command line, and the projects that it writes, have pages of their own; messages are made by lcm-gen; the names of
+# `live` are those of its parent.
+WITHOUT_PAGE = ("vtbdrake.cli", "vtbdrake.project", "vtbdrake.recording.lcm_types", "vtbdrake.monitoring.live")
 # Modules beside the packages that users import from.
 MODULES = ("vtbdrake.deployment", "vtbdrake.settings", "vtbdrake.scan", "vtbdrake.spline")
 
@@ -207,6 +208,7 @@ def setup(app: Sphinx) -> None:
         if field.name == "variable":
             field.label = "Attributes"  # a variable is something else here
     app.add_directive("pydrake_system", PydrakeSystem)
+    app.connect("env-get-outdated", lambda *_: [root_doc])  # its navigation depends on the reference
     app.connect("source-read", add_navigation)
     app.connect("autodoc-process-docstring", mend_docstring, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", mend_signature)

@@ -16,7 +16,7 @@ import griffe
 ROOT = Path(__file__).resolve().parents[1]
 BASELINE = Path(__file__).with_suffix(".txt")
 # Programs, messages, and what the parent lists; and the modules beside the packages that users import from.
-_NOT_PUBLIC = ("vtbdrake.cli", "vtbdrake.recording.lcm_types", "vtbdrake.monitoring.live")
+_NOT_PUBLIC = ("vtbdrake.cli", "vtbdrake.project", "vtbdrake.recording.lcm_types", "vtbdrake.monitoring.live")
 _MODULES = ("vtbdrake.deployment", "vtbdrake.settings", "vtbdrake.scan", "vtbdrake.spline")
 
 
