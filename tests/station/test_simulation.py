@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -57,15 +58,26 @@ def commander(key: str, opening: float, force: float) -> Callable[[vtb.Station],
     return make_dps
 
 
-@pytest.mark.parametrize(("key", "opening"), [("Torque", 0.1), ("Position", 0.01), ("PositionAndTorque", 0.039)])
-def test_motion_is_that_of_hardware_sim_bit_for_bit(key: str, opening: float) -> None:
+@pytest.mark.parametrize(
+    ("key", "opening", "gains"),
+    [
+        ("Torque", 0.1, ""),
+        ("Position", 0.01, ""),
+        ("PositionAndTorque", 0.039, ""),
+        ("Torque", 0.06, "pid_gains: [7200.0, 3000.0, 5.0]"),
+    ],
+)
+def test_motion_is_that_of_hardware_sim_bit_for_bit(key: str, opening: float, gains: str, tmp_path: Path) -> None:
+    shutil.copytree(FILE.parent, tmp_path / "station")
+    file = tmp_path / "station" / FILE.name
+    file.write_text(FILE.read_text().replace("!SchunkWsgDriver {}", f"!SchunkWsgDriver {{ {gains} }}"))
     grip = lcmt_schunk_wsg_command()
     grip.utime, grip.target_position_mm, grip.force = 1, 1e3 * opening, 30.0
     urls = {"iiwa": "memq://null", "wsg": "memq://wsg"}
-    reference = hardware_sim_loop.build(FILE, key, urls=urls, grip=grip, sources=sources(key))
+    reference = hardware_sim_loop.build(file, key, urls=urls, grip=grip, sources=sources(key))
     expected = reference.states(TIMES)
 
-    testbed = vtb.Station(f"{FILE}#{key}", dps=commander(key, opening, 30.0)).build()
+    testbed = vtb.Station(f"{file}#{key}", dps=commander(key, opening, 30.0)).build()
     simulator = testbed.simulator()
     context = testbed.plant.GetMyContextFromRoot(simulator.get_context())
     for time, state in zip(TIMES, expected, strict=True):

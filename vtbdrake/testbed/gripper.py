@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import isfinite
 from typing import Any
 
@@ -80,12 +81,15 @@ class SchunkWsgControl(AddressedSystem):
         self._state_port = self.DeclareVectorInputPort("state", 4)
         self._gains = float(kp), float(ki), float(kd)
         self._motion = self.declare_discrete_state(
-            last_position=Quantity(0.0, "m"),
+            moves=Quantity(0.0, "1", (0.0, 1.0)),
+            target=Quantity(0.0, "m"),
             max_force=Quantity(0.0, "N"),
-            moving=Quantity(0.0, "1", (0.0, 1.0)),
-            start_position=Quantity(0.0, "m"),
-            target_position=Quantity(0.0, "m"),
-            start_time=Quantity(0.0, "s"),
+            start=Quantity(0.0, "s"),
+            # After the start: when the second and the third part of the ramp begin, and when it ends.
+            begins=Quantity(np.zeros(2), "s"),
+            end=Quantity(0.0, "s"),
+            # Of each part: [g, dg/dt] at its begin, and their slopes.
+            parts=Quantity(np.zeros((3, 4)), "m, m/s, m/s^2"),
         )
         motion = self.discrete_state_ticket(self._motion.index)
         self.DeclareVectorOutputPort(
@@ -102,17 +106,20 @@ class SchunkWsgControl(AddressedSystem):
         target, limit = -float(self._position_port.Eval(context)[0]), float(self._force_port.Eval(context)[0])
         if not (isfinite(target) and isfinite(limit)):
             raise ValueError(f"a gripper is commanded with finite numbers, not to {-target} m with {limit} N")
-        position = 2.0 * float(self._state_port.Eval(context)[0])
-        after.last_position = position
         after.max_force = limit
-        if not before.moving or abs(before.target_position - target) > _SMALLEST_CHANGE:
-            after.moving, after.start_position, after.target_position = 1.0, position, target
-            after.start_time = context.get_time()
+        if not before.moves or abs(before.target - target) > _SMALLEST_CHANGE:
+            parts, after.end = _ramp(2.0 * float(self._state_port.Eval(context)[0]), target)
+            after.moves, after.target, after.start = 1.0, target, context.get_time()
+            after.begins, after.parts = [begin for begin, *_ in parts[1:]], [part for _, *part in parts]
 
     def _errors(self, context: Context) -> tuple[float, float, float, float, float]:
         """Return the errors of mean and grip, those of their rates, and the force limit."""
-        last, limit, moving, start, target, start_time = self._motion.array(context).tolist()
-        grip, rate = _ramp(context.get_time() - start_time, start, target) if moving else (last, 0.0)
+        _, _, limit, start, second, third, end, *parts = self._motion.array(context).tolist()
+        # As PiecewisePolynomial does: a part lasts until the next one begins, and beyond its ends nothing moves.
+        elapsed = min(max(context.get_time() - start, 0.0), end)
+        begin, k = (0.0, 0) if elapsed < second else (second, 4) if elapsed < third else (third, 8)
+        grip = parts[k] + (elapsed - begin) * parts[k + 2]
+        rate = parts[k + 1] + (elapsed - begin) * parts[k + 3]
         q0, q1, v0, v1 = self._state_port.Eval(context).tolist()
         return -(0.5 * q0 + 0.5 * q1), grip - (q0 - q1), -(0.5 * v0 + 0.5 * v1), rate - (v0 - v1), limit
 
@@ -126,7 +133,8 @@ class SchunkWsgControl(AddressedSystem):
         mean_integral, grip_integral = self._integrals(context)
         mean_force = kp * mean + kd * mean_rate + ki * mean_integral
         grip_force = min(max(kp * grip + kd * grip_rate + ki * grip_integral, -0.5 * limit), 0.5 * limit)
-        output.SetFromVector([0.5 * mean_force + grip_force, 0.5 * mean_force - grip_force])
+        output.SetAtIndex(0, 0.5 * mean_force + grip_force)
+        output.SetAtIndex(1, 0.5 * mean_force - grip_force)
 
 
 class SchunkWsgIntegralControl(SchunkWsgControl):
@@ -145,11 +153,14 @@ class SchunkWsgIntegralControl(SchunkWsgControl):
         derivatives.get_mutable_vector().SetFromVector([mean, grip])
 
 
-def _ramp(time: float, start: float, target: float) -> tuple[float, float]:
-    """Return position and speed after ``time`` of a motion between two positions at rest, in Drake's arithmetic."""
+def _ramp(start: float, target: float) -> tuple[list[tuple[float, ...]], float]:
+    """Return the three parts of a motion between two positions at rest, and its duration, in Drake's arithmetic.
+
+    A part is its begin, [g, dg/dt] there, and their slopes; of a motion with fewer parts, the last one is repeated.
+    """
     delta = abs(target - start)
     if delta == 0.0:
-        return start, 0.0
+        return [(0.0, start, 0.0, 0.0, 0.0)] * 3, 0.0
     sign = 1.0 if start < target else -1.0
     ramp_time = _MAX_SPEED / _MAX_ACCELERATION
     ramp = 0.5 * _MAX_ACCELERATION * ramp_time * ramp_time
@@ -170,9 +181,7 @@ def _ramp(time: float, start: float, target: float) -> tuple[float, float]:
             (ramp_time + cruise_time, target - (ramp * sign), _MAX_SPEED * sign),
             (ramp_time + cruise_time + ramp_time, target, 0.0),
         ]
-    # As PiecewisePolynomial does: a part lasts until the next one begins, and beyond its ends the motion is constant.
-    time = min(max(time, 0.0), knots[-1][0])
-    part = sum(begin <= time for begin, _, _ in knots[1:-1])
-    (t0, p0, v0), (t1, p1, v1) = knots[part : part + 2]
-    dt, length = time - t0, t1 - t0
-    return p0 + dt * ((p1 - p0) / length), v0 + dt * ((v1 - v0) / length)
+    parts = [
+        (t0, g0, v0, (g1 - g0) / (t1 - t0), (v1 - v0) / (t1 - t0)) for (t0, g0, v0), (t1, g1, v1) in pairwise(knots)
+    ]
+    return [*parts, *parts[-1:] * (3 - len(parts))], knots[-1][0]
