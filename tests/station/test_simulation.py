@@ -151,3 +151,20 @@ def test_contexts_run_side_by_side() -> None:
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(motion, openings)) == one_by_one
     assert one_by_one[1] == one_by_one[3] != one_by_one[2]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("signal", ["iiwa_torque", "wsg_position", "wsg_force_limit"])
+def test_command_that_is_not_finite_ends_the_simulation(signal: str, value: float) -> None:
+    def make_dps(station: vtb.Station) -> System:
+        builder = DiagramBuilder()
+        for name, command in (("iiwa_torque", np.zeros(7)), ("wsg_position", [0.05]), ("wsg_force_limit", [30.0])):
+            values = np.array(command, dtype=float)
+            values[0] = value if name == signal else values[0]
+            source = builder.AddNamedSystem(name, ConstantVectorSource(values))
+            builder.ExportOutput(source.get_output_port(), name)
+        return builder.Build()
+
+    testbed = vtb.Station(f"{FILE}#Torque", dps=make_dps).build()
+    with pytest.raises(ValueError, match=f"the DPS commands {signal} = .* not finite"):
+        testbed.simulator().AdvanceTo(0.06)

@@ -211,11 +211,11 @@ class Arm(StationDriver):
         if self._torque_alone:
             added = builder.add("act", f"{self.name}_torque", PassThrough(self._size))
             # The driver passes NaN on, and the plant raises.
-            builder.sim_actuator(f"{self.name}_torque", added.get_input_port(), raises_at_nan=True)
+            builder.sim_actuator(f"{self.name}_torque", added.get_input_port(), raises_at="nan")
             builder.sim_sensor(f"{self.name}_torque_added", added.get_output_port())
             builder.connect(added.get_output_port(), simulated.GetInputPort("torque"))
         elif f"{self.name}_torque" in used:
-            builder.sim_actuator(f"{self.name}_torque", simulated.GetInputPort("torque"), raises_at_nan=True)
+            builder.sim_actuator(f"{self.name}_torque", simulated.GetInputPort("torque"), raises_at="nan")
         elif self._has_torque:
             nothing = builder.add("act", f"{self.name}_torque", ConstantVectorSource(np.zeros(self._size)))
             builder.connect(nothing.get_output_port(), simulated.GetInputPort("torque"))
@@ -348,9 +348,11 @@ class Gripper(StationDriver):
         for name, port in ports.items():
             if name in used:
                 builder.sim_sensor(name, port)
-        builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"), raises_at_nan=True)
+        builder.sim_actuator(f"{self.name}_position", simulated.GetInputPort("position"), raises_at="not finite")
         if f"{self.name}_force_limit" in used:
-            builder.sim_actuator(f"{self.name}_force_limit", simulated.GetInputPort("force_limit"), raises_at_nan=True)
+            builder.sim_actuator(
+                f"{self.name}_force_limit", simulated.GetInputPort("force_limit"), raises_at="not finite"
+            )
         else:
             limit = builder.add("act", f"{self.name}_force_limit", ConstantVectorSource([self._force]))
             builder.connect(limit.get_output_port(), simulated.GetInputPort("force_limit"))

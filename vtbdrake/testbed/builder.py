@@ -76,7 +76,7 @@ class VirtualTestbedBuilder:
         self._dps: System | None = None
         self.sensors: dict[str, OutputPort] = {}
         self.actuators: dict[str, InputPort] = {}
-        self._raising: set[str] = set()  # actuator signals whose systems raise where a command is NaN
+        self._raising: dict[str, str] = {}  # by actuator signal, see `sim_actuator`
         self._commands: dict[str, OutputPort] = {}
         self._places: dict[str, str] = {}
         self.belief_rules: list[BeliefRule] = []
@@ -156,17 +156,18 @@ class VirtualTestbedBuilder:
         """Offer ``port`` as the simulated sensor signal ``name``."""
         self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort)
 
-    def sim_actuator(self, name: str, port: InputPort, *, raises_at_nan: bool = False) -> None:
+    def sim_actuator(self, name: str, port: InputPort, *, raises_at: str = "") -> None:
         """Lead the actuator signal ``name`` to ``port`` of the simulated world.
 
         Args:
             name: The actuator signal of the interface.
             port: The port that gets its commands.
-            raises_at_nan: Whether what lies behind the port raises an exception at a command of NaN, as a plant does.
-                Else, a check is added where a command that is not finite would stop the integration.
+            raises_at: Commands at which what lies behind the port raises an exception: ``"nan"``, as a plant does, or
+                ``"not finite"``. Else, a check is added where a command that is not finite would stop the integration.
         """
-        if raises_at_nan:
-            self._raising.add(name)
+        if raises_at not in ("", "nan", "not finite"):
+            raise ValueError(f"actuator signal {name}: raises_at is 'nan' or 'not finite', not {raises_at!r}")
+        self._raising[name] = raises_at
         self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort)
 
     def command(self, name: str, port: OutputPort) -> None:
@@ -347,7 +348,11 @@ class VirtualTestbedBuilder:
         if not (continuous and controls_error(self.simulator_config)):
             return {}
         vectors = [signal.name for signal in self.interface.act if signal.is_vector]
-        return {name: name in self._raising or is_plant(self.actuators[name].get_system()) for name in vectors}
+        return {
+            name: self._raising.get(name) == "nan" or is_plant(self.actuators[name].get_system())
+            for name in vectors
+            if self._raising.get(name) != "not finite"
+        }
 
     def _connect_switches(self, switches: Switches, dps: System) -> None:
         for name, sensor in self.sensors.items():
