@@ -129,6 +129,7 @@ def check_fork_is_the_future(subject: Subject) -> None:
     A robot reasons in copies of its own state. A value of abstract state that two contexts share must never change:
     make it a frozen dataclass with read-only arrays, and replace it as a whole.
     """
+    subject.presuppose(check_runs_repeat)
     testbed = subject.testbed
     original = subject.started(testbed)
     simulator = testbed.simulator(original)
@@ -150,7 +151,7 @@ def check_snapshot_resumes(subject: Subject) -> None:
     Studies are resumed, and machines started, from files. A codec must keep every bit of an abstract state: do not
     round, and do not leave out what can be computed again.
     """
-    subject.presuppose(check_yaml_round_trip)
+    subject.presuppose(check_yaml_round_trip, check_runs_repeat)
     testbed = subject.testbed
     context = subject.started(testbed)
     simulator = testbed.simulator(context)
