@@ -259,7 +259,4 @@ def _station_values(station: StationFile) -> dict[str, str]:
         "away": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.away])},' for arm in station.arms),
         "opening": json.dumps(station.grippers),
         "period": _number(station.period),
-        "expected": ""
-        if all(arm.takes_positions for arm in station.arms)
-        else '    "check_silence_ends_in_the_fallback": "a brake without a velocity gives way to zero torques",\n',
     }
