@@ -176,10 +176,17 @@ def is_field_of_named_tuple(
     return True if str(getattr(value, "__doc__", "")).startswith("Alias for field number") else None
 
 
+def path_of(name: str, value: Any) -> str:
+    """Return the path of a class as the module of ``value`` imports it: two packages may have classes of one name."""
+    function = getattr(value, "fget", value)  # of a property
+    kind = getattr(sys.modules.get(getattr(function, "__module__", "")), name, None)
+    return f"~{kind.__module__}.{name}" if getattr(kind, "__module__", "").startswith("vtbdrake.") else name
+
+
 def mend_docstring(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
     """Show |x| and indented equations as they are written, and the documentation of the fields of configurations."""
     for index, line in enumerate(lines):
-        line = with_short_arrays(line)
+        line = re.sub(r"^:raises (\w+):", lambda match: f":raises {path_of(match[1], value)}:", with_short_arrays(line))
         line = re.sub(r"^:(ivar|param) .*?:", lambda match: match[0].replace(", ", "/"), line)  # several names
         lines[index] = re.sub(r"(`[^`]+`)|\|", lambda match: match[1] or r"\|", line)
         following = [*lines[index + 1 : index + 3], "", ""]
