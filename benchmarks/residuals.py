@@ -18,7 +18,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
-from vtbdrake.monitoring.residuals import Calibration, ResidualMonitor
+from vtbdrake.monitoring.residuals import NominalResiduals, ResidualMonitor
 from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
@@ -82,7 +82,7 @@ def payload_alarm(nominal: float = 10.0) -> list[Benchmark]:
     ]
 
 
-def learn(runtime: Runtime) -> Calibration:
+def learn(runtime: Runtime) -> NominalResiduals:
     """Return the residuals while the arm moves."""
     with ResidualMonitor(runtime, "twin", learn=True) as monitor:
         runtime.run(cycles=round(LEARNING / PERIOD))

@@ -4,6 +4,7 @@ from vtbdrake.testing import parametrize_with_checks
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
+from vtbdrake_diagrams.forest.studies.next_route import RouteScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.plain.scenario import PlainScenario
@@ -28,6 +29,7 @@ SCENARIOS = {
     LightingScenario: {},
     ApproachScenario: {},
     ForestScenario: {},
+    RouteScenario: {},
     PlainScenario: {},
     ArmStation: {"u.target": HOME + 0.1, "u.opening": 0.1},
     DoublePendulumScenario: {"u.torques": [0.5, 0.3]},

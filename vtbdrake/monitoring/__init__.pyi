@@ -7,6 +7,6 @@ from vtbdrake.monitoring.live.client import LiveWatch as LiveWatch
 from vtbdrake.monitoring.live.client import watch as watch
 from vtbdrake.monitoring.live.service import LiveService as LiveService
 from vtbdrake.monitoring.residuals import Alarm as Alarm
-from vtbdrake.monitoring.residuals import Calibration as Calibration
+from vtbdrake.monitoring.residuals import NominalResiduals as NominalResiduals
 from vtbdrake.monitoring.residuals import ResidualConfig as ResidualConfig
 from vtbdrake.monitoring.residuals import ResidualMonitor as ResidualMonitor

@@ -18,10 +18,10 @@ from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPen
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
 from vtbdrake.monitoring.residuals.alarms import (
     AlarmDetector,
-    Calibration,
-    CalibrationError,
     Cusum,
-    calibrate,
+    NominalResiduals,
+    NominalResidualsError,
+    nominal_residuals,
     run_length,
     threshold_for,
 )
@@ -35,7 +35,7 @@ SCENARIO = DrivenPendulum(sampled=True)
 
 
 def start(
-    *, mass: float = MASS, seed: int = 1, calibration: Calibration | None = None, config: ResidualConfig = CONFIG
+    *, mass: float = MASS, seed: int = 1, calibration: NominalResiduals | None = None, config: ResidualConfig = CONFIG
 ) -> tuple[Together, dict[str, ResidualMonitor]]:
     robot = machine(SCENARIO, values={PAYLOAD: mass}, noise=NOISE, seed=seed)
     together = Together(SCENARIO, robot, shadowing=SCENARIO)
@@ -50,7 +50,7 @@ def start(
 
 
 @cache
-def nominal() -> Calibration:
+def nominal() -> NominalResiduals:
     together, monitors = start()
     together.run(4000)
     return monitors["twin"].calibrate()
@@ -171,7 +171,7 @@ def test_tolerance_alone_is_a_scale() -> None:
 def test_calibration_of_other_windows_is_rejected(change: dict[str, object], message: str) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     other = replace(nominal(), **change)
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(NominalResidualsError, match=message):
         ResidualMonitor(together.driver, "twin", config=CONFIG, calibration=other, worker=False)
 
 
@@ -193,8 +193,8 @@ def test_wrong_tolerance_is_rejected(tolerance: dict[str, object], message: str)
 PLACES = {"sense.a": slice(0, 2), "act.b": slice(2, 3)}
 
 
-def of(table: np.ndarray) -> Calibration:
-    return calibrate(table, PLACES, horizon=10, period=1e-3)
+def of(table: np.ndarray) -> NominalResiduals:
+    return nominal_residuals(table, PLACES, horizon=10, period=1e-3)
 
 
 def noise(windows: int) -> np.ndarray:
@@ -283,29 +283,29 @@ def test_missing_signal_has_no_deviation() -> None:
 
 
 def test_short_run_is_rejected() -> None:
-    with pytest.raises(CalibrationError, match="at least 200 windows, not 150"):
+    with pytest.raises(NominalResidualsError, match="at least 200 windows, not 150"):
         of(noise(150))
 
 
 def test_calibration_file_round_trip(tmp_path: Path) -> None:
     found = of(noise(300))
     found.save(tmp_path / "nominal.json")
-    assert Calibration.load(tmp_path / "nominal.json") == found
+    assert NominalResiduals.load(tmp_path / "nominal.json") == found
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"mean": {}}', '{"other": 1}'])
 def test_file_without_calibration_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "nominal.json").write_text(text)
-    with pytest.raises(CalibrationError, match="not a calibration"):
-        Calibration.load(tmp_path / "nominal.json")
+    with pytest.raises(NominalResidualsError, match="not a calibration"):
+        NominalResiduals.load(tmp_path / "nominal.json")
 
 
 @pytest.mark.parametrize("mean", [[], None, {"sense.level": [float("nan")]}, {"sense.level": ["a"]}])
 def test_calibration_without_numbers_is_rejected(tmp_path: Path, mean: object) -> None:
     content = {"mean": mean, "deviation": {"sense.level": [1.0]}, "windows": 200, "horizon": 10, "period": 0.001}
     (tmp_path / "nominal.json").write_text(json.dumps(content))
-    with pytest.raises(CalibrationError, match="not a calibration"):
-        Calibration.load(tmp_path / "nominal.json")
+    with pytest.raises(NominalResidualsError, match="not a calibration"):
+        NominalResiduals.load(tmp_path / "nominal.json")
 
 
 def test_cusum_matches_its_definition() -> None:

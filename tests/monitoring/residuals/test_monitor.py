@@ -17,7 +17,7 @@ from tests.monitoring.residuals.line import Ear, Line, Together, loop
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
 from vtbdrake.deployment import Deployment
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
-from vtbdrake.monitoring.residuals.alarms import CalibrationError
+from vtbdrake.monitoring.residuals.alarms import NominalResidualsError
 from vtbdrake.state import Quantity
 from vtbdrake.testbed import DpsAlone, VirtualTestbedBuilder
 
@@ -100,7 +100,7 @@ def test_stopped_worker_process_skips_windows() -> None:
         before = monitor.history[-1].time
         wait_for_windows(monitor, together, len(monitor.history) + 10)
         assert 50 <= monitor.skipped <= together.driver.cycles // CONFIG.horizon - len(monitor.history)
-        with pytest.raises(CalibrationError, match="skipped, because the worker process is too slow"):
+        with pytest.raises(NominalResidualsError, match="skipped, because the worker process is too slow"):
             monitor.calibrate()
         assert np.diff([window.time for window in monitor.history]).max() > 50 * CONFIG.window
         assert monitor.history[-1].time > before
@@ -117,7 +117,9 @@ def test_skipped_windows_are_reported_while_running() -> None:
             assert time.monotonic() < end, "skipped windows are not reported"
             together.run(10)
         assert not monitor.history
-        with pytest.raises(CalibrationError, match=r"not 0: run longer; \d+ windows were skipped, because samples"):
+        with pytest.raises(
+            NominalResidualsError, match=r"not 0: run longer; \d+ windows were skipped, because samples"
+        ):
             monitor.calibrate()
 
 
@@ -144,7 +146,7 @@ def test_failed_dps_has_no_residuals() -> None:
     driver.run(cycles=300)
     assert monitor.history[-1].time <= 3.2
     assert monitor.skipped > 20
-    with pytest.raises(CalibrationError, match="because the DPS raised ZeroDivisionError: too late"):
+    with pytest.raises(NominalResidualsError, match="because the DPS raised ZeroDivisionError: too late"):
         monitor.calibrate()
 
 

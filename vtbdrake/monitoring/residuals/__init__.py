@@ -1,7 +1,7 @@
 """Residuals of shadow and twin: differences between the machine and its model, and alarms if they persist."""
 
-from vtbdrake.monitoring.residuals.alarms import Alarm, Calibration, CalibrationError
+from vtbdrake.monitoring.residuals.alarms import Alarm, NominalResiduals, NominalResidualsError
 from vtbdrake.monitoring.residuals.comparison import ResidualConfig
 from vtbdrake.monitoring.residuals.monitor import ResidualError, ResidualMonitor
 
-__all__ = ["Alarm", "Calibration", "CalibrationError", "ResidualConfig", "ResidualError", "ResidualMonitor"]
+__all__ = ["Alarm", "NominalResiduals", "NominalResidualsError", "ResidualConfig", "ResidualError", "ResidualMonitor"]

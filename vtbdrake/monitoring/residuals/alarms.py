@@ -24,16 +24,16 @@ _EXCESS = 1.166  # Siegmund's correction for the excess over the threshold, for 
 # -- calibration
 
 
-class CalibrationError(ValueError):
+class NominalResidualsError(ValueError):
     """A calibration cannot be made or read, or does not fit."""
 
 
 @dataclass(frozen=True)
-class Calibration:
+class NominalResiduals:
     """Mean and deviation of every residual in nominal operation, as plain data."""
 
     # mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``); the deviation is that of
-    # independent values whose sums scatter as much (see `calibrate`)
+    # independent values whose sums scatter as much (see `nominal_residuals`)
     mean: Mapping[str, list[float]]
     deviation: Mapping[str, list[float]]
     windows: int  # number of windows that it was made of
@@ -45,11 +45,11 @@ class Calibration:
         Path(path).write_text(json.dumps(asdict(self), indent=2) + "\n")
 
     @classmethod
-    def load(cls, path: str | Path) -> Calibration:
+    def load(cls, path: str | Path) -> NominalResiduals:
         """Return the calibration in a file that `save` has written.
 
         Raises:
-            CalibrationError: The file is not a calibration.
+            NominalResidualsError: The file is not a calibration.
         """
         try:
             calibration = cls(**json.loads(Path(path).read_text()))
@@ -58,12 +58,14 @@ class Calibration:
                 np.asarray_chkfinite(entries, dtype=float)
             return calibration
         except (ValueError, TypeError, AttributeError) as error:
-            raise CalibrationError(
-                f"{path} is not a calibration of residuals as Calibration.save writes it: {error}"
+            raise NominalResidualsError(
+                f"{path} is not a calibration of residuals as NominalResiduals.save writes it: {error}"
             ) from None
 
 
-def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizon: int, period: float) -> Calibration:
+def nominal_residuals(
+    residuals: Iterable[Array], places: Mapping[str, slice], *, horizon: int, period: float
+) -> NominalResiduals:
     r"""Return the calibration from the windows of a nominal run, which should include all motions of the later runs.
 
     A cumulative sum test takes a slow change within the run for a shift, and values that resemble the ones before (an
@@ -87,11 +89,13 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
         period: Length of a period in seconds.
 
     Raises:
-        CalibrationError: There are too few windows.
+        NominalResidualsError: There are too few windows.
     """
     table = np.array(list(residuals))
     if len(table) < _MIN_WINDOWS:
-        raise CalibrationError(f"a calibration needs at least {_MIN_WINDOWS} windows, not {len(table)}: run longer")
+        raise NominalResidualsError(
+            f"a calibration needs at least {_MIN_WINDOWS} windows, not {len(table)}: run longer"
+        )
     batches = table[: len(table) // _BATCH * _BATCH].reshape(-1, _BATCH, table.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         is_number = ~np.isnan(batches)
@@ -104,7 +108,7 @@ def calibrate(residuals: Iterable[Array], places: Mapping[str, slice], *, horizo
         once, ratio = _scatter(table - mean)
         deviation = np.fmax(np.where(counts > 1, deviations, 0.0).max(axis=0), once) * ratio
         deviation = np.maximum(deviation, _SHARE * apart)
-    return Calibration(
+    return NominalResiduals(
         mean={name: mean[place].tolist() for name, place in places.items()},
         deviation={name: deviation[place].tolist() for name, place in places.items()},
         windows=len(table),
@@ -231,18 +235,20 @@ class AlarmDetector:
     Args:
         places: Slices of a window by signal, as `residual_places` returns them.
         config: Configuration.
-        calibration: Calibration; None if there are tolerances for all signals.
+        calibration: The residuals of nominal operation; None if there are tolerances for all signals.
 
     Attributes:
         mean, scale: Mean and scale of the residuals, of shape (size,).
         statistic: The larger sum of each entry after the last window.
 
     Raises:
-        CalibrationError: The calibration is of other signals or windows.
+        NominalResidualsError: The calibration is of other signals or windows.
         ValueError: A tolerance is of an unknown signal or has another size, or a residual has no scale.
     """
 
-    def __init__(self, places: Mapping[str, slice], config: ResidualConfig, calibration: Calibration | None) -> None:
+    def __init__(
+        self, places: Mapping[str, slice], config: ResidualConfig, calibration: NominalResiduals | None
+    ) -> None:
         self._places = places
         size = max(place.stop for place in places.values())
         self.mean, self.scale, self.statistic = np.zeros((3, size))
@@ -252,8 +258,8 @@ class AlarmDetector:
             _check_calibration(calibration, places, config)
             deviation = np.zeros(size)
             for name in places:
-                self._set(self.mean, name, calibration.mean[name], CalibrationError)
-                self._set(deviation, name, calibration.deviation[name], CalibrationError)
+                self._set(self.mean, name, calibration.mean[name], NominalResidualsError)
+                self._set(deviation, name, calibration.deviation[name], NominalResidualsError)
             self.scale = np.maximum(self.scale, deviation)
         for name, place in places.items():
             if not (self.scale[place] > 0.0).all():
@@ -302,15 +308,15 @@ class AlarmDetector:
         return changed
 
 
-def _check_calibration(calibration: Calibration, places: Mapping[str, slice], config: ResidualConfig) -> None:
+def _check_calibration(calibration: NominalResiduals, places: Mapping[str, slice], config: ResidualConfig) -> None:
     if (calibration.horizon, calibration.period) != (config.horizon, config.period):
-        raise CalibrationError(
+        raise NominalResidualsError(
             f"the calibration is of windows of {calibration.horizon} periods of {calibration.period} s, not of "
             f"{config.horizon} periods of {config.period} s: calibrate again"
         )
     for part, values in (("mean", calibration.mean), ("deviation", calibration.deviation)):
         if values.keys() != places.keys():
-            raise CalibrationError(
+            raise NominalResidualsError(
                 f"the calibration has a {part} of {', '.join(values) or 'nothing'}, but there are residuals of "
                 f"{', '.join(places)}: calibrate again"
             )

@@ -17,7 +17,13 @@ from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import ChangeKind, Cycle
 from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.monitoring.residuals.alarms import Alarm, AlarmDetector, Calibration, CalibrationError, calibrate
+from vtbdrake.monitoring.residuals.alarms import (
+    Alarm,
+    AlarmDetector,
+    NominalResiduals,
+    NominalResidualsError,
+    nominal_residuals,
+)
 from vtbdrake.monitoring.residuals.comparison import (
     INDEX,
     SHADOW,
@@ -65,7 +71,7 @@ class ResidualMonitor:
         mode: ``shadow``: the actuator commands that the machine reports drive the prediction, and the DPS's commands
             are compared with them; ``twin``: the commands that the DPS sends drive the prediction.
         config: Configuration; by default that of the scenario's deployment.
-        calibration: Calibration from nominal operation; without it, tolerances are needed.
+        calibration: The residuals of nominal operation; without it, tolerances are needed.
         learn: Whether to collect residuals for `calibrate` instead of raising alarms.
         worker: Whether a worker process computes. Otherwise the loop's process computes, and the loop waits: for tests,
             replays, and loops without a clock.
@@ -93,7 +99,7 @@ class ResidualMonitor:
         mode: str,
         *,
         config: ResidualConfig | None = None,
-        calibration: Calibration | None = None,
+        calibration: NominalResiduals | None = None,
         learn: bool = False,
         worker: bool = True,
         memory: int = 60_000,
@@ -255,19 +261,19 @@ class ResidualMonitor:
         """Return the alarms that have not ended."""
         return [alarm for alarm in self.alarms if alarm.ended == inf]
 
-    def calibrate(self) -> Calibration:
+    def calibrate(self) -> NominalResiduals:
         """Return the calibration from the windows that are kept, if they are of nominal operation.
 
         Raises:
-            CalibrationError: There are too few windows.
+            NominalResidualsError: There are too few windows.
         """
         residuals = (window.residual for window in self.history)
         try:
-            return calibrate(residuals, self.places, horizon=self.config.horizon, period=self.config.period)
-        except CalibrationError as error:
+            return nominal_residuals(residuals, self.places, horizon=self.config.horizon, period=self.config.period)
+        except NominalResidualsError as error:
             if not (self.skipped or self.failed):
                 raise
-            raise CalibrationError(
+            raise NominalResidualsError(
                 f"{error}; {self.skipped} windows were skipped, because {self._cause()}; {self.failed} predictions "
                 f"failed{self.error and f' ({self.error})'}"
             ) from error
