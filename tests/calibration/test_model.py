@@ -28,10 +28,10 @@ def test_ten_numbers_are_a_body_of_positive_masses_and_come_back() -> None:
         )
         moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         for expected, value in zip((mass, center, moments), convert(log_cholesky(mass, center, moments)), strict=True):
-            np.testing.assert_allclose(np.ravel(value), np.ravel(expected), rtol=1e-9, atol=1e-10)
+            np.testing.assert_allclose(value.full().ravel(), np.ravel(expected), rtol=1e-9, atol=1e-10)
     # Whatever the ten numbers are, the triangle inequality of moments holds.
     for _ in range(50):
-        mass, _, moments = (np.ravel(value) for value in convert(generator.normal(size=10)))
+        mass, _, moments = (value.full().ravel() for value in convert(generator.normal(size=10)))
         xx, yy, zz, xy, xz, yz = moments
         principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         assert mass[0] > 0.0 and principal[0] > 0.0 and principal[2] < principal[0] + principal[1]
@@ -55,7 +55,7 @@ def test_steps_are_those_of_drake(time_step: float) -> None:
     x, positions, substeps = np.array([q[0], 0.0]), [q[0]], 1 if time_step else 4
     for m in motor[:-1]:
         for _ in range(substeps):
-            x = np.ravel(model.step(x, m, PERIOD / substeps, z))
+            x = model.step(x, m, PERIOD / substeps, z).full().ravel()
         positions.append(x[0])
     # A continuous plant is integrated by Drake to its accuracy of 1e-3.
     np.testing.assert_allclose(positions, q, rtol=0.0, atol=1e-12 if time_step else 1e-5)
@@ -100,5 +100,5 @@ def test_a_whole_inertia_begins_where_the_body_is() -> None:
     symbol = casadi.SX.sym("z", 10)
     mass, center, moments = casadi.Function("f", [symbol], list(inertia_of(symbol)))(model.start)
     assert float(mass) == pytest.approx(1.0)
-    np.testing.assert_allclose(np.ravel(center), [0.0, 0.0, -0.3], atol=1e-12)
-    np.testing.assert_allclose(np.ravel(moments), [0.02, 0.02, 0.02, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(center.full().ravel(), [0.0, 0.0, -0.3], atol=1e-12)
+    np.testing.assert_allclose(moments.full().ravel(), [0.02, 0.02, 0.02, 0.0, 0.0, 0.0], atol=1e-12)

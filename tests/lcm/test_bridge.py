@@ -37,7 +37,14 @@ class Arm:
     def __init__(self, *, reorder_window: float = math.inf) -> None:
         self.position, self.torque = ReceivedSignal(), ReceivedSignal()
         signals = {"position": self.position, "torque": self.torque}
-        self.reader = ChannelReader(iiwa_status(SENSE), interface().sense, signals, reorder_window)
+        self.later = 0.0
+        self.reader = ChannelReader(
+            iiwa_status(SENSE),
+            interface().sense,
+            signals,
+            reorder_window,
+            clock=lambda: time.monotonic() + self.later,
+        )
 
     def take(self, *messages: lcmt_iiwa_status | bytes) -> Arm:
         for message in messages:
@@ -115,17 +122,15 @@ def test_first_time_far_ahead_is_overcome_after_the_window() -> None:
     assert (arm.position.value.tolist(), arm.reader.clock_jumps) == ([0.6] * 7, 1)
 
 
-def test_sender_may_be_ahead_by_the_time_that_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sender_may_be_ahead_by_the_time_that_passed() -> None:
     arm = Arm().take(status(1_000_000))
-    later = time.monotonic() + 3600.0
-    monkeypatch.setattr("vtbdrake.lcm.bridge.time.monotonic", lambda: later)
+    arm.later = 3600.0
     assert arm.take(status(3_601_000_000)).position.count == 2
 
 
-def test_message_after_one_that_waited_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_after_one_that_waited_is_accepted() -> None:
     arm = Arm().take(status(1_000_000))
-    later = time.monotonic() + 3600.0
-    monkeypatch.setattr("vtbdrake.lcm.bridge.time.monotonic", lambda: later)
+    arm.later = 3600.0
     arm.take(status(1_001_000), status(3_601_000_000))  # The first one has waited for an hour.
     assert (arm.position.count, arm.position.rejected, arm.reader.clock_jumps) == (3, {}, 0)
 

@@ -93,17 +93,20 @@ def test_commands_from_inside_are_not_written() -> None:
 
 # -- loops that break one
 
+# The search ends with the first. What it tries depends on the modules that are loaded, whose constants it takes.
+MANY = 300
+
 
 def test_loop_without_staleness_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vtbdrake.control.guards.faults_at", lambda now, monitors, received: [])
     with pytest.raises(AssertionError, match=r"the DPS commands, although \w+ is .* s old, and 0.0105 s are allowed"):
-        run(MovedServo())
+        run(MovedServo(), examples=MANY)
 
 
 def test_loop_that_forgets_its_faults_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vtbdrake.control.guards.Guards._latch", lambda self, faults: None)
     with pytest.raises(AssertionError, match="although|without a reset"):
-        run(MovedServo())
+        run(MovedServo(), examples=MANY)
 
 
 def test_loop_without_limits_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,13 +116,13 @@ def test_loop_without_limits_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("vtbdrake.control.guards.RateLimiter", Unlimited)
     with pytest.raises(AssertionError, match="is not within its limits|beyond its rate|does not depart from"):
-        run(MovedServo())
+        run(MovedServo(), examples=MANY)
 
 
 def test_rate_that_counts_cycles_instead_of_time_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vtbdrake.control.runtime.Runtime._time_of_commands", lambda self, due, now: nan)
     with pytest.raises(AssertionError, match="beyond its rate|does not depart from"):
-        run(MovedServo(), alone=True)
+        run(MovedServo(), examples=MANY, alone=True)
 
 
 def test_command_that_outlasts_its_leave_time_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +131,7 @@ def test_command_that_outlasts_its_leave_time_is_found(monkeypatch: pytest.Monke
 
     monkeypatch.setattr("vtbdrake.control.guards.Guards._end_leaving", never)
     with pytest.raises(AssertionError, match="a command velocity is sent, which has not been on real for"):
-        run(MovedServo())
+        run(MovedServo(), examples=MANY)
 
 
 class FragileServo(Servo):
@@ -148,7 +151,7 @@ class FragileScenario(MovedServo):
 
 def test_dps_that_raises_is_found() -> None:
     with pytest.raises(AssertionError, match="the DPS raised ZeroDivisionError: it has not been thought of"):
-        run(FragileScenario())
+        run(FragileScenario(), examples=MANY)
 
 
 # -- the machine in lock-step

@@ -46,5 +46,5 @@ def test_seed_determines_the_ground() -> None:
 
 
 def test_impassable_ground_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"so that a carrier can drive there, not 1 and 0.5"):
+    with pytest.raises(ValueError, match="bumps must be a number from 0 to 0.08 m, not 0.5: a carrier"):
         Ground(relief=1.0, bumps=0.5)
