@@ -4,8 +4,8 @@ python tools/gallery.py [NAME ...]
 """
 
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.plain.scenario import PlainScenario
@@ -32,6 +33,8 @@ from vtbdrake_diagrams.station.scenario import ArmStation
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 SKY, SPACE, MARS = (0.80, 0.88, 0.96), (0.02, 0.02, 0.04), (0.86, 0.72, 0.58)
+
+SWUNG = {f"sim.sys.pendulum.{joint}.position": angle for joint, angle in (("shoulder", 0.7), ("elbow", -1.1))}
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class Shot:
     eye: tuple[float, float, float]  # m, relative to the target
     target: str  # a body
     background: tuple[float, float, float] = SKY
+    values: Mapping[str, float] = field(default_factory=dict)  # of variables, at the begin
 
 
 SHOTS = {
@@ -52,6 +56,7 @@ SHOTS = {
     "forest": Shot(ForestScenario, 5.0, (-8.0, -5.0, 3.0), "base"),
     "plain": Shot(PlainScenario, 5.0, (-8.0, -5.0, 3.0), "base", MARS),
     "station": Shot(ArmStation, 1.0, (1.9, 1.3, 0.6), "iiwa_link_6"),
+    "double_pendulum": Shot(DoublePendulumScenario, 0.0, (0.5, -1.2, 0.1), "lower", values=SWUNG),
     "cart_pole": Shot(CartPoleScenario, 1.0, (0.5, -2.2, 0.1), "cart"),
 }
 
@@ -67,7 +72,9 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
 def render(shot: Shot) -> Image.Image:
     """Return the picture, 480 x 320 pixels, rendered at twice the size."""
     testbed = shot.scenario().build()
-    simulator = testbed.simulator(testbed.default_context())
+    start = testbed.default_context()
+    testbed.write(start, shot.values)
+    simulator = testbed.simulator(start)
     simulator.AdvanceTo(shot.time)
     context = simulator.get_context()
     plant, scene_graph = testbed.plant, testbed.scene_graph

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+from pydrake.geometry import Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, RotationalInertia, SpatialInertia
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 JOINTS, LINKS = ("shoulder", "elbow"), ("upper", "lower")
 GEAR_RATIO = 6.0
+_BLUE = np.array([0.2, 0.4, 0.7, 1.0])
 
 
 def _continuous() -> MultibodyPlantConfig:
@@ -106,6 +109,8 @@ class DoublePendulumScenario(Scenario):
             body = plant.AddRigidBody(link, instance, inertia)
             mount = plant.AddFrame(FixedOffsetFrame(f"{name}_mount", parent.body_frame(), place, instance))
             joint = plant.AddJoint(RevoluteJoint(name, mount, body.body_frame(), [0.0, 1.0, 0.0]))
+            rod = Cylinder(0.012, self.upper_length)
+            plant.RegisterVisualGeometry(body, RigidTransform([0.0, 0.0, -0.5 * rod.length()]), rod, link, _BLUE)
             motor = plant.AddJointActuator(name, joint, self.torque_limit)
             motor.set_default_rotor_inertia(self.rotor_inertia)
             motor.set_default_gear_ratio(GEAR_RATIO)
