@@ -100,18 +100,20 @@ def _trials(law: str, full: bool) -> Trials:
     by_the_clock = replace(scenario.deployment(), pace="")
     sent_by_testbed: list[NDArray[np.float64]] = []
     sent_by_dps: list[NDArray[np.float64]] = []
-    with Hub(port=0, protect=["IIWA_COMMAND"]) as hub:
-        with scenario.deploy(
+    with (
+        Hub(port=0) as hub,
+        scenario.deploy(
             hub.url, target=testbed, values=DURATIONS, deployment=by_the_clock, clock=SimulatedClock()
-        ) as simulation:
-            simulated = run_trial(simulation)
-        stripped = alone.continue_from(testbed, simulation.context)
-        with _commanding(scenario, hub, testbed, simulation.context, sent_by_testbed) as loop:
-            loop.run(until=Trial(loop, PROGRAM), cycles=None if full else COMPARED)
-            latched = loop.guards.latched
-        with _commanding(scenario, hub, alone, stripped, sent_by_dps) as loop:
-            track = run_trial(loop)
-            latched += loop.guards.latched
+        ) as simulation,
+    ):
+        simulated = run_trial(simulation)
+    stripped = alone.continue_from(testbed, simulation.context)
+    with _commanding(scenario, testbed, simulation.context, sent_by_testbed) as loop:
+        loop.run(until=Trial(loop, PROGRAM), cycles=None if full else COMPARED)
+        latched = loop.guards.latched
+    with _commanding(scenario, alone, stripped, sent_by_dps) as loop:
+        track = run_trial(loop)
+        latched += loop.guards.latched
     compared = min(len(sent_by_testbed), len(sent_by_dps))
     return Trials(
         simulated,
@@ -125,18 +127,21 @@ def _trials(law: str, full: bool) -> Trials:
 @contextmanager
 def _commanding(
     scenario: ManipulatorScenario,
-    hub: Hub,
     target: VirtualTestbed | DpsAlone,
     context: Context,
     sent: list[NDArray[np.float64]],
 ) -> Iterator[Runtime]:
-    """Start a machine and a loop in lock-step with it, on real; collect the torques in ``sent``, shape (7,) each."""
+    """Start a machine and a loop in lock-step with it, on real; collect the torques in ``sent``, shape (7,) each.
+
+    They have a hub of their own: the channel of commands belongs to a loop for a while after its end.
+    """
 
     def collect(cycle: Cycle) -> None:
         sent.append(cycle.verdict.actuation["joint_torque"].copy())
 
     deployment = scenario.deployment().in_lock_step("wrench", wait=PATIENCE)
     with (
+        Hub(port=0, protect=["IIWA_COMMAND"]) as hub,
         scenario.deploy(hub.url, target=target, context=context, deployment=deployment, watchers=(collect,)) as loop,
         MachineProcess(scenario, hub.url, lock_step=True, perturb=PERTURB, seed=SEED),
     ):
