@@ -98,12 +98,13 @@ def test_optimization_of_a_project_finds_feasible_gains(projects: Path) -> None:
 
 
 @pytest.mark.slow
-def test_notebook_of_a_project_runs(projects: Path) -> None:
+@pytest.mark.parametrize("name", ["pendulum", "torque_station"])
+def test_notebook_of_a_project_runs(projects: Path, name: str) -> None:
     import nbformat
     from nbclient import NotebookClient
 
-    project = projects / "my_pendulum"
-    notebook = nbformat.read(project / "my_pendulum.ipynb", as_version=4)
+    project = projects / f"my_{name}"
+    notebook = nbformat.read(project / f"my_{name}.ipynb", as_version=4)
     nbformat.validate(notebook)
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(project)}}).execute()
 

@@ -32,6 +32,7 @@ _ROBOT = {
 _STATION = {
     **_COMMON,
     "station/README.md": "README.md",
+    "station/notebook.ipynb": "{name}.ipynb",
     "station/test.py": "tests/test_{name}.py",
     **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("__init__", "dps", "scenario", "optimize", "drive")},
 }
