@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
-from typing import Self
 
-import numpy as np
 from pydrake.lcm import DrakeLcm
 from pydrake.manipulation import ApplyDriverConfigs, IiwaDriver
 from pydrake.multibody.parsing import ModelDirectives, Parser, ProcessModelDirectives
@@ -17,17 +14,14 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmBuses, LcmInterfaceSystem
 
 from tests.lcm.iiwa import HOME, PERIOD, directives
+from tests.lcm.plain_drake import PlainDrake
 
 STEP = 0.001
 """The time step of the plant, in s."""
 
 
-class DrakeIiwa:
-    """The machine: it is stepped by the test, so that nothing depends on a clock.
-
-    Attributes:
-        actuation: The torques on the joints in each step of the plant, in N m.
-        positions: The joint positions at the end of each period, in rad.
+class DrakeIiwa(PlainDrake):
+    """The machine.
 
     Args:
         url: The URL of the LCM bus.
@@ -36,25 +30,7 @@ class DrakeIiwa:
     """
 
     def __init__(self, url: str, mode: str, *, offset: float = 0.0) -> None:
-        self.actuation: list[np.ndarray] = []
-        self.positions: list[np.ndarray] = []
-        command = [sys.executable, "-m", __name__, url, mode, str(offset)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def advance(self, commands: int) -> None:
-        """Wait until so many commands have arrived in all, advance by a period, and publish the status."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        print(commands, file=self._process.stdin, flush=True)
-        answer = json.loads(self._process.stdout.readline())
-        self.actuation += map(np.array, answer["actuation"])
-        self.positions.append(np.array(answer["position"]))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
+        super().__init__(__name__, url, mode, str(offset))
 
 
 def main(url: str, mode: str, offset: str) -> None:

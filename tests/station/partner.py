@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
-from typing import Self
+from typing import Any
 
 import numpy as np
 from pydrake.lcm import DrakeLcm
 
 from benchmarks import hardware_sim_loop
+from tests.lcm.plain_drake import PlainDrake
 from vtbdrake_diagrams.station import FILE
 
 PERIOD = 0.005
@@ -19,12 +19,10 @@ STEP = 0.001
 """The time step of the plant, in s."""
 
 
-class HardwareSim:
+class HardwareSim(PlainDrake):
     """The machine: hardware_sim with the station of a file, stepped by the test or in real time.
 
     Attributes:
-        actuation: The torques on the arm's joints in each step of the plant, in N m.
-        positions: The positions of the arm's joints at the end of each period, in rad.
         openings: The distance of the gripper's fingers at the end of each period, in m.
 
     Args:
@@ -38,28 +36,14 @@ class HardwareSim:
     def __init__(
         self, url: str, key: str, *, offset: float = 0.0, cameras: bool = False, real_time: bool = False
     ) -> None:
-        self.actuation: list[np.ndarray] = []
-        self.positions: list[np.ndarray] = []
         self.openings: list[float] = []
         options = json.dumps({"offset": offset, "cameras": cameras, "real_time": real_time})
-        command = [sys.executable, "-m", __name__, url, key, options]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        super().__init__(__name__, url, key, options)
 
-    def advance(self, commands: int) -> None:
-        """Wait until the arm has got so many commands in all, advance by a period, and publish the status."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        print(commands, file=self._process.stdin, flush=True)
-        answer = json.loads(self._process.stdout.readline())
-        self.actuation += map(np.array, answer["actuation"])
-        self.positions.append(np.array(answer["position"]))
+    def advance(self, commands: int) -> dict[str, Any]:
+        answer = super().advance(commands)
         self.openings.append(answer["opening"])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
+        return answer
 
 
 def main(url: str, key: str, options: str) -> None:
