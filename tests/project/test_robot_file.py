@@ -1,4 +1,4 @@
-"""What a model file says about its robot, against the file's own numbers; and what a file without one gets."""
+"""A model file's robot is read as the file's own numbers say; a file without one is refused."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What is wrong in the file of a station, in its models or in its DPS is told, with the place and what to do."""
+"""Mistakes in the file of a station, in its models or in its DPS are told, with the place and what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the campaigns of the tests draw and measure."""
+"""Functions that the campaigns of the tests draw with and measure by."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What needs pytest or Hypothesis says so, where they are missing; the rest goes without."""
+"""Functions that need pytest or Hypothesis say so where these are missing; the others work without."""
 
 import subprocess
 import sys

@@ -343,7 +343,7 @@ class Local(Encoder):
 
 
 class Connection:
-    """What belongs to the thread that has made it, as a connection to a database does."""
+    """An object that belongs to the thread that has made it, as a connection to a database does."""
 
     def __init__(self):
         self.local = threading.local()

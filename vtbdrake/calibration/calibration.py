@@ -31,7 +31,7 @@ _BLOCK = 0.2  # s, of the sandwich estimator
 
 
 class Verdict(StrEnum):
-    """What a calibration comes to, for one parameter."""
+    """The outcome of a calibration, for one parameter."""
 
     ACCEPTED = "accepted"
     DISCREPANT = "discrepant"  # the model does not explain the recordings: innovations are coloured, a hold-out worse
@@ -204,14 +204,15 @@ def _regression(model: JointModel, recordings: Sequence[JointRecording]) -> tupl
     slope = casadi.Function("slope", symbols, [casadi.jacobian(model.unexplained(*symbols), symbols[-1])])
     z, scales = model.start.copy(), _scales(model)
     n = Q.shape[1]
+    residual_of_all, slope_of_all = model.unexplained.map(n), slope.map(n)
 
     def unexplained(at: Array) -> tuple[Array, Array]:
         torques, by = zip(*(model.motor(r.times, r.u, at) for r in recordings), strict=True)
         m = np.concatenate([t[span] for t, span in zip(torques, rows, strict=True)]).T
         dm = np.concatenate([d[span] for d, span in zip(by, rows, strict=True)])
         z_all = np.tile(at[:, np.newaxis], (1, n))
-        e = np.asarray(model.unexplained.map(n)(Q, V, A, m, z_all)).T
-        J = np.asarray(slope.map(n)(Q, V, A, m, z_all)).reshape(model.nq, n, len(at)).swapaxes(0, 1)
+        e = np.asarray(residual_of_all(Q, V, A, m, z_all)).T
+        J = np.asarray(slope_of_all(Q, V, A, m, z_all)).reshape(model.nq, n, len(at)).swapaxes(0, 1)
         selection = model.selection
         for k, index in enumerate(model.drive_parameters):
             J[:, :, index] -= dm[:, k] @ selection.T
@@ -237,10 +238,15 @@ def _regression(model: JointModel, recordings: Sequence[JointRecording]) -> tupl
     return z, e
 
 
+def _directions(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:
+    """Return eigenvalues and directions of the information about scaled parameters, and which are determined."""
+    values, directions = np.linalg.eigh(H)
+    return values, directions, np.asarray(values > 1.0 / UNDETERMINED**2)
+
+
 def _determined_step(H: Array, g: Array) -> Array:
     """Return the step of Gauss and Newton in the directions that are determined; in scaled parameters."""
-    values, directions = np.linalg.eigh(H)
-    determined = values > 1.0 / UNDETERMINED**2
+    values, directions, determined = _directions(H)
     along = directions.T @ g
     return np.asarray(directions[:, determined] @ (along[determined] / values[determined]))
 
@@ -284,8 +290,7 @@ def _result(
         ]
     ).reshape(-1, len(z))
     J = innovations.slopes[:, used].reshape(-1, len(z)) * scales
-    values, directions = np.linalg.eigh(J.T @ J)
-    determined = values > 1.0 / UNDETERMINED**2
+    values, directions, determined = _directions(J.T @ J)
     inverse = directions[:, determined] / values[determined] @ directions[:, determined].T
     sandwich = inverse @ (scores.T @ scores) @ inverse
     # Never less than what the noise alone leaves: few blocks make a sandwich too small now and then.

@@ -134,7 +134,7 @@ class Linearization(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """What the filter did not expect, whitened.
+    """The differences of the measured positions from the expected ones, whitened.
 
     Attributes:
         white: (N, W, nq), of unit variance.

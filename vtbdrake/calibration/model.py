@@ -221,12 +221,11 @@ class JointModel:
         tau = selection @ (m - friction)
         needed = dynamics.inverse_dynamics(q, v, a) + dynamics.damping_torque(v) - tau
         held_torque = casadi.SX.sym("tau", self.nq)
-        results = [needed, tau, casadi.vertcat(v, dynamics.acceleration(q, v, held_torque)), dynamics.mass_matrix(q)]
+        results = [needed, tau, casadi.vertcat(v, dynamics.acceleration(q, v, held_torque))]
         if self.step_size > 0.0:
             results.append(casadi.vertcat(*dynamics.step(q, v, tau, self.step_size)))
-        needed, tau, rate, mass_matrix, *step = dynamics.substituted(results, inputs)
+        needed, tau, rate, *step = dynamics.substituted(results, inputs)
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
-        self.mass_matrix = casadi.Function("mass_matrix", [q, z], [mass_matrix], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
         following = step[0] if step else _runge_kutta(lambda state: f(state, tau, z), x, h)
         self.step = casadi.Function("step", [x, m, h, z], [following], {"cse": True})

@@ -33,7 +33,7 @@ BAND, WHITE = 0.95, 0.01
 
 
 class Verdict(StrEnum):
-    """What a comparison comes to."""
+    """The outcome of a comparison."""
 
     WITHIN = "within tolerances"
     BEYOND = "beyond tolerances"
@@ -42,7 +42,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """What differences between a recording and its simulation are acceptable; infinite: any."""
+    """The differences between a recording and its simulation that are acceptable; infinite: any."""
 
     rmse: float = setting(inf, "Root mean square of the differences, in the signal's unit.", ge=0, finite=False)
     largest: float = setting(inf, "Largest difference, in the signal's unit.", ge=0, finite=False)

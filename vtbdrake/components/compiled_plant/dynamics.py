@@ -211,11 +211,6 @@ class PlantDynamics:
             torque[link.v] = link.damping * v[link.v]
         return torque
 
-    def mass_matrix(self, q: Expression) -> Expression:
-        """Return M(q), with the reflected inertias."""
-        a = casadi.SX.sym("a", self.nv)
-        return casadi.jacobian(self.inverse_dynamics(q, casadi.SX(self.nv, 1), a, gravity=False), a)
-
     def energy(self, q: Expression, v: Expression, *, rotors: bool = True) -> tuple[Expression, Expression]:
         """Return the kinetic and the potential energy, in J; ``rotors`` as in `inverse_dynamics`."""
         kinetic, potential = casadi.SX(0), casadi.SX(0)

@@ -131,18 +131,13 @@ def check_fork_is_the_future(subject: Subject) -> None:
     """
     subject.presuppose(check_runs_repeat)
     testbed = subject.testbed
-    original = subject.started(testbed)
-    simulator = testbed.simulator(original)
-    instants = subject.instants
-    middle = len(instants) // 2
-    for instant in instants[1 : middle + 1]:
-        simulator.AdvanceTo(instant)
+    original, simulator, middle = _halfway(testbed, subject)
     copied = testbed.default_context()
     testbed.copier_from(testbed).copy(original, copied)
     testbed.fork(simulator)  # An integrator with error control begins anew in both.
     future = _futures(testbed, simulator, subject)
     forecast = _futures(testbed, testbed.simulator(copied, restored=True), subject)
-    _compare(future, forecast, f"from a copy at {instants[middle]:g} s")
+    _compare(future, forecast, f"from a copy at {middle:g} s")
 
 
 def check_snapshot_resumes(subject: Subject) -> None:
@@ -153,19 +148,14 @@ def check_snapshot_resumes(subject: Subject) -> None:
     """
     subject.presuppose(check_yaml_round_trip, check_runs_repeat)
     testbed = subject.testbed
-    context = subject.started(testbed)
-    simulator = testbed.simulator(context)
-    instants = subject.instants
-    middle = len(instants) // 2
-    for instant in instants[1 : middle + 1]:
-        simulator.AdvanceTo(instant)
+    _, simulator, middle = _halfway(testbed, subject)
     saved = testbed.fork(simulator).to_bytes()
     future = _futures(testbed, simulator, subject)
     other = subject.scenario.build()
     resumed = other.default_context()
     other.restore(resumed, Snapshot.load(saved))
     forecast = _futures(other, other.simulator(resumed, restored=True), subject)
-    _compare(future, forecast, f"from a snapshot at {instants[middle]:g} s")
+    _compare(future, forecast, f"from a snapshot at {middle:g} s")
 
 
 def check_dropped_testbed_is_freed(subject: Subject) -> None:
@@ -233,6 +223,16 @@ def _consume(samples: Iterator[object], count: int) -> None:
 def _run(simulator: Simulator, subject: Subject) -> None:
     for instant in subject.instants[1:]:
         simulator.AdvanceTo(instant)
+
+
+def _halfway(testbed: VirtualTestbed, subject: Subject) -> tuple[Context, Simulator, float]:
+    """Return a simulation that has come to the middle of the instants: its context, it, and that time in s."""
+    context = subject.started(testbed)
+    simulator, instants = testbed.simulator(context), subject.instants
+    middle = len(instants) // 2
+    for instant in instants[1 : middle + 1]:
+        simulator.AdvanceTo(instant)
+    return context, simulator, float(instants[middle])
 
 
 def _futures(testbed: VirtualTestbed, simulator: Simulator, subject: Subject) -> Trace:
