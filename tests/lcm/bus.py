@@ -9,6 +9,7 @@ from collections.abc import Callable
 import lcm
 
 from tests.control.arm import status
+from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import STATUS_CHANNEL
 
@@ -41,6 +42,11 @@ def wait(bridge: LcmBridge, condition: Callable[[], bool]) -> bool:
     while not condition() and time.monotonic() < end:
         bridge.poll(0.02)
     return condition()
+
+
+def handled(received: ReceivedSignal) -> int:
+    """Return how many messages were accepted or rejected."""
+    return received.count + sum(received.rejected.values())
 
 
 def in_step(bridge: LcmBridge, peer: Peer) -> None:

@@ -19,6 +19,7 @@ import pytest
 from drake import lcmt_iiwa_status, lcmt_image, lcmt_point_cloud, lcmt_robot_state
 
 from tests.control.arm import LIMIT, SENSE, bridge, interface, status
+from tests.lcm.bus import handled
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.lcm.arm_messages import iiwa_status
 from vtbdrake.lcm.bridge import ChannelReader
@@ -147,11 +148,6 @@ def test_every_kind_of_rejection_occurred(fuzzed: tuple[dict[str, ReceivedSignal
 def test_memory_stays_flat(fuzzed: tuple[dict[str, ReceivedSignal], Oracle, list[int]]) -> None:
     early, late = fuzzed[2]
     assert late - early < 5_000_000
-
-
-def handled(received: ReceivedSignal) -> int:
-    """Return how many messages were accepted or rejected."""
-    return received.count + sum(received.rejected.values())
 
 
 def test_broken_messages_of_another_process_are_only_counted() -> None:

@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context, System
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
 from tests.control.scripted import Servo as ServoSystem
 from tests.control.slow import SlowScenario, chaotic, picky
+from tests.lcm.bus import handled, wait
 from tests.recording.seeing import HEIGHT, WIDTH, SeeingScenario, brightness, picture
 from tests.recording.servo import Servo
 from tests.testbed.test_dps_state import PlannedScenario
@@ -368,13 +369,12 @@ class Seeing:
 
     def show(self, *, late: bool = False) -> np.ndarray:
         """Send a new image and return it when it has arrived; a late one is rejected."""
-        pixels = self._random.integers(0, 256, (HEIGHT, WIDTH))
+        pixels, image = self._random.integers(0, 256, (HEIGHT, WIDTH)), self.bridge.sensed["image"]
+        before = handled(image)
         self._utime += 1000
         self._camera.publish("CAMERA", picture(self._utime - 5000 * late, pixels))
-        for _ in range(60):
-            if self.bridge.poll(1.0):
-                return pixels
-        raise TimeoutError("the image does not come")
+        assert wait(self.bridge, lambda: handled(image) > before)  # The hub's status messages are polled, too.
+        return pixels
 
 
 def test_images_are_replayed_from_raw_messages(hub: Hub, tmp_path: Path) -> None:
