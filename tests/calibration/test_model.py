@@ -41,21 +41,23 @@ def test_ten_numbers_are_a_body_of_positive_masses_and_come_back() -> None:
 
 @pytest.mark.parametrize("time_step", [0.0, PERIOD])
 def test_steps_are_those_of_drake(time_step: float) -> None:
-    # Without friction, which the drives sample.
+    # A continuous plant without friction, which the drives sample once in several of its steps.
+    coulomb, viscous = (0.3, 0.05) if time_step else (0.0, 0.0)
     scenario = PendulumScenario(time_step=time_step)
-    truth = {f"{ARM}.link.mass": 1.7, f"{DRIVES}.coulomb[0]": 0.0, f"{DRIVES}.viscous[0]": 0.0}
+    truth = {f"{ARM}.link.mass": 1.7, f"{DRIVES}.coulomb[0]": coulomb, f"{DRIVES}.viscous[0]": viscous}
     log = recorded(truth, 3, seconds=2.0, noise=0.0, scenario=scenario)
     model = JointModel(
         scenario.build(),
         [MASS, Parameter(f"{DRIVES}.coulomb[0]", 0.0, 1.0), Parameter(f"{DRIVES}.viscous[0]", 0.0, 1.0)],
     )
     q, u = log.sense["position"].values[:, 0], log.act["torque"].values
-    z = np.array([1.7, 0.0, 0.0])
+    z = np.array([1.7, coulomb, viscous])
     motor, _ = model.motor(log.sense["position"].times, u, z)
     x, positions, substeps = np.array([q[0], 0.0]), [q[0]], 1 if time_step else 4
+    v_before = 0.0
     for m in motor[:-1]:
         for _ in range(substeps):
-            x = model.step(x, m, PERIOD / substeps, z).full().ravel()
+            x, v_before = model.step(x, v_before, m, PERIOD / substeps, z).full().ravel(), x[1]
         positions.append(x[0])
     # A continuous plant is integrated by Drake to its accuracy of 1e-3.
     np.testing.assert_allclose(positions, q, rtol=0.0, atol=1e-12 if time_step else 1e-5)

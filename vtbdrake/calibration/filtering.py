@@ -199,14 +199,17 @@ class Segments:
         self._functions = self._compile()
 
     def _compile(self) -> casadi.Function:
-        """Return the function (x, m, h, z) -> following x, and its Jacobians by x, by m and by z, side by side."""
-        x, m, h, z = self.model.step.sx_in()
-        following = x
+        """Return the function (x, change, m, h, z) -> following x, and its Jacobians by x, m and z, side by side.
+
+        The change is that of the velocities in the step before, which only the friction of a discrete plant feels.
+        """
+        x, change, m, h, z = self.model.step.sx_in()
+        following, v_before = x, x[self.model.nq :] - change
         for _ in range(self._substeps):
-            following = self.model.step(following, m, h, z)
+            following, v_before = self.model.step(following, v_before, m, h, z), following[self.model.nq :]
         parts = [following, *(casadi.jacobian(following, by) for by in (x, m, z))]
         table = casadi.densify(casadi.horzcat(*parts))
-        return compiled_if_possible(casadi.Function("calibration_step", [x, m, h, z], [table], {"cse": True}))
+        return compiled_if_possible(casadi.Function("calibration_step", [x, change, m, h, z], [table], {"cse": True}))
 
     def linearized(self, z: Array) -> Linearization:
         """Return the model along the trajectory."""
@@ -216,8 +219,12 @@ class Segments:
         by = np.stack([motors[i][1][span][:-1] for i, span in self._pieces], axis=1)
         count = self.steps * self.count
         mapped = self._functions.map(count)
+        v = self.trajectory[:, :, n:]
+        change = np.diff(v, axis=0) / self._substeps
+        change = np.concatenate([change[:1], change[:-1]])  # That before the first step is about that of the first.
         table = mapped(
             self.trajectory[:-1].reshape(count, -1).T,
+            change.reshape(count, -1).T,
             m.reshape(count, -1).T,
             self._h.reshape(1, -1),
             np.tile(z[:, np.newaxis], (1, count)),

@@ -1,8 +1,8 @@
 r"""The joints of a testbed as one function of its parameters: plant and drives, written in CasADi.
 
 The drives are those of `JointDrives`: they feel a command one period after it was given, hold torque and friction
-during a step, and a discrete plant feels the torque another period later. Other than theirs, the delay may be any time,
-not only whole periods; and a discrete plant feels the friction at once.
+during a step, and a discrete plant feels the torque another period later, with the friction at the velocity of the step
+before. Other than theirs, the delay may be any time, not only whole periods.
 """
 
 from __future__ import annotations
@@ -216,10 +216,16 @@ class JointModel:
         drive = {name: self._drive_parameter(name, testbed, context, z) for name in _FRICTION}
         q, v, m = dynamics.symbols()
         a, h = casadi.SX.sym("a", self.nq), casadi.SX.sym("h")
-        x, speeds = casadi.vertcat(q, v), selection.T @ v
-        friction = drive["viscous"] * speeds + drive["coulomb"] * casadi.tanh(speeds / drive["coulomb_velocity"])
-        tau = selection @ (m - friction)
-        needed = dynamics.inverse_dynamics(q, v, a) + dynamics.damping_torque(v) - tau
+        x, v_before = casadi.vertcat(q, v), casadi.SX.sym("v_before", self.nq)
+
+        def driven(velocities: Expression) -> Expression:
+            speeds = selection.T @ velocities
+            friction = drive["viscous"] * speeds + drive["coulomb"] * casadi.tanh(speeds / drive["coulomb_velocity"])
+            return selection @ (m - friction)
+
+        # The drives of a discrete plant act in the step after that in which they saw the velocities.
+        tau = driven(v_before if self.step_size > 0.0 else v)
+        needed = dynamics.inverse_dynamics(q, v, a) + dynamics.damping_torque(v) - driven(v - self.step_size * a)
         held_torque = casadi.SX.sym("tau", self.nq)
         results = [needed, tau, casadi.vertcat(v, dynamics.acceleration(q, v, held_torque))]
         if self.step_size > 0.0:
@@ -228,7 +234,7 @@ class JointModel:
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
         following = step[0] if step else _runge_kutta(lambda state: f(state, tau, z), x, h)
-        self.step = casadi.Function("step", [x, m, h, z], [following], {"cse": True})
+        self.step = casadi.Function("step", [x, v_before, m, h, z], [following], {"cse": True})
 
     def motor(self, times: Array, u: Array, z: Array) -> tuple[Array, Array]:
         """Return the motors' torques after delay and current loop, (n, nu), and their derivatives (n, k, nu).
