@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, System
 from threadpoolctl import ThreadpoolController
 
 from vtbdrake.arrays import Array
@@ -22,7 +22,6 @@ from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.localization.dead_reckoning import (
     MOTION,
     POSE,
-    DeadReckoning,
     DriftModel,
     body_rotation,
     carrier_pose_at,
@@ -240,7 +239,7 @@ def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, dura
 
 def add_localizer(
     builder: DiagramBuilder,
-    reckoning: DeadReckoning,
+    reckoning: System,
     localizer: Localizer,
     signals: Mapping[str, Any],
     *,
@@ -251,9 +250,9 @@ def add_localizer(
 
     Args:
         builder: The builder of the Diagram ``env`` of the DPS.
-        reckoning: The dead reckoning, whose history the part reads.
+        reckoning: The dead reckoning, whose port ``history`` the part reads.
         localizer: The function of the part.
-        signals: A value of each of the signals that the localizer takes, by name.
+        signals: A value of each of the signals that the localizer takes, by name; an array of a vector signal.
         period: The period of the DPS, in s.
         latency: The time from the sample of a scan to its pose, in s.
 
@@ -263,7 +262,11 @@ def add_localizer(
     first = Localization.unknown()
     part = SlowPart(
         localizer,
-        inputs={**signals, **{f"{name}_time": 1 for name in signals}, "history": history_size(period)},
+        inputs={
+            **{name: value.size if isinstance(value, np.ndarray) else value for name, value in signals.items()},
+            **{f"{name}_time": 1 for name in signals},
+            "history": history_size(period),
+        },
         outputs={
             "pose": 3,
             "covariance": 9,

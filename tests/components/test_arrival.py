@@ -28,7 +28,7 @@ class Received:
         self.calls: list[tuple[float, Any]] = []
         part = SlowPart(
             self._evaluate,
-            inputs={"sample": model, "time": 1},
+            inputs={"sample": model.size if isinstance(model, np.ndarray) else model, "time": 1},
             outputs={"y": 1},
             period=PERIOD,
             latency=3 * PERIOD,
@@ -49,7 +49,8 @@ class Received:
         return request
 
     def show(self, value: Any) -> None:
-        self.diagram.GetInputPort("signal").FixValue(self.simulator.get_mutable_context(), Value(value))
+        port = self.diagram.GetInputPort("signal")
+        port.FixValue(self.simulator.get_mutable_context(), value if isinstance(value, np.ndarray) else Value(value))
 
     def advance(self, time: float) -> None:
         self.simulator.AdvanceTo(time)
@@ -132,6 +133,15 @@ def test_points_that_are_not_finite_are_no_news() -> None:
     received.show(PointCloud(cloud))
     received.advance(0.1)
     assert received.number == 0.0
+
+
+def test_vector_signals_arrive_like_others() -> None:
+    received = Received(np.zeros(3), age=PERIOD)
+    for k in range(4):
+        received.show(np.array([1.0, 2.0, k // 2]))
+        received.advance(0.2 * (k + 1) + 0.01)
+    assert received.number == 2.0 and received.time == pytest.approx(0.42 - PERIOD)
+    np.testing.assert_array_equal([sample for _, sample in received.calls], [[1.0, 2.0, 0.0], [1.0, 2.0, 1.0]])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Images, scans and other samples of abstract signals, with their times by the clock of the DPS that receives them."""
+"""Images, scans and other samples of signals, with their times by the clock of the DPS that receives them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vtbdrake.state.codecs import codec_of
 
 
 class Arrival(AddressedSystem):
-    """Holds the newest sample of an abstract signal, with its number and the time at which it was taken.
+    """Holds the newest sample of a signal, with its number and the time at which it was taken.
 
     .. pydrake_system::
 
@@ -43,7 +43,7 @@ class Arrival(AddressedSystem):
         """Declare the system.
 
         Args:
-            model_value: A value of the signal, such as an image of its size.
+            model_value: A value of the signal, such as an image of its size; an array (n,) of a vector signal.
             period: The period of the DPS, in s.
             age: The time from the sampling of a value to its arrival, in s.
 
@@ -55,9 +55,14 @@ class Arrival(AddressedSystem):
             raise ValueError(f"Arrival: the period is positive, in s, not {period!r}")
         if not (isfinite(age) and age >= 0.0):
             raise ValueError(f"Arrival: the age is a finite time in s, and not negative, not {age!r}")
+        self._is_vector = isinstance(model_value, np.ndarray)
         self._codec = codec_of(model_value, varying=True)
-        self._signal = self.DeclareAbstractInputPort("signal", Value(model_value))
-        sample = self.DeclareAbstractState(Value(model_value))
+        if self._is_vector:
+            self._signal = self.DeclareVectorInputPort("signal", model_value.size)
+            sample: Any = self.declare_discrete_state(sample=Quantity(model_value)).index
+        else:
+            self._signal = self.DeclareAbstractInputPort("signal", Value(model_value))
+            sample = self.DeclareAbstractState(Value(model_value))
         self._time = self.declare_discrete_state(time=Quantity(0.0, "s"))
         self._number = self.declare_discrete_state(number=Quantity(0.0, bounds=(0.0, inf)))
         for name, index in {"sample": sample, "time": self._time.index, "number": self._number.index}.items():
@@ -69,9 +74,14 @@ class Arrival(AddressedSystem):
 
     def _update(self, context: Context, state: State) -> EventStatus:
         value = self._signal.Eval(context)
-        if self._is_same(value, context.get_abstract_state(self._sample).get_value()):
-            return EventStatus.DidNothing()
-        state.get_mutable_abstract_state(self._sample).set_value(value)
+        if self._is_vector:
+            if _equal(value, context.get_discrete_state(self._sample).value()):
+                return EventStatus.DidNothing()
+            state.get_mutable_discrete_state().set_value(self._sample, value)
+        else:
+            if self._is_same(value, context.get_abstract_state(self._sample).get_value()):
+                return EventStatus.DidNothing()
+            state.get_mutable_abstract_state(self._sample).set_value(value)
         numbers = state.get_mutable_discrete_state()
         self._time.mutable(numbers).time = max(context.get_time() - self._settings.view(context).age, 0.0)
         self._number.mutable(numbers).number += 1.0

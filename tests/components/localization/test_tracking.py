@@ -28,7 +28,7 @@ def tracked(one: Drive, **settings):
     first = one.poses[0] + np.random.default_rng(len(one.map)).multivariate_normal(np.zeros(3), START)
     states = [tracker.start(first, START, one.scans[0])[0]]
     for k in range(1, len(one.scans)):
-        states.append(tracker.update(tracker.predict(states[-1], *one.motion(k), duration=PERIOD), one.scans[k])[0])
+        states.append(tracker.update(tracker.predict(states[-1], *one.motion(k), extent=PERIOD), one.scans[k])[0])
     return tracker, states
 
 
@@ -180,7 +180,7 @@ def test_an_uncertain_position_loses_the_track():
     for way, is_lost in ((100.0, False), (300.0, True)):
         motion = np.array([way, 0.0, 0.0])
         # Along the way, its deviation is 0.03 m times the root of the metres.
-        after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), duration=0.0)
+        after = tracker.predict(state, motion, np.diag([0.03**2 * way, 0.0, 0.0]), extent=0.0)
         assert tracker.is_lost(after) == is_lost
 
 
@@ -283,7 +283,7 @@ def test_fusing_the_map_in_each_scan_is_inconsistent():
             forgetful = TrackState(
                 state.mean[:6], state.covariance[:6, :6], state.indices[:0], state.is_recent[:0], state.evidence
             )
-            state, _ = tracker.update(tracker.predict(forgetful, *one.motion(k), duration=PERIOD), one.scans[k])
+            state, _ = tracker.update(tracker.predict(forgetful, *one.motion(k), extent=PERIOD), one.scans[k])
         for squares, last in ((once, states[-1]), (afresh, state)):
             squares.append(nees(last.pose, last.pose_covariance, one.poses[-1]))
     assert np.mean(once) < BOUNDS[1] < 2.0 * BOUNDS[1] < np.mean(afresh)
@@ -340,7 +340,7 @@ def test_the_filter_equals_batch_least_squares(correlation):
     )
     state, _ = tracker.start(poses[0], START)
     for k, z in enumerate(seen):
-        state = tracker.predict(state, move, noise, duration=duration) if k else state
+        state = tracker.predict(state, move, noise, extent=duration) if k else state
         m = len(z)
         scan = Landmarks(z, np.tile(deviation**2 * np.eye(2), (m, 1, 1)), np.full(m, 0.3), np.full(m, np.inf))
         state, matches = tracker.update(state, scan)
@@ -394,7 +394,7 @@ def test_the_heading_is_no_more_certain_than_the_map_allows():
         if k == 0:
             state, matches = tracker.start(truth, np.diag([0.7, 0.7, 0.02]) ** 2, scan)
         else:
-            state, matches = tracker.update(tracker.predict(state, motion, drift, duration=PERIOD), scan)
+            state, matches = tracker.update(tracker.predict(state, motion, drift, extent=PERIOD), scan)
     assert len(matches.pairs) > 0.9 * n
     # By generalized least squares (Gauss and Markov), where all places relative to the carrier are known.
     around = places - truth[:2]
@@ -433,7 +433,7 @@ def test_without_detections_covariance_grows_by_the_odometry():
     before = state.pose_covariance
     for _ in range(50):
         motion = np.array([0.2, 0.0, 0.0])
-        predicted = tracker.predict(state, motion, DRIFT.covariance(motion, PERIOD), duration=PERIOD)
+        predicted = tracker.predict(state, motion, DRIFT.covariance(motion, PERIOD), extent=PERIOD)
         state, matches = tracker.update(predicted, Landmarks.empty())
         assert not matches.is_fused
     R_HW = rotation(-states[-1].pose[2])
@@ -457,7 +457,7 @@ def test_landmarks_without_a_known_place_are_not_used():
         tracker = Tracker(landmarks)
         state, _ = tracker.start(one.poses[0], START, one.scans[0])
         for k in range(1, 6):
-            state, matches = tracker.update(tracker.predict(state, *one.motion(k), duration=PERIOD), one.scans[k])
+            state, matches = tracker.update(tracker.predict(state, *one.motion(k), extent=PERIOD), one.scans[k])
         assert matches.is_fused and len(state.indices) < 60
         poses.append(state.pose)
     # Only the distribution of all diameters differs.
@@ -488,7 +488,7 @@ def test_the_map_is_used_once_on_a_closed_route():
         n = len(near)
         scan = Landmarks(places, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, 0.01))
         slip = rng.multivariate_normal(np.zeros(3), drift)
-        state, matches = tracker.update(tracker.predict(state, motion + slip, drift, duration=PERIOD), scan)
+        state, matches = tracker.update(tracker.predict(state, motion + slip, drift, extent=PERIOD), scan)
         seen |= set(matches.pairs[:, 1])
     assert matches.is_fused and len(seen) > 40
     assert (np.diagonal(state.pose_covariance)[:2] > deviation**2 / count).all()
@@ -504,7 +504,7 @@ def test_lasting_errors_of_dead_reckoning_are_expected():
     last, without = (one.start(np.zeros(3), exactly)[0] for one in (tracker, forgetful))
     for _ in range(steps):
         last, without = (
-            one.predict(state, measured, C, duration=duration) for one, state in ((tracker, last), (forgetful, without))
+            one.predict(state, measured, C, extent=duration) for one, state in ((tracker, last), (forgetful, without))
         )
     wrong = []
     for _ in range(60):
@@ -535,8 +535,8 @@ def test_the_state_stays_small_and_is_a_value():
     codec = codec_of(TrackState.none())
     again = codec.decode(codec.encode(last))
     motion = one.motion(3)
-    for name, array in codec.encode(tracker.predict(again, *motion, duration=PERIOD)).items():
-        np.testing.assert_array_equal(array, codec.encode(tracker.predict(last, *motion, duration=PERIOD))[name])
+    for name, array in codec.encode(tracker.predict(again, *motion, extent=PERIOD)).items():
+        np.testing.assert_array_equal(array, codec.encode(tracker.predict(last, *motion, extent=PERIOD))[name])
     with pytest.raises(ValueError):
         last.mean[0] = 1.0
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import atan2, ceil, cos, hypot, inf, sin, sqrt
+from math import atan2, ceil, copysign, cos, hypot, inf, sin, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,7 +75,7 @@ class DriftModel:
         x, y, turned = np.asarray(motion, dtype=float).tolist()
         length = hypot(x, y)
         along = self.along**2 * length
-        heading = self.heading**2 * abs(duration) + self.turn**2 * abs(turned)
+        heading = self.heading**2 * abs(self.extent(motion, duration)) + self.turn**2 * abs(turned)
         # The drift of the heading on the way displaces the end sideways.
         across = self.across**2 * length + heading * length**2 / 3.0
         in_chord = np.array(
@@ -89,6 +89,31 @@ class DriftModel:
         turn[:2, :2] = rotation(atan2(y, x))
         covariance: Array = turn @ in_chord @ turn.T
         return covariance
+
+    def extent(self, motion: ArrayLike, duration: float) -> float:
+        """Return what the error of the heading grows with: the duration of a motion, as its rate is measured."""
+        return duration
+
+
+@dataclass(frozen=True)
+class SteeringDriftModel(DriftModel):
+    """The drift of dead reckoning by speed and steering angle, which measures a curvature in place of a turn rate.
+
+    An error of the angle turns the carrier while it drives, and not while it stands: the heading's error grows with the
+    distance. The lasting error g of a `Tracker` is then one of the curvature, ``rate_deviation`` and ``rate_walk`` are
+    in rad/m and rad/m^1.5. The defaults are those of a car on grass: rounded from the first half of the drive in
+    Victoria Park, see `vtbdrake_diagrams.park`.
+    """
+
+    along: float = setting(0.05, "Standard deviation along the path.", unit="m/sqrt(m)", ge=0)
+    across: float = setting(0.03, "Standard deviation sideways by slip.", unit="m/sqrt(m)", ge=0)
+    heading: float = setting(0.006, "Standard deviation of the heading.", unit="rad/sqrt(m)", ge=0)
+    turn: float = setting(0.02, "Standard deviation of the heading in turns.", unit="rad/sqrt(rad)", ge=0)
+
+    def extent(self, motion: ArrayLike, duration: float) -> float:
+        """Return what the error of the heading grows with: the distance of a motion, negative backwards."""
+        x, y, _ = np.asarray(motion, dtype=float).tolist()
+        return copysign(hypot(x, y), x)
 
 
 class DeadReckoning(AddressedSystem):

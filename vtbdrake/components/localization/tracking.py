@@ -24,8 +24,9 @@ Dead reckoning measures a motion [t; turn] in the time T. It is too long by its 
     true motion = [(1 - e) R(-g T / 2) t; turn - g T] + noise.
 
 e is a first-order Gauss-Markov process over the distance travelled, because the slip of wheels depends on the slope; g
-is a random walk in time. Noise alone, independent from step to step, would be too small after a minute without
-landmarks. e and g are estimated while landmarks are seen.
+is a random walk in time. With a steering angle in place of gyros, T is the distance, and g an error of the curvature.
+Noise alone, independent from step to step, would be too small after a minute without landmarks. e and g are estimated
+while landmarks are seen.
 
 Errors of a map may be correlated: neighbours are displaced alike. With M_ij = c σ_i σ_j exp(-r_ij² / (2 L²)) +
 (1 - c) σ_i² δ_ij for the errors of the landmarks, per axis, the prior of a landmark that is seen for the first time is
@@ -210,30 +211,30 @@ class Tracker:
         loose = self._at(pose, np.diag(_LOOSE**2))
         return self._fused(self._extended(loose, matches.pairs[:, 1], matches.probability), detections, matches.pairs)
 
-    def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, duration: float) -> TrackState:
+    def predict(self, state: TrackState, motion: ArrayLike, covariance: ArrayLike, *, extent: float) -> TrackState:
         """Return the state after a motion.
 
         Args:
             state: The state before.
             motion: The pose of the carrier afterwards in its frame before, by dead reckoning, shape (3,).
             covariance: The covariance of its noise, shape (3, 3).
-            duration: The duration of the motion in s.
+            extent: Extent of the error g of the heading, see `DriftModel.extent`: the duration of the motion in s.
         """
         measured = np.asarray(motion, dtype=float)
         mean, P, heading = state.mean.copy(), state.covariance.copy(), state.mean[2]
-        turned = mean[RATE] * duration
+        turned = mean[RATE] * extent
         way = rotation(-turned / 2.0) @ measured[:2]
         move = np.array([*((1.0 - mean[ODOMETRY]) * way), measured[2] - turned])
         F, G = np.eye(3), block_diag(rotation(heading), 1.0)
         F[:2, 2] = rotation(heading + np.pi / 2.0) @ move[:2]
-        aside = 0.5 * duration * move[:2]
+        aside = 0.5 * extent * move[:2]
         # The derivatives of the pose with respect to e and g.
-        B = -G @ np.array([[way[0], -aside[1]], [way[1], aside[0]], [0.0, duration]])
+        B = -G @ np.array([[way[0], -aside[1]], [way[1], aside[0]], [0.0, extent]])
         mean[:3] = compose(mean[:3], move)
         P[:3] = F @ P[:3] + B @ P[ODOMETRY:FIXED]
         P[:, :3] = P[:, :3] @ F.T + P[:, ODOMETRY:FIXED] @ B.T
         P[:3, :3] += state.drift * G @ np.asarray(covariance, dtype=float) @ G.T
-        P[RATE, RATE] += self.rate_walk**2 * duration
+        P[RATE, RATE] += self.rate_walk**2 * abs(extent)
         decay = float(np.exp(-np.hypot(*measured[:2]) / self.odometry_length))
         mean[ODOMETRY] *= decay
         P[ODOMETRY] *= decay

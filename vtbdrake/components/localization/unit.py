@@ -157,7 +157,8 @@ class LocalizationUnit:
         if begins:
             state = replace(state, submap=Submap.empty(pose))
         if state.track.is_tracking:
-            predicted = self.tracker.predict(state.track, motion, C, duration=duration)
+            extent = self.drift.extent(motion, duration)
+            predicted = self.tracker.predict(state.track, motion, C, extent=extent)
             track, matches = self.tracker.update(predicted, landmarks)
             if not self.tracker.is_lost(track):
                 answer = self._answer(track, matches, len(landmarks), pose, time)
