@@ -2,8 +2,10 @@
 
 from vtbdrake.calibration.calibration import Calibration as Calibration
 from vtbdrake.calibration.calibration import calibrate as calibrate
+from vtbdrake.calibration.calibration import information as information
 from vtbdrake.calibration.filtering import JointRecording as JointRecording
 from vtbdrake.calibration.filtering import Noise as Noise
+from vtbdrake.calibration.fisher import Information as Information
 from vtbdrake.calibration.model import CalibrationError as CalibrationError
 from vtbdrake.calibration.model import Inertia as Inertia
 from vtbdrake.calibration.model import JointModel as JointModel

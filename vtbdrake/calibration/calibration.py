@@ -4,30 +4,35 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
 
 import casadi
 import numpy as np
-import scipy.stats
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
-from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
+from vtbdrake.calibration.filtering import Innovations, JointRecording, Noise, Segments
+from vtbdrake.calibration.fisher import UNTOLD, Information, information_of
+from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
+from vtbdrake.calibration.log_checks import check_log, check_torques
 from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError, Inertia, JointModel, inertia_of
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log
+from vtbdrake.recording.table_reader import GAP
 from vtbdrake.testbed import Scenario
 
 _log = logging.getLogger(__name__)
 
-# A direction in which the recordings leave more than this, in units of the parameters' scales, is not determined.
-UNDETERMINED = 0.5
 # Innovations are called coloured, or a hold-out worse, beyond these; tests of significance reject any real model.
 COLOURED, WORSE = 0.2, 1.3
 _ITERATIONS, _NOISE_ROUNDS, _CONVERGED = 25, 2, 1e-3
 _BLOCK = 0.2  # s, of the sandwich estimator
+# A discrete plant steps by its own step, so that a position that is missing is a gap.
+_LONGEST = 1.5
+# An interval of 95 %, in deviations, and its deviance; how far beyond a bound the optimum lies when it is doubted.
+_WIDE, _DEVIANCE, _PULLED = 1.959964, 3.841459, 3.0
 
 
 class Verdict(StrEnum):
@@ -37,6 +42,7 @@ class Verdict(StrEnum):
     DISCREPANT = "discrepant"  # the model does not explain the recordings: innovations are coloured, a hold-out worse
     NOT_IDENTIFIABLE = "not identifiable"  # these recordings do not tell it apart from others
     AT_BOUND = "at a bound"
+    NO_EVIDENCE = "no evidence"  # the start explains the segments that were kept back as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ class Calibrated:
         start: Its value in the scenario.
         value: Its estimate.
         deviation: Its standard deviation, by the sandwich estimator over blocks of 0.2 s.
-        lower, upper: Its interval of 95 %.
+        lower, upper: Its interval of 95 %, within its range. At a bound it is the profile of the likelihood, one-sided.
         verdict: Whether it may be used.
     """
 
@@ -73,7 +79,9 @@ class Calibration:
         fit, holdout: Root mean square of the whitened innovations (1 is expected) in the segments of the fit, and in
             those that were kept back.
         correlation: The largest autocorrelation of the whitened innovations at the first ten lags, of any joint.
-        reasons: Why the model is discrepant, as sentences.
+        reasons: Why the model is discrepant, or there is no evidence, as sentences.
+        remarks: What the checks of the recordings have noticed, as sentences.
+        information: What the recordings could tell, before the fit.
         segments: Number of segments of the fit.
         sources: The recordings.
     """
@@ -86,6 +94,8 @@ class Calibration:
     holdout: float
     correlation: float
     reasons: tuple[str, ...]
+    remarks: tuple[str, ...]
+    information: Information
     segments: int
     sources: tuple[str, ...]
 
@@ -113,7 +123,7 @@ class Calibration:
                 f"{each.address:{width}}{each.start:12.5g}{each.value:12.5g}{each.deviation:12.2g}   "
                 f"[{each.lower:.5g}, {each.upper:.5g}] {each.verdict}"
             )
-        return "\n".join([*lines, *self.reasons, *self.combinations])
+        return "\n".join([*lines, *self.reasons, *self.combinations, *self.remarks])
 
 
 def calibrate(
@@ -151,34 +161,115 @@ def calibrate(
     Raises:
         CalibrationError: A parameter is none of the model, a log does not fit the model, or nothing is varied.
     """
-    logs = [logs] if isinstance(logs, Log) else list(logs)
-    if not (parameters or inertias):
-        raise CalibrationError("nothing is varied: give parameters=[Parameter(address, lower, upper)] or inertias=")
     if not 0.0 < holdout < 0.9:
         raise CalibrationError(f"the share that is kept back is above 0 and below 0.9, not {holdout}")
-    for name, value in (("period", period), ("segment", segment)):
-        if value is not None and not 0.0 < value < inf:
-            raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
-    testbed = scenario.build()
-    model = JointModel(testbed, parameters, inertias, measured_torque=measured_torque)
-    recordings = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
-    _check_information(model, recordings)
-    z, unexplained = _regression(model, recordings)
-    segments = Segments(model, recordings, duration=segment)
-    held_back = _kept_back(segments.count, holdout)
-    noise = Noise.guess(recordings, unexplained)
-    for _ in range(_NOISE_ROUNDS):
-        noise = segments.likeliest_noise(z, noise)
-        z = _gauss_newton(segments, noise, z, ~held_back)
-    return _result(scenario, model, segments, noise, z, held_back, tuple(log.source for log in logs))
+    prepared = _Prepared(
+        scenario,
+        logs,
+        parameters,
+        inertias,
+        position=position,
+        torque=torque,
+        measured_torque=measured_torque,
+        period=period,
+        segment=segment,
+    )
+    return prepared.fitted(scenario, holdout)
 
 
-def _check_information(model: JointModel, recordings: Sequence[JointRecording]) -> None:
-    for recording in recordings:
-        for name, values in (("position", recording.q), ("torque", recording.u)):
-            still = np.flatnonzero(np.ptp(values, axis=0) == 0.0)
-            if still.size:
-                _log.warning("%s: the %s of joint %s never changes", recording.source, name, ", ".join(map(str, still)))
+def information(
+    scenario: Scenario,
+    logs: Log | Sequence[Log],
+    parameters: Sequence[Parameter] = (),
+    *,
+    inertias: Sequence[Inertia] = (),
+    position: str,
+    torque: str,
+    measured_torque: bool = False,
+    period: float | None = None,
+    segment: float = 1.0,
+) -> Information:
+    """Return what recordings, measured or simulated, can tell about parameters; nothing is fitted but a start.
+
+    It is computed with the noise and at the parameters with which `calibrate` begins. For the arguments see there.
+
+    Raises:
+        CalibrationError: As in `calibrate`, but for parameters that change nothing.
+    """
+    return _Prepared(
+        scenario,
+        logs,
+        parameters,
+        inertias,
+        position=position,
+        torque=torque,
+        measured_torque=measured_torque,
+        period=period,
+        segment=segment,
+    ).information
+
+
+class _Prepared:
+    """Model and recordings, checked, with a start of the fit and what it can tell."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        logs: Log | Sequence[Log],
+        parameters: Sequence[Parameter],
+        inertias: Sequence[Inertia],
+        *,
+        position: str,
+        torque: str,
+        measured_torque: bool,
+        period: float | None,
+        segment: float,
+    ) -> None:
+        logs = [logs] if isinstance(logs, Log) else list(logs)
+        if not (parameters or inertias):
+            raise CalibrationError("nothing is varied: give parameters=[Parameter(address, lower, upper)] or inertias=")
+        if not logs:
+            raise CalibrationError("there is no recording to calibrate with")
+        for name, value in (("period", period), ("segment", segment)):
+            if value is not None and not 0.0 < value < inf:
+                raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
+        self.model = model = JointModel(scenario.build(), parameters, inertias, measured_torque=measured_torque)
+        self.sources = tuple(log.source for log in logs)
+        whole = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
+        longest = _LONGEST if model.step_size > 0.0 else GAP
+        recordings = [piece for recording in whole for piece in recording.pieces(longest=longest)]
+        checks = [check_log(log, scenario.interface(), position=position, torque=torque) for log in logs]
+        dynamics = InverseDynamics(model)
+        fit = dynamics.fit(recordings, start=model.start)
+        checks.append(check_torques(model, dynamics, recordings, fit))
+        self.remarks = tuple(remark for check in checks for remark in check.remarks)
+        self.doubts = tuple(doubt for check in checks for doubt in check.doubts)
+        for remark in self.remarks:
+            _log.warning("%s", remark)
+        self.segments = Segments(model, recordings, duration=segment)
+        self.z = fit.z
+        try:
+            self.noise = self.segments.likeliest_noise(self.z, Noise.guess(recordings, fit.unexplained))
+            slopes = self.segments.innovations(self.noise, self.segments.linearized(self.z)).slopes
+        except CalibrationError as error:
+            raise CalibrationError(". ".join([str(error), *self.doubts])) from error
+        self.information = information_of(slopes.reshape(-1, len(self.z)), model.names, model.scales)
+
+    def fitted(self, scenario: Scenario, holdout: float) -> Calibration:
+        """Return the result of the fit.
+
+        Raises:
+            CalibrationError: A parameter changes nothing.
+        """
+        scalars = set(self.model.names[: self.model.scalars])
+        if nothing := [name for name in self.information.nothing if name in scalars]:
+            raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
+        held_back = _kept_back(self.segments.count, holdout)
+        z, noise = self.z, self.noise
+        for k in range(_NOISE_ROUNDS):
+            noise = self.segments.likeliest_noise(z, noise) if k else noise
+            z = _gauss_newton(self.segments, noise, z, ~held_back)
+        return _result(scenario, self, noise, z, held_back)
 
 
 def _kept_back(count: int, share: float) -> NDArray[np.bool]:
@@ -189,133 +280,123 @@ def _kept_back(count: int, share: float) -> NDArray[np.bool]:
     return held_back
 
 
-def _scales(model: JointModel) -> Array:
-    """Return how far each parameter is from being known: half of its range, and 1 for the numbers of an inertia."""
-    half = 0.5 * (model.upper - model.lower)
-    return np.where(np.isfinite(half), half, 1.0)
-
-
-def _regression(model: JointModel, recordings: Sequence[JointRecording]) -> tuple[Array, Array]:
-    """Return parameters by which inverse dynamics explain the torques, and what is left of these, (n, nq)."""
-    rows = [slice(15, len(recording.times) - 15, 3) for recording in recordings]
-    smoothed = [[part[span] for part in r.smoothed()] for r, span in zip(recordings, rows, strict=True)]
-    Q, V, A = (np.concatenate(parts).T for parts in zip(*smoothed, strict=True))
-    symbols = model.unexplained.sx_in()
-    slope = casadi.Function("slope", symbols, [casadi.jacobian(model.unexplained(*symbols), symbols[-1])])
-    z, scales = model.start.copy(), _scales(model)
-    n = Q.shape[1]
-    residual_of_all, slope_of_all = model.unexplained.map(n), slope.map(n)
-
-    def unexplained(at: Array) -> tuple[Array, Array]:
-        torques, by = zip(*(model.motor(r.times, r.u, at) for r in recordings), strict=True)
-        m = np.concatenate([t[span] for t, span in zip(torques, rows, strict=True)]).T
-        dm = np.concatenate([d[span] for d, span in zip(by, rows, strict=True)])
-        z_all = np.tile(at[:, np.newaxis], (1, n))
-        e = np.asarray(residual_of_all(Q, V, A, m, z_all)).T
-        J = np.asarray(slope_of_all(Q, V, A, m, z_all)).reshape(model.nq, n, len(at)).swapaxes(0, 1)
-        selection = model.selection
-        for k, index in enumerate(model.drive_parameters):
-            J[:, :, index] -= dm[:, k] @ selection.T
-        return e, J
-
-    e, J = unexplained(z)
-    deviation = np.maximum(e.std(axis=0), 1e-9)
-    for _ in range(_ITERATIONS):
-        white, slopes = (e / deviation).ravel(), (J / deviation[:, np.newaxis]).reshape(-1, len(z)) * scales
-        step = _determined_step(slopes.T @ slopes, slopes.T @ white) * scales
-        for _ in range(12):
-            trial = np.clip(z - step, model.lower, model.upper)
-            e_trial, J_trial = unexplained(trial)
-            if ((e_trial / deviation) ** 2).sum() <= (white**2).sum():
-                break
-            step = 0.5 * step
-        else:
-            break
-        moved, z, e, J = abs(trial - z) / scales, trial, e_trial, J_trial
-        deviation = np.maximum(e.std(axis=0), 1e-9)
-        if moved.max() < _CONVERGED:
-            break
-    return z, e
-
-
-def _directions(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:
-    """Return eigenvalues and directions of the information about scaled parameters, and which are determined."""
-    values, directions = np.linalg.eigh(H)
-    return values, directions, np.asarray(values > 1.0 / UNDETERMINED**2)
-
-
-def _determined_step(H: Array, g: Array) -> Array:
-    """Return the step of Gauss and Newton in the directions that are determined; in scaled parameters."""
-    values, directions, determined = _directions(H)
-    along = directions.T @ g
-    return np.asarray(directions[:, determined] @ (along[determined] / values[determined]))
-
-
 def _gauss_newton(segments: Segments, noise: Noise, z: Array, used: NDArray[np.bool]) -> Array:
     """Return the parameters that minimize the whitened innovations, for this noise."""
     model = segments.model
-    scales = _scales(model)
     for _ in range(_ITERATIONS):
         innovations = segments.innovations(noise, segments.linearized(z))
         segments.trajectory = innovations.states
-        J = innovations.slopes[:, used].reshape(-1, len(z)) * scales
+        J = innovations.slopes[:, used].reshape(-1, len(z)) * model.scales
         # Innovations are measured - expected: their derivatives have the other sign than the step.
-        step = _determined_step(J.T @ J, J.T @ innovations.white[:, used].ravel()) * scales
+        step = bounded_step(model, z, J.T @ J, J.T @ innovations.white[:, used].ravel())
         moved = np.clip(z - step, model.lower, model.upper) - z
         z = z + moved
-        if np.max(abs(moved) / scales) < _CONVERGED:
+        if np.max(abs(moved) / model.scales) < _CONVERGED:
             break
     return z
 
 
 def _result(
-    scenario: Scenario,
-    model: JointModel,
-    segments: Segments,
-    noise: Noise,
-    z: Array,
-    held_back: NDArray[np.bool],
-    sources: tuple[str, ...],
+    scenario: Scenario, prepared: _Prepared, noise: Noise, z: Array, held_back: NDArray[np.bool]
 ) -> Calibration:
-    scales = _scales(model)
+    model, segments, used = prepared.model, prepared.segments, ~held_back
     innovations = segments.innovations(noise, segments.linearized(z))
-    white, used = innovations.white, ~held_back
-    fit, holdout = (float(np.sqrt(np.mean(white[:, part] ** 2))) if part.any() else nan for part in (used, held_back))
-    # Scores of blocks that are long against the correlation of what the model lacks.
-    length = max(round(_BLOCK / segments.period), 10)
-    scores = np.array(
-        [
-            np.einsum("twij,twi->wj", innovations.slopes[k : k + length, used], white[k : k + length, used]) * scales
-            for k in range(0, segments.steps - length + 1, length)
-        ]
-    ).reshape(-1, len(z))
-    J = innovations.slopes[:, used].reshape(-1, len(z)) * scales
-    values, directions, determined = _directions(J.T @ J)
-    inverse = directions[:, determined] / values[determined] @ directions[:, determined].T
-    sandwich = inverse @ (scores.T @ scores) @ inverse
-    # Never less than what the noise alone leaves: few blocks make a sandwich too small now and then.
-    larger = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
-    covariance = sandwich * np.outer(larger * scales, larger * scales)
-    unknown = np.linalg.norm(directions[:, ~determined], axis=1)
+    white = innovations.white
+    fit, holdout = (_rms(white[:, part]) for part in (used, held_back))
+    J = innovations.slopes[:, used].reshape(-1, len(z))
+    info = information_of(J, model.names, model.scales)
+    sandwich = _sandwich(segments, innovations, used, info)
+    gradient = (J * model.scales).T @ white[:, used].ravel()
+    bounds = _Bounds(model, z, gradient, info, np.diag(sandwich))
     correlation = _autocorrelation(white[:, used])
-    reasons = []
+    reasons = [*prepared.doubts, *bounds.reasons]
     if correlation > COLOURED:
         reasons.append(f"the innovations are coloured (autocorrelation {correlation:.2g}): the model lacks something")
     if holdout > WORSE * fit:
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
-    combinations = [_combination(directions[:, k], model.names, values[k]) for k in np.flatnonzero(~determined)]
+    verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
+    if not reasons and _start_is_as_good(segments, noise, white, held_back):
+        verdict = Verdict.NO_EVIDENCE
+        reasons.append("the start explains the segments that were kept back as well: nothing speaks for other values")
     return Calibration(
         scenario=scenario,
-        parameters=_reported(model, z, covariance, unknown, discrepant=bool(reasons)),
-        combinations=tuple(combinations),
+        parameters=_reported(model, z, sandwich * np.outer(model.scales, model.scales), info.untold, bounds, verdict),
+        combinations=info.combinations,
         noise=noise,
         fit=fit,
         holdout=holdout,
         correlation=correlation,
         reasons=tuple(reasons),
+        remarks=prepared.remarks,
+        information=prepared.information,
         segments=int(used.sum()),
-        sources=sources,
+        sources=prepared.sources,
     )
+
+
+def _rms(white: Array) -> float:
+    return float(np.sqrt(np.mean(white**2))) if white.size else nan
+
+
+def _sandwich(segments: Segments, innovations: Innovations, used: NDArray[np.bool], info: Information) -> Array:
+    """Return the covariance of the scaled parameters, from scores of blocks that are long against correlations."""
+    length = max(round(_BLOCK / segments.period), 10)
+    spans = [slice(k, k + length) for k in range(0, segments.steps - length + 1, length)]
+    scores = np.array(
+        [
+            np.einsum("twij,twi->wj", innovations.slopes[span][:, used], innovations.white[span][:, used])
+            for span in spans
+        ]
+    ).reshape(-1, len(info.names))
+    scores = scores * info.scales
+    inverse = info.covariance
+    sandwich = inverse @ (scores.T @ scores) @ inverse
+    # Never less than what the noise alone leaves: few blocks make a sandwich too small now and then.
+    larger = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    return np.asarray(sandwich * np.outer(larger, larger))
+
+
+def _start_is_as_good(segments: Segments, noise: Noise, white: Array, held_back: NDArray[np.bool]) -> bool:
+    """Return whether the start explains the segments that were kept back as well as the estimate."""
+    if not held_back.any():
+        return False
+    linearized = segments.linearized(segments.model.start)
+    by_start = segments.innovations(noise, linearized._replace(slopes=linearized.slopes[..., :0])).white
+    gain = (by_start[:, held_back] ** 2).sum() - (white[:, held_back] ** 2).sum()
+    return bool(gain < _DEVIANCE * max((white[:, held_back] ** 2).mean(), 1.0))
+
+
+class _Bounds:
+    """The parameters at an end of their range: how far the optimum lies beyond it, and the interval within it.
+
+    Along a parameter, with the others at their best, the deviance rises from the bound as 2 g d + h d^2 with the
+    distance d, the slope g, and the information h that the others leave. The sandwich takes the place of 1 / h where
+    it is larger.
+
+    Args:
+        model: The model.
+        z: The estimate.
+        gradient: Of half the sum of squares, by the scaled parameters.
+        info: The information at the estimate.
+        variances: Of the scaled parameters.
+    """
+
+    def __init__(self, model: JointModel, z: Array, gradient: Array, info: Information, variances: Array) -> None:
+        at = outward(model, z, gradient) | (z == model.lower) | (z == model.upper)
+        self.intervals: dict[int, tuple[float, float]] = {}
+        self.reasons: list[str] = []
+        for k in np.flatnonzero(at & (info.untold <= UNTOLD)):
+            h = 1.0 / info.covariance[k, k]
+            excess = variances[k] * h
+            g = abs(float(gradient[k]))
+            reach = (np.sqrt(g**2 + h * excess * _DEVIANCE) - g) / h * model.scales[k]
+            ends = (z[k], z[k] + reach) if z[k] == model.lower[k] else (z[k] - reach, z[k])
+            self.intervals[int(k)] = max(ends[0], model.lower[k]), min(ends[1], model.upper[k])
+            if g / np.sqrt(h * excess) > _PULLED:
+                self.reasons.append(
+                    f"{model.names[k]} is pulled {g / np.sqrt(h * excess):.2g} deviations beyond its bound {z[k]:g}: "
+                    "the range excludes the best value"
+                )
 
 
 def _autocorrelation(white: Array) -> float:
@@ -325,30 +406,25 @@ def _autocorrelation(white: Array) -> float:
     return float(np.max(abs(sums / power)))
 
 
-def _combination(direction: Array, names: Sequence[str], value: float) -> str:
-    order = np.argsort(-abs(direction))
-    terms = [f"{direction[k]:+.2f} {names[k]}" for k in order if abs(direction[k]) > 0.2][:6]
-    left = inf if value <= 0.0 else 1.0 / np.sqrt(value)
-    return f"not determined: {' '.join(terms)} (in scaled parameters; deviation {left:.2g} of the range)"
-
-
 def _reported(
-    model: JointModel, z: Array, covariance: Array, unknown: Array, *, discrepant: bool
+    model: JointModel, z: Array, covariance: Array, unknown: Array, bounds: _Bounds, verdict: Verdict
 ) -> dict[str, Calibrated]:
     """Return the numbers by address, of an inertia the physical ones."""
     results: dict[str, Calibrated] = {}
 
-    def add(address: str, start: float, value: float, variance: float, unknown: float, at_bound: bool) -> None:
-        verdict = Verdict.DISCREPANT if discrepant else Verdict.ACCEPTED
-        verdict = Verdict.AT_BOUND if at_bound else verdict
-        verdict = Verdict.NOT_IDENTIFIABLE if unknown > 0.1 else verdict
+    def add(address: str, start: float, value: float, variance: float, unknown: float) -> None:
         deviation = float(np.sqrt(variance))
-        wide = scipy.stats.norm.ppf(0.975) * deviation
-        results[address] = Calibrated(address, start, value, deviation, value - wide, value + wide, verdict)
+        ends = value - _WIDE * deviation, value + _WIDE * deviation
+        judged = Verdict.NOT_IDENTIFIABLE if unknown > UNTOLD else verdict
+        results[address] = Calibrated(address, start, value, deviation, *ends, judged)
 
     for k in range(model.scalars):
-        at_bound = z[k] in (model.lower[k], model.upper[k])
-        add(model.names[k], model.start[k], z[k], covariance[k, k], unknown[k], bool(at_bound))
+        name = model.names[k]
+        add(name, model.start[k], z[k], covariance[k, k], unknown[k])
+        ends = results[name].lower, results[name].upper
+        lower, upper = bounds.intervals.get(k, (max(ends[0], model.lower[k]), min(ends[1], model.upper[k])))
+        judged = Verdict.AT_BOUND if k in bounds.intervals else results[name].verdict
+        results[name] = replace(results[name], lower=lower, upper=upper, verdict=judged)
     symbol = casadi.SX.sym("z", INERTIA_SIZE)
     physical = casadi.vertcat(*inertia_of(symbol))
     convert = casadi.Function("inertia", [symbol], [physical, casadi.jacobian(physical, symbol)])
@@ -361,5 +437,5 @@ def _reported(
         size = np.abs(J) @ np.ones(INERTIA_SIZE)
         doubt = np.abs(J) @ unknown[rows] / np.maximum(size, 1e-300)
         for i, part in enumerate(parts):
-            add(f"{body}.{part}", start[i], float(value[i, 0]), float(C[i, i]), float(doubt[i]), False)
+            add(f"{body}.{part}", start[i], float(value[i, 0]), float(C[i, i]), float(doubt[i]))
     return results

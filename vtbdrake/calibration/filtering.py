@@ -15,37 +15,42 @@ its innovations, and their derivatives by the parameters, are those of the defec
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import casadi
 import numpy as np
 import scipy.optimize
 import scipy.signal
+from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.model import CalibrationError, JointModel
 from vtbdrake.components.casadi_system.compiler import compiled_if_possible
-from vtbdrake.recording.log import Log
+from vtbdrake.recording.log import Log, Series
+from vtbdrake.recording.table_reader import GAP
 
 # How far the period of a recording may differ from a multiple of the plant's step, as a share of that step.
 _ON_GRID = 0.05
 # The least number of samples, and the number of samples of a local polynomial of third order.
 _FEWEST, _SMOOTHED = 50, 15
 _NOISE_SEGMENTS = 12
+# Commands with less jitter than this share of their period come by a clock.
+_REGULAR = 0.2
 _LEAST = 1e-9  # of a deviation, in rad or m
 
 
 @dataclass(frozen=True, eq=False)
 class JointRecording:
-    """Positions and torques of one recording, at the times of the positions.
+    """Positions and torques of one recording, from each position to the next.
 
     Attributes:
         source: Where it is from.
         times: (n,), in s.
         q: Measured positions, (n, nq).
-        u: Commands that acted from each time on, (n, nu).
-        stride: Of how many recorded positions each is one; the torques are means over these.
+        u: Means of the commands that acted from each time to the next one, (n, nu).
+        stride: Of how many recorded positions each is one.
     """
 
     source: str
@@ -70,21 +75,38 @@ class JointRecording:
                 raise CalibrationError(
                     f"{log.source}: {name} has {side[name].values.shape[1]} entries, the model {size}: other joints?"
                 )
-        u = log.act[torque].at(log.sense[position].times)
-        rows = np.isfinite(u).all(axis=1)
-        times, q = log.sense[position].times[rows], log.sense[position].values[rows]
-        stride = 1 if period is None else max(round(period / float(np.median(np.diff(times)))), 1)
+        positions, commands = log.sense[position], log.act[torque]
+        rows = (positions.times >= commands.times[0]) & ~stale(commands, positions.times)
+        times, q = positions.times[rows], positions.values[rows]
+        stride = 1 if period is None or len(times) < 2 else max(round(period / float(np.median(np.diff(times)))), 1)
         count = len(times) // stride
         if count < _FEWEST:
             raise CalibrationError(f"{log.source}: {count} positions with a torque are too few to calibrate with")
-        torques = u[rows][: count * stride].reshape(count, stride, -1).mean(axis=1)
         span = slice(0, count * stride, stride)
-        return cls(log.source, times[span], q[span], torques, stride)
+        return cls(log.source, times[span], q[span], _means(commands, times[span]), stride)
 
     @property
     def period(self) -> float:
         """Return the median time between two positions, in s."""
         return float(np.median(np.diff(self.times)))
+
+    def pieces(self, *, longest: float) -> list[JointRecording]:
+        """Return the parts between gaps, of those that are long enough.
+
+        Args:
+            longest: The longest time between two positions that is no gap, in periods.
+
+        Raises:
+            CalibrationError: No part is long enough.
+        """
+        cuts = np.flatnonzero(np.diff(self.times) > longest * self.period) + 1
+        ends = [0, *cuts.tolist(), len(self.times)]
+        spans = [slice(*pair) for pair in pairwise(ends) if pair[1] - pair[0] >= _FEWEST]
+        if not spans:
+            raise CalibrationError(
+                f"{self.source}: {cuts.size} gaps leave no {_FEWEST} positions in a row: the recording is too sparse"
+            )
+        return [replace(self, times=self.times[span], q=self.q[span], u=self.u[span]) for span in spans]
 
     def smoothed(self) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations (n, nq) by local polynomials."""
@@ -147,6 +169,28 @@ class Innovations(NamedTuple):
     slopes: Array
     log_determinant: float
     states: Array
+
+
+def _means(commands: Series, times: Array) -> Array:
+    """Return the means of commands, each of which acts until the next one, from each time to the next, (n, nu)."""
+    # The integral from the first command on bends where a command begins.
+    steps = np.diff(commands.times)[:, np.newaxis]
+    integral = np.concatenate(
+        [np.zeros((1, commands.values.shape[1])), np.cumsum(commands.values[:-1] * steps, axis=0)]
+    )
+    index = np.searchsorted(commands.times, times, side="right") - 1
+    at = integral[index] + commands.values[index] * (times - commands.times[index])[:, np.newaxis]
+    means = np.diff(at, axis=0) / np.diff(times)[:, np.newaxis]
+    return np.concatenate([means, commands.values[index[-1:]]])
+
+
+def stale(commands: Series, times: Array) -> NDArray[np.bool]:
+    """Return at which times the newest command is older than commands of a regular clock can be: some are missing."""
+    period, jitter, _ = commands.uniformity
+    if not jitter < _REGULAR * period:  # They are recorded when they change.
+        return np.zeros(len(times), bool)
+    newest = np.searchsorted(commands.times, times, side="right") - 1
+    return np.asarray(times - commands.times[np.maximum(newest, 0)] > GAP * period)
 
 
 class Segments:
@@ -265,7 +309,13 @@ class Segments:
             X[:, : 2 * n, 0] += defects[k]
             X[:, : 2 * n, 1:] += slopes[k]
             P = transition @ P @ np.swapaxes(transition, 1, 2) + Q
-            L = np.linalg.cholesky(P[:, :n, :n] + R)
+            try:
+                L = np.linalg.cholesky(P[:, :n, :n] + R)
+            except np.linalg.LinAlgError:
+                raise CalibrationError(
+                    "the model runs away from the recordings within a step, for the parameters that fit their torques "
+                    "best: another machine, other units, or ranges of the parameters that are too wide"
+                ) from None
             # Of the innovations: measured - expected.
             rest = -X[:, :n]
             rest[:, :, 0] += q[k + 1] - trajectory[k + 1, :, :n]

@@ -152,6 +152,12 @@ class JointModel:
                     f"{parameter.address} is no parameter of a plant (sim.sys....) or of JointDrives (sim.act....)"
                     f"{suggestion(parameter.address, list(variables))}"
                 )
+            if parameter.integer:
+                raise CalibrationError(f"{parameter.address} is an integer: the fit takes continuous parameters")
+            try:
+                parameter.find(variables)
+            except ValueError as error:
+                raise CalibrationError(str(error)) from error
             if (match := _DRIVE.match(parameter.address)) and match[2] in _TIMES:
                 if measured_torque:
                     raise CalibrationError(f"{parameter.address} is not seen in torques that were measured")
@@ -175,6 +181,17 @@ class JointModel:
         self.upper = np.array([*upper, *infinite])
         self._check_ranges()
         self._build(testbed, context, plant, plant_context)
+
+    @property
+    def scales(self) -> Array:
+        """Return how far each parameter is from being known: half of its range, and 1 for the numbers of an inertia."""
+        half = 0.5 * (self.upper - self.lower)
+        return np.where(np.isfinite(half), half, 1.0)
+
+    @property
+    def varies_delay(self) -> bool:
+        """Return whether the delay of the drives is one of the parameters."""
+        return "delay" in self._drive_names
 
     def _check_ranges(self) -> None:
         for name, value, low, high in zip(self.names, self.start, self.lower, self.upper, strict=True):

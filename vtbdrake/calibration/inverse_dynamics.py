@@ -1,0 +1,129 @@
+"""Inverse dynamics: which torques the model needs for the motion of a recording, and how well the recorded ones fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.arrays import Array
+from vtbdrake.calibration.filtering import JointRecording
+from vtbdrake.calibration.model import JointModel
+
+# A direction in which the recordings leave more than this, in units of the parameters' scales, is not determined.
+UNDETERMINED = 0.5
+_ITERATIONS, _CONVERGED = 25, 1e-3
+# Smoothed positions are bad at the ends of a recording; between them, every third is taken.
+_ENDS, _STRIDE = 15, 3
+
+
+class TorqueFit(NamedTuple):
+    """Parameters by which inverse dynamics explain the torques of recordings.
+
+    Attributes:
+        z: The parameters.
+        unexplained: What is left of the torques, (n, nq).
+        share: The share of the power of the torques that is not explained; about 1 of nothing, 0 of everything.
+    """
+
+    z: Array
+    unexplained: Array
+    share: float
+
+
+class InverseDynamics:
+    """Fits torques, with one model, to any recordings.
+
+    Args:
+        model: The model.
+    """
+
+    def __init__(self, model: JointModel) -> None:
+        self._model = model
+        symbols = model.unexplained.sx_in()
+        self._slope = casadi.Function("slope", symbols, [casadi.jacobian(model.unexplained(*symbols), symbols[-1])])
+
+    def fit(self, recordings: Sequence[JointRecording], *, start: Array, most: int | None = None) -> TorqueFit:
+        """Return the fit, within the ranges of the parameters.
+
+        Args:
+            recordings: The recordings.
+            start: Where the parameters begin.
+            most: About the largest number of samples to use; None: all.
+        """
+        model, scales = self._model, self._model.scales
+        samples = sum(len(recording.times) for recording in recordings)
+        stride = _STRIDE if most is None else max(_STRIDE, samples // most)
+        rows = [slice(_ENDS, len(recording.times) - _ENDS, stride) for recording in recordings]
+        smoothed = [[part[span] for part in r.smoothed()] for r, span in zip(recordings, rows, strict=True)]
+        Q, V, A = (np.concatenate(parts).T for parts in zip(*smoothed, strict=True))
+        n = Q.shape[1]
+        residual_of_all, slope_of_all = model.unexplained.map(n), self._slope.map(n)
+        selection = model.selection
+
+        def unexplained(at: Array) -> tuple[Array, Array, Array]:
+            torques, by = zip(*(model.motor(r.times, r.u, at) for r in recordings), strict=True)
+            m = np.concatenate([t[span] for t, span in zip(torques, rows, strict=True)])
+            dm = np.concatenate([d[span] for d, span in zip(by, rows, strict=True)])
+            z_all = np.tile(at[:, np.newaxis], (1, n))
+            e = np.asarray(residual_of_all(Q, V, A, m.T, z_all)).T
+            J = np.asarray(slope_of_all(Q, V, A, m.T, z_all)).reshape(model.nq, n, len(at)).swapaxes(0, 1)
+            for k, index in enumerate(model.drive_parameters):
+                J[:, :, index] -= dm[:, k] @ selection.T
+            return e, J, m @ selection.T
+
+        z = np.array(start, dtype=float)
+        e, J, acting = unexplained(z)
+        deviation = np.maximum(e.std(axis=0), 1e-9)
+        for _ in range(_ITERATIONS):
+            white, slopes = (e / deviation).ravel(), (J / deviation[:, np.newaxis]).reshape(-1, len(z)) * scales
+            step = bounded_step(model, z, slopes.T @ slopes, slopes.T @ white)
+            for _ in range(12):
+                trial = np.clip(z - step, model.lower, model.upper)
+                e_trial, J_trial, acting_trial = unexplained(trial)
+                if ((e_trial / deviation) ** 2).sum() <= (white**2).sum():
+                    break
+                step = 0.5 * step
+            else:
+                break
+            moved, z, e, J, acting = abs(trial - z) / scales, trial, e_trial, J_trial, acting_trial
+            deviation = np.maximum(e.std(axis=0), 1e-9)
+            if moved.max() < _CONVERGED:
+                break
+        # By joint, as torques of a wrist are small beside those of a shoulder; of a passive joint, those of its motion.
+        power = np.maximum((acting**2).mean(axis=0), ((e + acting) ** 2).mean(axis=0))
+        shares = (e**2).mean(axis=0) / np.maximum(power, 1e-12)
+        return TorqueFit(z, e, float(shares.mean()))
+
+
+def directions_of(H: Array) -> tuple[Array, Array, NDArray[np.bool]]:
+    """Return eigenvalues and directions of the information about scaled parameters, and which are determined."""
+    values, directions = np.linalg.eigh(H)
+    return values, directions, np.asarray(values > 1.0 / UNDETERMINED**2)
+
+
+def bounded_step(model: JointModel, z: Array, H: Array, g: Array) -> Array:
+    """Return the step of Gauss and Newton, to be subtracted from z, in the directions that are determined.
+
+    A parameter at an end of its range that is pulled beyond it stays there, and the others step without it.
+
+    Args:
+        model: The model.
+        z: The parameters.
+        H: The information about the scaled parameters.
+        g: The gradient of half the sum of squares by the scaled parameters.
+    """
+    free = ~outward(model, z, g)
+    step = np.zeros(len(z))
+    values, directions, determined = directions_of(H[np.ix_(free, free)])
+    along = directions.T @ g[free]
+    step[free] = directions[:, determined] @ (along[determined] / values[determined])
+    return step * model.scales
+
+
+def outward(model: JointModel, z: Array, g: Array) -> NDArray[np.bool]:
+    """Return which parameters stand at an end of their range and are pulled beyond it by the gradient."""
+    return np.asarray(((z <= model.lower) & (g > 0.0)) | ((z >= model.upper) & (g < 0.0)))

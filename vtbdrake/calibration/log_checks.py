@@ -1,0 +1,255 @@
+"""What is wrong with a recording, before anything is fitted to it: clock, columns, units, alignment, the wrong machine.
+
+Remarks say what a user should know; a doubt makes the result discrepant; what cannot be right is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from vtbdrake.arrays import Array
+from vtbdrake.calibration.filtering import JointRecording, stale
+from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
+from vtbdrake.calibration.model import CalibrationError, JointModel
+from vtbdrake.recording.log import Log, Series
+from vtbdrake.recording.table_reader import GAP
+from vtbdrake.testbed import Interface
+
+# Shares of a recording from which on something is said: missing time, uneven periods, and equal extreme values.
+_MISSING, _UNEVEN, _SATURATED = 0.02, 0.2, 0.05
+# An extreme value in a row for so many samples is a limit, and for so long, in s, a dead sensor.
+_PLATEAU, _FROZEN = 5, 0.5
+# Beyond this share of unexplained power, a model is not that of the recorded machine.
+UNLIKE = 0.5
+# Another reading of the columns is believed if it leaves this share of what the columns as they are leave, and below
+# this share of all; one above an even smaller share is not looked for.
+_BETTER, _EXPLAINED, _GOOD = 1.0 / 9.0, 0.3, 0.02
+# Torques that come by another delay are mentioned if they leave this share.
+_ALIGNED = 0.7
+_DELAYS = (1, 2, 4, 8, 16, 32)  # in periods
+_SAMPLES = 500  # of a fit of the torques for one reading
+_MOST_SWAPPED = 8  # joints
+
+
+class Checks(NamedTuple):
+    """The outcome of the checks.
+
+    Attributes:
+        remarks: What a user should know, as sentences.
+        doubts: Why no result can be accepted, as sentences.
+    """
+
+    remarks: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+
+def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> Checks:
+    """Check clock and columns of a recording.
+
+    Args:
+        log: The recording, with both signals.
+        interface: The signals of the DPS, for the bounds of the torques.
+        position: The sensor signal of the joint positions.
+        torque: The actuator signal of the joint torques.
+
+    Raises:
+        CalibrationError: No joint moves, or nothing is a number.
+    """
+    q, u = log.sense[position], log.act[torque]
+    if not np.isfinite(q.values).all() or not np.isfinite(u.values).all():
+        raise CalibrationError(f"{log.source} has positions or torques that are not finite: leave these samples out")
+    dead = np.flatnonzero(np.ptp(q.values, axis=0) == 0.0)
+    if dead.size == q.values.shape[1]:
+        raise CalibrationError(f"{log.source}: no entry of {position} ever changes, so that nothing can be told")
+    remarks = list(log.remarks)
+    for name, series in ((position, q), (torque, u)):
+        remarks += _of_clock(f"{log.source}: {name}", series)
+        still = np.flatnonzero(np.ptp(series.values, axis=0) == 0.0)
+        if still.size:
+            remarks.append(f"{log.source}: {name} never changes in the entries {', '.join(map(str, still))}")
+    missing = int(stale(u, q.times).sum() + (q.times < u.times[0]).sum())
+    if missing > _MISSING * len(q):
+        remarks.append(
+            f"{log.source}: {missing} of {len(q)} samples of {position} have no {torque} at their time: truncated, or "
+            "of another clock?"
+        )
+    for k in range(q.values.shape[1]):
+        seconds = _longest_run(q.values[:, k], others=np.delete(q.values, k, 1)) * q.uniformity.period
+        if k not in dead and seconds > _FROZEN:
+            remarks.append(
+                f"{log.source}: {position}[{k}] keeps one value for {seconds:.3g} s while another joint moves: a "
+                "sensor that was dead, or a joint that stuck"
+            )
+    for k in range(u.values.shape[1]):
+        share, value = _plateau(u.values[:, k])
+        if share > _SATURATED:
+            remarks.append(
+                f"{log.source}: {torque}[{k}] stays at its extreme value {value:g} in {share:.0%} of the samples: if "
+                "it is a limit of the recording, another torque has acted"
+            )
+    return Checks(tuple(dict.fromkeys(remarks)), tuple(_beyond_bounds(log, interface, torque)))
+
+
+def _of_clock(label: str, series: Series) -> Iterator[str]:
+    period, jitter, _ = series.uniformity
+    if not period > 0.0:
+        return
+    steps = np.diff(series.times)
+    gaps = steps > GAP * period
+    if gaps.any():
+        first = int(np.flatnonzero(gaps)[0])
+        yield (
+            f"{label} has {int(gaps.sum())} gaps, {steps[gaps].sum():.3g} s in all, the first at "
+            f"{series.times[first]:.6g} s; the recording is cut there"
+        )
+    if jitter > _UNEVEN * period:
+        yield f"{label} comes unevenly: every {1e3 * period:.3g} ms, and half of the times {1e3 * jitter:.2g} ms off"
+
+
+def _longest_run(values: Array, *, others: Array) -> int:
+    """Return the largest number of equal samples in a row during which one of the others changes all the time."""
+    if not others.shape[1]:
+        return 0
+    moving = (np.diff(others, axis=0) != 0.0).any(axis=1)
+    longest = run = 0
+    for same in (np.diff(values) == 0.0) & moving:
+        run = run + 1 if same else 0
+        longest = max(longest, run)
+    return longest
+
+
+def _plateau(values: Array) -> tuple[float, float]:
+    """Return the share of samples at an extreme value in long rows, and the value, of the worse of both ends."""
+    shares = []
+    for extreme in (values.min(), values.max()):
+        at = np.concatenate([[False], values == extreme, [False]])
+        ends = np.flatnonzero(np.diff(at.astype(int))).reshape(-1, 2)
+        lengths = ends[:, 1] - ends[:, 0]
+        # A drive that rests commands nothing, which is no limit.
+        count = lengths[lengths >= _PLATEAU].sum() if extreme != 0.0 and np.ptp(values) > 0.0 else 0
+        shares.append((float(count) / len(values), float(extreme)))
+    return max(shares)
+
+
+def _beyond_bounds(log: Log, interface: Interface, torque: str) -> Iterator[str]:
+    signal = next((each for each in interface.act if each.name == torque), None)
+    if signal is None or not signal.is_vector:
+        return
+    values = log.act[torque].values
+    lower, upper = (np.broadcast_to(np.asarray(end, float), values.shape[1:]) for end in (signal.lower, signal.upper))
+    slack = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+    for k in np.flatnonzero(((values < lower - slack) | (values > upper + slack)).any(axis=0)):
+        yield (
+            f"{log.source}: {torque}[{k}] reaches from {values[:, k].min():g} to {values[:, k].max():g}, beyond its "
+            f"bounds [{lower[k]:g}, {upper[k]:g}]: other units, or another machine?"
+        )
+
+
+def check_torques(
+    model: JointModel, dynamics: InverseDynamics, recordings: Sequence[JointRecording], fit: TorqueFit
+) -> Checks:
+    """Check whether the recordings are of this machine, in these units, columns and times.
+
+    Args:
+        model: The model.
+        dynamics: Its inverse dynamics.
+        recordings: The recordings.
+        fit: The fit of the torques to them as they are.
+
+    Raises:
+        CalibrationError: Another reading of the columns (exchanged, another sign, other units) is explained much
+            better than that in which they were given.
+    """
+
+    def share_of(reading: Callable[[JointRecording], JointRecording]) -> float:
+        return dynamics.fit([reading(each) for each in recordings], start=model.start, most=_SAMPLES).share
+
+    remarks, doubts = [], []
+    share = share_of(lambda recording: recording)  # of the samples of the others
+    if share > _GOOD:
+        shares = {text: share_of(reading) for text, reading in _readings(model)}
+        text, least = min(shares.items(), key=lambda item: item[1])
+        if least < _BETTER * share and least < _EXPLAINED:
+            raise CalibrationError(
+                f"{recordings[0].source}: as given, {share:.0%} of the power of the torques is not explained; with "
+                f"{text}, {least:.1%}: check signals, columns and units (read_table has units=)"
+            )
+    if not model.varies_delay:
+        delays = {d: share_of(_delayed(d)) for d in (*_DELAYS, *(-each for each in _DELAYS)) if _fits(recordings, d)}
+        d, least = min(delays.items(), key=lambda item: item[1], default=(0, share))
+        if least < _ALIGNED * share:
+            period = recordings[0].period
+            remarks.append(
+                f"with torques that act {1e3 * abs(d) * period:.3g} ms {'later' if d > 0 else 'earlier'}, {least:.2g} "
+                f"of their power is not explained, instead of {share:.2g}: vary the delay of the drives, or check the "
+                "clocks"
+            )
+    if fit.share > UNLIKE:
+        doubts.append(
+            f"{fit.share:.0%} of the power of the torques is not explained by any parameters in these ranges: another "
+            "machine, other units, or a model that lacks the most"
+        )
+    return Checks(tuple(remarks), tuple(doubts))
+
+
+def _fits(recordings: Sequence[JointRecording], delay: int) -> bool:
+    return all(len(each.times) > 4 * abs(delay) + 100 for each in recordings)
+
+
+def _delayed(periods: int) -> Callable[[JointRecording], JointRecording]:
+    def reading(recording: JointRecording) -> JointRecording:
+        rows = len(recording.times) - abs(periods)
+        q, u = (max(periods, 0), max(-periods, 0))
+        times = recording.times[q : q + rows]
+        return replace(recording, times=times, q=recording.q[q : q + rows], u=recording.u[u : u + rows])
+
+    return reading
+
+
+def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording], JointRecording]]]:
+    """Yield other readings of the columns, each with its name."""
+
+    def of(
+        q: Sequence[int] | None = None,
+        u: Sequence[int] | None = None,
+        by_q: Array | float = 1.0,
+        by_u: Array | float = 1.0,
+    ) -> Callable[[JointRecording], JointRecording]:
+        columns_q, columns_u = list(q or range(model.nq)), list(u or range(model.nu))
+        return lambda each: replace(each, q=by_q * each.q[:, columns_q], u=by_u * each.u[:, columns_u])
+
+    for factor, text in ((pi / 180.0, "degrees"), (2.0 * pi, "turns"), (180.0 / pi, "rad that were converted twice")):
+        yield f"positions that are {text}", of(by_q=factor)
+    for k in range(model.nq):
+        yield f"the other sign of position {k}", of(by_q=_sign(model.nq, k))
+    for k in range(model.nu):
+        yield f"the other sign of torque {k}", of(by_u=_sign(model.nu, k))
+    if model.nq > 1:
+        yield "the other sign of all positions", of(by_q=-1.0)
+    for factor, text in ((1e-3, "1000 times too large"), (1e3, "1000 times too small")):
+        yield f"torques that are {text}", of(by_u=factor)
+    if model.nq <= _MOST_SWAPPED:
+        for pair in combinations(range(model.nq), 2):
+            yield f"positions {pair[0]} and {pair[1]} exchanged", of(q=_exchanged(model.nq, *pair))
+            if model.nu == model.nq:
+                order = _exchanged(model.nq, *pair)
+                yield f"torques {pair[0]} and {pair[1]} exchanged", of(u=order)
+                yield f"joints {pair[0]} and {pair[1]} exchanged", of(q=order, u=order)
+
+
+def _sign(size: int, k: int) -> Array:
+    signs = np.ones(size)
+    signs[k] = -1.0
+    return signs
+
+
+def _exchanged(size: int, i: int, j: int) -> list[int]:
+    order = list(range(size))
+    order[i], order[j] = j, i
+    return order
