@@ -9,6 +9,14 @@ from vtbdrake.calibration.fisher import Information as Information
 from vtbdrake.calibration.model import CalibrationError as CalibrationError
 from vtbdrake.calibration.model import Inertia as Inertia
 from vtbdrake.calibration.model import JointModel as JointModel
+from vtbdrake.calibration.regression import Drive as Drive
+from vtbdrake.calibration.regression import Equations as Equations
+from vtbdrake.calibration.regression import Regression as Regression
+from vtbdrake.calibration.regression import TorqueRegressor as TorqueRegressor
+from vtbdrake.calibration.regression import base_parameters as base_parameters
+from vtbdrake.calibration.regression import equations as equations
+from vtbdrake.calibration.regression import friction as friction
+from vtbdrake.calibration.regression import regress as regress
 from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
 from vtbdrake.calibration.validation import Tolerance as Tolerance

@@ -1,0 +1,544 @@
+r"""Inverse-dynamics regression: inertial parameters and friction of a fixed-base plant by linear least squares.
+
+The torques of an arm depend linearly on the inertial parameters of its bodies and on its friction,
+
+    tau = Y(q, v, a) p,
+
+so that no start is needed (W. Khalil and E. Dombre, "Modeling, Identification and Control of Robots", 2002, chapter
+12). p has more entries than any motion can tell apart. Those that can be told, the base parameters b = p_1 + beta p_2,
+are named in words. Where all of p is needed (to simulate), it is the one nearest to the plant's own numbers that a body
+with positive masses can have (P. M. Wensing, S. Kim and J.-J. E. Slotine, "Linear matrix inequalities for physically
+consistent inertial parameter identification", IEEE Robotics and Automation Letters 3, 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi
+import numpy as np
+import scipy.linalg
+import scipy.signal
+import scipy.stats
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.solvers import ClarabelSolver, MathematicalProgram
+from pydrake.systems.framework import Context
+
+from vtbdrake.arrays import Array
+from vtbdrake.calibration.filtering import JointRecording
+from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError
+from vtbdrake.components.casadi_system.kernel import Expression
+from vtbdrake.components.compiled_plant import PlantDynamics
+from vtbdrake.state.multibody import bodies, element_address
+
+# Names of the inertial parameters of a body: about its origin, in its frame.
+INERTIAL = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
+Term = Callable[[Array, Array, Array], Array]
+_ORDER = 4  # of the Butterworth filters
+_PER_CUTOFF = 4  # samples that are kept in a period of the cutoff frequency
+_RANK = 1e-7  # of a column of the regressor that adds nothing, relative to its norm
+_ROUNDS = 3  # of the weights
+_NO_PRIOR = 1e3  # relative deviation of the plant's own numbers where they count only if nothing else does
+_MARGIN = 1e-4  # of mass and moments, in units of the model's mean ones, that each body has at least
+_BLOCKS_PER_PARAMETER = 3
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What acts on the joints along a direction, linear in parameters: a motor with its friction, or a spring.
+
+    Attributes:
+        direction: Its rate is direction' v, and it acts with direction * torque, (nq,). A motor that a wrist couples to
+            two joints has two entries.
+        terms: Functions of its angle (rad), rate and acceleration, (n,) each, that its parameters multiply.
+    """
+
+    direction: Array
+    terms: Mapping[str, Term]
+
+
+def friction(
+    *, coulomb_velocity: float = 0.01, stribeck_velocity: float | None = None, offset: bool = True, rotor: bool = True
+) -> dict[str, Term]:
+    """Return the terms of a motor: viscous and Coulomb friction, and as asked the others.
+
+    The two velocities are fixed: the torques are not linear in them, and a recording hardly tells them.
+
+    Args:
+        coulomb_velocity: Width v_c of Coulomb's friction tanh(v / v_c), in rad/s.
+        stribeck_velocity: Range v_s of the friction tanh(v / v_c) exp(-(v / v_s)^2) that a slow motion has in addition.
+        offset: A constant torque.
+        rotor: The reflected inertia of the motor.
+    """
+
+    def sign(rate: Array) -> Array:
+        return np.asarray(np.tanh(rate / coulomb_velocity))
+
+    terms: dict[str, Term] = {
+        "viscous": lambda angle, rate, acceleration: rate,
+        "coulomb": lambda angle, rate, acceleration: sign(rate),
+    }
+    if stribeck_velocity is not None:
+        width = stribeck_velocity
+        terms["stribeck"] = lambda angle, rate, acceleration: sign(rate) * np.exp(-((rate / width) ** 2))
+    if offset:
+        terms["offset"] = lambda angle, rate, acceleration: np.ones_like(rate)
+    if rotor:
+        terms["rotor"] = lambda angle, rate, acceleration: acceleration
+    return terms
+
+
+class TorqueRegressor:
+    """The torques of a plant as tau = Y(q, v, a) p.
+
+    Args:
+        plant: A finalized plant with a fixed base, which can be compiled.
+        context: The plant's own Context; the default one by default.
+        drives: What acts beside the bodies, by name; by default, `friction` at each joint. The plant's own damping and
+            reflected inertia are not part of the torques: they are terms of drives.
+
+    Attributes:
+        nq: Number of joints.
+        bodies: Names of the bodies.
+        names: Names of the entries of p: ten of each body, then those of the drives.
+        nominal: p of the plant, with zeros for the drives.
+
+    Raises:
+        CalibrationError: The plant cannot be compiled, has a floating joint, or a direction has another size.
+    """
+
+    def __init__(
+        self, plant: MultibodyPlant, context: Context | None = None, *, drives: Mapping[str, Drive] | None = None
+    ) -> None:
+        context = plant.CreateDefaultContext() if context is None else context
+        carried = [body for body in bodies(plant) if not plant.IsAnchored(body)]
+        addresses = [element_address(plant, body, lambda instance: "") for body in carried]
+        short = [body.name() for body in carried]
+        self.bodies = tuple(short if len(set(short)) == len(short) else addresses)
+        inputs = [[f"{address}.{part}" for part in ("mass", "center_of_mass", "inertia")] for address in addresses]
+        try:
+            dynamics = PlantDynamics(plant, context, inputs=[name for parts in inputs for name in parts])
+        except ValueError as error:
+            raise CalibrationError(str(error)) from error
+        if dynamics.nq != dynamics.nv:
+            raise CalibrationError("a floating joint has no torques to be regressed: fix the base")
+        self.nq = dynamics.nq
+        if drives is None:
+            joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+            places = {joint.name(): joint.position_start() for joint in joints if joint.num_positions()}
+            drives = {name: Drive(np.eye(self.nq)[k], friction()) for name, k in places.items()}
+        for name, drive in drives.items():
+            if np.shape(drive.direction) != (self.nq,):
+                raise CalibrationError(
+                    f"the direction of {name} has the shape {np.shape(drive.direction)}, not ({self.nq},)"
+                )
+        self._drives = dict(drives)
+        self.names = tuple(
+            [f"{body}.{name}" for body in self.bodies for name in INERTIAL]
+            + [f"{name}.{term}" for name, drive in drives.items() for term in drive.terms]
+        )
+        inertial = [_inertial(*(dynamics.values[name] for name in parts)) for parts in inputs]
+        self.nominal = np.concatenate([*inertial, np.zeros(len(self.names) - INERTIA_SIZE * len(self.bodies))])
+        self._regressor = self._compile(dynamics, inputs)
+
+    def _compile(self, dynamics: PlantDynamics, inputs: Sequence[Sequence[str]]) -> casadi.Function:
+        """Return the function (q, v, a) -> columns of Y for the bodies."""
+        q, v, _ = dynamics.symbols()
+        a = casadi.SX.sym("a", self.nq)
+        p = casadi.SX.sym("p", INERTIA_SIZE * len(self.bodies))
+        values: dict[str, Expression] = {}
+        for k, names in enumerate(inputs):
+            values |= dict(zip(names, _of_inertial(p[INERTIA_SIZE * k : INERTIA_SIZE * (k + 1)]), strict=True))
+        (tau,) = dynamics.substituted([dynamics.inverse_dynamics(q, v, a, rotors=False)], values)
+        # Linear in p, so that its Jacobian is the same everywhere: here where masses are 1, as they divide.
+        Y = casadi.substitute(casadi.jacobian(tau, p), p, np.tile(np.eye(INERTIA_SIZE)[0], len(self.bodies)))
+        return casadi.Function("regressor", [q, v, a], [casadi.densify(Y)], {"cse": True})
+
+    def matrix(self, q: Array, v: Array, a: Array) -> Array:
+        """Return Y (n, nq, P) for positions, velocities and accelerations (n, nq)."""
+        n = len(q)
+        columns = np.asarray(self._regressor.map(n)(q.T, v.T, a.T)).reshape(self.nq, n, -1).swapaxes(0, 1)
+        parts = [columns]
+        for drive in self._drives.values():
+            d = drive.direction
+            factors = [term(q @ d, v @ d, a @ d) for term in drive.terms.values()]
+            parts += [np.einsum("n,j->nj", factor, d)[:, :, np.newaxis] for factor in factors]
+        return np.concatenate(parts, axis=2)
+
+    def vector(self, values: Mapping[str, float]) -> Array:
+        """Return p of the plant, with other values for the named entries.
+
+        Raises:
+            CalibrationError: A name is no entry of p.
+        """
+        p = self.nominal.copy()
+        for name, value in values.items():
+            if name not in self.names:
+                raise CalibrationError(f"{name} is no parameter; the parameters are {', '.join(self.names)}")
+            p[self.names.index(name)] = value
+        return p
+
+
+def _inertial(mass: Array, com: Array, inertia: Array) -> Array:
+    """Return the ten parameters of a body from mass, centre of mass and moments about it [xx, yy, zz, xy, xz, yz]."""
+    x, y, z = com
+    shift = mass * np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+    return np.concatenate([mass, mass * com, inertia + shift])
+
+
+def _of_inertial(p: Expression) -> tuple[Expression, Expression, Expression]:
+    """Return mass, centre of mass and moments about it; the inverse of `_inertial`."""
+    m = p[0]
+    x, y, z = (p[k] / m for k in (1, 2, 3))
+    shift = [y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z]
+    return m, casadi.vertcat(x, y, z), casadi.vertcat(*(p[4 + k] - m * s for k, s in enumerate(shift)))
+
+
+class Equations(NamedTuple):
+    """The equations of one recording, filtered and thinned.
+
+    Attributes:
+        source: The recording.
+        times: (n,), in s.
+        Y: (n, nq, P).
+        tau: Measured torques, (n, nq).
+    """
+
+    source: str
+    times: Array
+    Y: Array
+    tau: Array
+
+    def between(self, start: float, end: float) -> Equations:
+        """Return the equations of the times start <= t < end, in s."""
+        rows = (self.times >= start) & (self.times < end)
+        return Equations(self.source, self.times[rows], self.Y[rows], self.tau[rows])
+
+
+def equations(
+    model: TorqueRegressor, recording: JointRecording, *, cutoff: float, band: float | None = None
+) -> Equations:
+    """Return the equations of a recording.
+
+    Positions pass a Butterworth filter forwards and backwards, which delays nothing, and give velocities and
+    accelerations by central differences. Then both sides of the equations pass another one. So their errors are
+    correlated in time: see the blocks of `regress`.
+
+    Args:
+        model: The inverse dynamics.
+        recording: Positions (n, nq), and the torques at the joints (n, nq) in their directions.
+        cutoff: Cutoff frequency for the positions, in Hz; well above the motion, or accelerations come out too small.
+        band: Cutoff frequency for the equations, in Hz; that of the positions by default.
+
+    Raises:
+        CalibrationError: The recording has other sizes, or is too slow or too short for these frequencies.
+    """
+    band = cutoff if band is None else band
+    if recording.q.shape[1:] != (model.nq,) or recording.u.shape != recording.q.shape:
+        raise CalibrationError(
+            f"{recording.source} has positions {recording.q.shape} and torques {recording.u.shape}, the model "
+            f"{model.nq} joints"
+        )
+    if np.min(np.diff(recording.times)) <= 0.0:
+        raise CalibrationError(f"{recording.source}: its clock steps back or stands still")
+    period, margin = recording.period, 2.0 / band
+    span = float(recording.times[-1] - recording.times[0])
+    if not 0.0 < band <= cutoff < 0.5 / period or span < 4.0 * margin:
+        raise CalibrationError(
+            f"{recording.source}: {span:.3g} s at {1.0 / period:.4g} Hz cannot be filtered with {cutoff:g} and "
+            f"{band:g} Hz: 0 < band <= cutoff < half of the rate, and 8 periods of the band at least"
+        )
+    times = np.arange(recording.times[0], recording.times[-1], period)
+    q, tau = (_resampled(times, recording.times, values) for values in (recording.q, recording.u))
+    q = _low_pass(q, cutoff, period)
+    v = np.gradient(q, period, axis=0)
+    a = np.gradient(v, period, axis=0)
+    Y = model.matrix(q, v, a)
+    rows = slice(
+        round(margin / period), len(times) - round(margin / period), max(int(1.0 / (_PER_CUTOFF * band * period)), 1)
+    )
+    return Equations(
+        recording.source, times[rows], _low_pass(Y, band, period)[rows], _low_pass(tau, band, period)[rows]
+    )
+
+
+def _resampled(times: Array, recorded: Array, values: Array) -> Array:
+    return np.stack([np.interp(times, recorded, column) for column in values.T], axis=1)
+
+
+def _low_pass(values: Array, cutoff: float, period: float) -> Array:
+    sections = scipy.signal.butter(_ORDER, cutoff, fs=1.0 / period, output="sos")
+    filtered: Array = scipy.signal.sosfiltfilt(sections, values, axis=0)
+    return filtered
+
+
+@dataclass(frozen=True, eq=False)
+class BaseParameters:
+    """The combinations b = B p of the parameters of a model that motions can tell.
+
+    Attributes:
+        names: Each combination, in words.
+        columns: Which parameter leads each combination: Y[:, columns] b = Y p, for all motions.
+        B: (b, P).
+    """
+
+    names: tuple[str, ...]
+    columns: tuple[int, ...]
+    B: Array
+
+
+def base_parameters(model: TorqueRegressor) -> BaseParameters:
+    """Return the base parameters of a model, by its regressor at random states.
+
+    Going from the base to the tip, a column of Y that depends on those before (its diagonal entry in a QR
+    decomposition is zero) is not kept: its parameter is added to theirs.
+
+    Raises:
+        CalibrationError: The numerical rank is not clear.
+    """
+    samples = 20 + 4 * len(model.names) // model.nq
+    states = np.random.default_rng(0).uniform(-np.pi, np.pi, (3, samples, model.nq))
+    Y = model.matrix(*states).reshape(-1, len(model.names))
+    norms = np.linalg.norm(Y, axis=0)
+    moving = np.flatnonzero(norms > _RANK * norms.max())
+    Y = Y[:, moving] / norms[moving]
+    diagonal = abs(np.diag(np.linalg.qr(Y, mode="r")))
+    rank = int((scipy.linalg.svdvals(Y) > _RANK * np.sqrt(len(moving))).sum())
+    kept_columns = np.flatnonzero(diagonal > _RANK)
+    if len(kept_columns) != rank:
+        raise CalibrationError(
+            f"the rank of the regressor is not clear: {len(kept_columns)} by QR, {rank} by its singular values"
+        )
+    beta = np.linalg.lstsq(Y[:, kept_columns], Y, rcond=None)[0]
+    B = np.zeros((rank, len(model.names)))
+    B[:, moving] = np.where(abs(beta) < 1e-6, 0.0, beta) / norms[moving][kept_columns, np.newaxis] * norms[moving]
+    # Relative to what the parameters do, these are rounding errors.
+    B[abs(B) < 1e-9] = 0.0
+    columns = tuple(int(k) for k in moving[kept_columns])
+    return BaseParameters(tuple(_words(row, model.names, k) for row, k in zip(B, columns, strict=True)), columns, B)
+
+
+def _words(row: Array, names: Sequence[str], leader: int) -> str:
+    """Return a combination in words, such as "upper.Iyy + 0.04 lower.m"."""
+    rest = [int(k) for k in np.flatnonzero(row) if k != leader]
+    terms = [names[leader]]
+    for k in rest:
+        size = f"{abs(row[k]):.4g} " if abs(abs(row[k]) - 1.0) > 1e-6 else ""
+        terms.append(f"{'-' if row[k] < 0.0 else '+'} {size}{names[k]}")
+    return " ".join(terms)
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """The result of `regress`.
+
+    Attributes:
+        model: The inverse dynamics.
+        names: Base parameters in words, then the gains.
+        values: Their estimates.
+        deviations: Their standard deviations, by the sandwich estimator over blocks.
+        lower, upper: Their intervals of 95 %.
+        residual: Root mean square of the torques that are left, by joint, in N m or N.
+        condition: Condition number of the weighted equations with columns of unit norm; above 100, some combinations of
+            the base parameters are hardly told.
+        blocks: Number of blocks of the sandwich; intervals are too small with less than 3 for each parameter.
+        gains: By joint, the factor from recorded to actual torques.
+        parameters: All of p, (P,): physically consistent if it was asked for, and else zero where nothing is told.
+    """
+
+    model: TorqueRegressor
+    names: tuple[str, ...]
+    values: Array
+    deviations: Array
+    lower: Array
+    upper: Array
+    residual: Array
+    condition: float
+    blocks: int
+    gains: Array
+    parameters: Array
+
+    def torques(self, equations: Equations) -> Array:
+        """Return the torques (n, nq) that are expected in a recording, in its own units."""
+        return np.asarray(equations.Y @ self.parameters / self.gains)
+
+    def inertia(self, body: str) -> tuple[float, Array, Array]:
+        """Return mass, centre of mass and [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] about it, of `parameters`."""
+        first = INERTIA_SIZE * self.model.bodies.index(body)
+        mass, com, inertia = _of_inertial(casadi.DM(self.parameters[first : first + INERTIA_SIZE]))
+        return float(mass), np.asarray(com).ravel(), np.asarray(inertia).ravel()
+
+    def __str__(self) -> str:
+        width = min(max(len(name) for name in self.names), 60)
+        lines = [
+            f"{len(self.names)} base parameters, condition number {self.condition:.3g}, {self.blocks} blocks; "
+            f"residual {np.array2string(self.residual, precision=3)}",
+            f"{'':{width}}       value   deviation   interval of 95 %",
+        ]
+        for name, value, deviation, low, high in zip(
+            self.names, self.values, self.deviations, self.lower, self.upper, strict=True
+        ):
+            short = name if len(name) <= width else name[: width - 3] + "..."
+            lines.append(f"{short:{width}}{value:12.5g}{deviation:12.2g}   [{low:.5g}, {high:.5g}]")
+        if self.blocks < _BLOCKS_PER_PARAMETER * len(self.names):
+            lines.append(
+                f"{self.blocks} blocks are too few for {len(self.names)} parameters: the intervals are too small"
+            )
+        return "\n".join(lines)
+
+
+def regress(
+    model: TorqueRegressor,
+    recordings: Equations | Sequence[Equations],
+    *,
+    gains: Sequence[int] = (),
+    consistent: bool = False,
+    prior: float | None = None,
+    block: float = 0.25,
+) -> Regression:
+    """Fit the base parameters of a model to recordings by weighted least squares.
+
+    Each joint is weighted by what is left of its torques. The errors are correlated in time (filters, disturbances,
+    what the model lacks), so that the covariance is a sandwich over blocks. Unknown gains are found with the expected
+    torques as instruments (A. Janot, P.-O. Vandanjon and M. Gautier, "A generic instrumental variable approach for
+    industrial robot identification", IEEE Trans. Control Systems Technology 22, 2014).
+
+    Args:
+        model: The inverse dynamics.
+        recordings: Their `equations`.
+        gains: Joints whose recorded torques are off by an unknown factor, such as currents. One joint at least must
+            have a known one: nothing tells the masses of an arm from the strength of all its motors.
+        consistent: Return parameters that bodies with positive masses can have, with friction that is not negative.
+        prior: Relative deviation of the plant's own inertias, for consistent parameters. By default, they count only
+            where the recordings tell nothing.
+        block: Duration of a block in s; long against what correlates the errors.
+
+    Raises:
+        CalibrationError: The equations are fewer than the parameters, or of another model; no gain is known.
+    """
+    recordings = [recordings] if isinstance(recordings, Equations) else list(recordings)
+    if len(set(gains)) >= model.nq:
+        raise CalibrationError(
+            "all gains are unknown: nothing tells the masses of an arm from the strength of all its motors"
+        )
+    for each in recordings:
+        if each.Y.shape[1:] != (model.nq, len(model.names)):
+            raise CalibrationError(f"{each.source} has equations {each.Y.shape} of another model")
+    base = base_parameters(model)
+    Y = np.concatenate([each.Y[:, :, list(base.columns)] for each in recordings])
+    tau = np.concatenate([each.tau for each in recordings])
+    # (1 + g) tau = Y b, so that tau = Y b - g tau.
+    Y = np.concatenate([Y, *(_column(-tau, joint) for joint in gains)], axis=2)
+    count = Y.shape[2]
+    if tau.size < 2 * count:
+        raise CalibrationError(f"{tau.size} equations are too few for {count} parameters")
+    values, scale = np.zeros(count), np.ones(model.nq)
+    Z = Y
+    for _ in range(_ROUNDS):
+        white, instruments = ((part / scale[:, np.newaxis]).reshape(-1, count) for part in (Y, Z))
+        norms = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
+        white, instruments = white / norms, instruments / norms
+        inverse = np.linalg.pinv(instruments.T @ white)
+        values = inverse @ (instruments.T @ (tau / scale).ravel()) / norms
+        left = tau - Y @ values
+        scale = np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1e-12)
+        if gains:
+            # Measured torques on the right side have errors, which expected ones have not.
+            Z = Y.copy()
+            Z[:, :, len(base.columns) :] = np.concatenate([_column(left - tau, joint) for joint in gains], axis=2)
+    condition = float(np.linalg.cond(white))
+    scores = _scores(recordings, Z / scale[:, np.newaxis], left / scale, block) / norms
+    sandwich = inverse @ (scores.T @ scores) @ inverse.T * len(scores) / max(len(scores) - 1, 1)
+    # Never less than what errors leave that are not correlated.
+    alone = inverse @ (instruments.T @ instruments) @ inverse.T
+    deviations = np.sqrt(np.maximum(np.diag(sandwich), np.diag(alone))) / norms
+    wide = float(scipy.stats.t.ppf(0.975, max(len(scores) - 1, 1))) * deviations
+    factors = np.ones(model.nq)
+    factors[list(gains)] += values[len(base.columns) :]
+    parameters = np.zeros(len(model.names))
+    parameters[list(base.columns)] = values[: len(base.columns)]
+    if consistent:
+        everything = np.concatenate([each.Y for each in recordings])
+        white_tau = tau * factors / scale
+        parameters = _consistent(
+            model, everything / scale[:, np.newaxis], white_tau, _NO_PRIOR if prior is None else prior
+        )
+    names = (*base.names, *(f"gain {joint} - 1" for joint in gains))
+    return Regression(
+        model,
+        names,
+        values,
+        deviations,
+        values - wide,
+        values + wide,
+        scale,
+        condition,
+        len(scores),
+        factors,
+        parameters,
+    )
+
+
+def _column(torques: Array, joint: int) -> Array:
+    """Return the torques of one joint as a column (n, nq, 1) of a regressor."""
+    column = np.zeros((*torques.shape, 1))
+    column[:, joint, 0] = torques[:, joint]
+    return column
+
+
+def _scores(recordings: Sequence[Equations], Y: Array, left: Array, block: float) -> Array:
+    """Return the sums over blocks of the scores, (blocks, parameters)."""
+    scores, first = [], 0
+    for each in recordings:
+        length = max(round(block / float(np.median(np.diff(each.times)))), 1)
+        for k in range(first, first + len(each.times), length):
+            rows = slice(k, min(k + length, first + len(each.times)))
+            scores.append(np.einsum("njp,nj->p", Y[rows], left[rows]))
+        first += len(each.times)
+    return np.array(scores)
+
+
+def _consistent(model: TorqueRegressor, Y: Array, tau: Array, prior: float) -> Array:
+    """Return the p of the least weighted squares among those that are physically consistent: a convex program."""
+    count = len(model.names)
+    # As few equations as parameters, with the same least squares.
+    triangle = np.asarray(np.linalg.qr(np.column_stack([Y.reshape(-1, count), tau.ravel()]), mode="r"))[:count]
+    R, d = triangle[:, :count], triangle[:, count]
+    program = MathematicalProgram()
+    p = program.NewContinuousVariables(count, "p")
+    size = np.sqrt(len(Y))
+    program.Add2NormSquaredCost(R / size, d / size, p)
+    inertial = INERTIA_SIZE * len(model.bodies)
+    scales = np.tile(_scales_of(model), len(model.bodies))
+    m, _, _, _, moment, *_ = _MARGIN * _scales_of(model)
+    # Of a sphere.
+    least = [m, 0.0, 0.0, 0.0, moment, moment, moment, 0.0, 0.0, 0.0]
+    far = prior * size * scales
+    program.Add2NormSquaredCost(np.diag(1.0 / far), model.nominal[:inertial] / far, p[:inertial])
+    for k in range(len(model.bodies)):
+        rows = slice(INERTIA_SIZE * k, INERTIA_SIZE * (k + 1))
+        program.AddPositiveSemidefiniteConstraint(_pseudo([a - b for a, b in zip(p[rows], least, strict=True)]))
+    for k, name in enumerate(model.names):
+        if name.endswith((".viscous", ".coulomb", ".rotor")):
+            program.AddBoundingBoxConstraint(0.0, np.inf, p[k])
+    result = ClarabelSolver().Solve(program)
+    if not result.is_success():
+        raise CalibrationError(f"no physically consistent parameters were found: {result.get_solution_result()}")
+    return np.asarray(result.GetSolution(p))
+
+
+def _scales_of(model: TorqueRegressor) -> Array:
+    """Return how large mass, moments of mass and moments of inertia of a body are in this model."""
+    numbers = abs(model.nominal[: INERTIA_SIZE * len(model.bodies)].reshape(-1, INERTIA_SIZE))
+    mass = max(float(numbers[:, 0].mean()), 1e-9)
+    length = np.sqrt(max(float(numbers[:, 4:7].mean()), 1e-12) / mass)
+    return np.array([mass, *3 * [mass * length], *6 * [mass * length**2]])
+
+
+def _pseudo(p: Sequence[Any]) -> Array:
+    """Return the pseudo-inertia (4, 4) of ten parameters, as expressions."""
+    m, x, y, z, xx, yy, zz, xy, xz, yz = p
+    half = 0.5 * (xx + yy + zz)
+    return np.array([[half - xx, -xy, -xz, x], [-xy, half - yy, -yz, y], [-xz, -yz, half - zz, z], [x, y, z, m]])
