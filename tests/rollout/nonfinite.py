@@ -1,4 +1,4 @@
-"""A DPS that commands NaN or infinity after a quarter of a second, in continuous worlds."""
+"""A DPS that commands NaN or infinity after a quarter of a second, and continuous worlds that become NaN then."""
 
 from dataclasses import dataclass, field
 
@@ -6,9 +6,10 @@ import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import (
     ConstantVectorSource,
+    Integrator,
     LinearSystem,
     Multiplexer,
     PassThrough,
@@ -70,6 +71,29 @@ def compiled_law(bad, *, sampled):
     return builder.Build()
 
 
+class Tank(LeafSystem):
+    """The level x of a tank, in m, whose rate is a root that ends at t = 0.25 s: that of a negative number is NaN."""
+
+    def __init__(self, root):
+        super().__init__()
+        self._root = root
+        self.DeclareContinuousState(BasicVector([0.0625]))
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0, 0.25, lambda context, discrete: discrete.set_value([-1.0]))
+        self.DeclareDiscreteState(BasicVector([1.0]))
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        (level,) = context.get_continuous_state_vector().CopyToVector()
+        root = {
+            "of time": lambda: np.sqrt(0.25 - context.get_time()),
+            # Torricelli's law, and a pump that goes on.
+            "of state": lambda: -np.sqrt(level) - 0.125,
+            # NaN from an event on, at the beginning of a step.
+            "of input": lambda: np.sqrt(context.get_discrete_state_vector().value()[0]),
+        }[self._root]
+        with np.errstate(invalid="ignore"):
+            derivatives.get_mutable_vector().SetFromVector([root()])
+
+
 @dataclass
 class NonfiniteScenario(Scenario):
     """A mass (a LinearSystem) or a pendulum (a MultibodyPlant) under a force that is not finite any more."""
@@ -82,6 +106,8 @@ class NonfiniteScenario(Scenario):
     time_step: float = 0.0
     # The force is that of a system of the world, and is not finite from the beginning.
     in_world: bool = False
+    # There is a `Tank` in the world.
+    root: str = ""
 
     def interface(self):
         return Interface(
@@ -90,9 +116,18 @@ class NonfiniteScenario(Scenario):
 
     def make_dps(self):
         law = compiled_law if self.compiled else FailingLaw
-        return law(0.0 if self.in_world else float(self.bad), sampled=self.sampled)
+        return law(0.0 if self.in_world or self.root else float(self.bad), sampled=self.sampled)
 
     def add_world(self, builder):
+        if self.root == "of wind":  # In C++ alone.
+            wind = PiecewisePolynomial.ZeroOrderHold([0.0, 0.25, 1e6], [[1.0, np.nan, np.nan]])
+            source = builder.add("env", "weather", TrajectorySource(wind))
+            hold = builder.add("env", "hold", ZeroOrderHold(0.05, 1))
+            tank = builder.add("env", "tank", Integrator(1))
+            builder.connect(source.get_output_port(), hold.get_input_port())
+            builder.connect(hold.get_output_port(), tank.get_input_port())
+        elif self.root:
+            builder.add("env", "tank", Tank(self.root))
         if self.plant:
             plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
             Parser(plant).AddModelsFromString(PENDULUM, "urdf")

@@ -1,7 +1,9 @@
 """Tests that what is not finite ends a rollout by its name; Drake's integrators would shorten their step for ever."""
 
 import itertools
+import os
 import re
+import signal
 import threading
 from math import inf
 
@@ -13,7 +15,7 @@ from pydrake.systems.primitives import LinearSystem
 
 from tests.interruptions import hanging_fails
 from tests.rollout.nonfinite import NonfiniteScenario, compiled_law
-from tests.testbeds import PendulumScenario
+from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
     Quality,
@@ -24,9 +26,11 @@ from vtbdrake.rollout import (
     make_executor,
     worker_processes,
 )
-from vtbdrake.testbed import SignalError
+from vtbdrake.testbed import SignalError, step_watch
+from vtbdrake.testbed.step_watch import NoProgressError
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
+SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
 
 
@@ -86,7 +90,42 @@ def test_world_that_is_not_finite_from_the_beginning_fails(process, scheme, bad)
     assert failed.end == "failed"
     assert "commands" not in failed.message
     if scheme != "cenic":
-        assert failed.message == "the time derivatives are not finite at t = 0 s"
+        assert failed.message.startswith("the time derivative of sim.sys.mass.")
+        assert failed.message.endswith(" is not finite at t = 0 s")
+
+
+ROOTS = ["of time", "of state", "of input", "of wind"]
+NO_STEP = r"the time derivative of sim.env.tank.continuous_state\S* is not finite at t = (0.[\d]+) s"
+
+
+@pytest.mark.parametrize("scheme", ["runge_kutta3", "runge_kutta5", "bogacki_shampine3", "implicit_euler", "radau3"])
+@pytest.mark.parametrize("root", ROOTS)
+def test_world_that_becomes_nan_in_a_step_fails_with_the_address(process, scheme, root):
+    failed = result(process, scheme, root=root)
+    assert failed.end == "failed"
+    if scheme in ("implicit_euler", "radau3") and root in ("of time", "of state"):  # Drake refuses their short steps.
+        assert "step smaller than minimum" in failed.message
+    else:
+        (t,) = re.fullmatch(NO_STEP, failed.message).groups()
+        # With u = sqrt(x), 2 u u' = -u - 1/8: the tank is empty at 2 (u - ln(1 + 8 u) / 8), from u = 1/4 on.
+        end = 0.5 - 0.25 * np.log(3.0) if root == "of state" else 0.25
+        assert float(t) == pytest.approx(end, rel=2e-3)
+
+
+@pytest.fixture
+def quick_look(monkeypatch):
+    monkeypatch.setattr(step_watch, "PERIOD", 0.05)
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor, lambda: ThreadExecutor(2)], ids=["serial", "threads"])
+@pytest.mark.parametrize("root", ROOTS)
+def test_world_that_becomes_nan_ends_in_this_process_too(process, quick_look, executor, root):
+    task = RolloutTask(NonfiniteScenario(SimulatorConfig(), root=root), 1.0, Quality(abs, "time"))
+    messages = [outcome.message for _, outcome in process.run(task, [{}])]  # here it would hang
+    with executor() as made:
+        for _ in range(2):  # The same testbed goes on.
+            messages += [outcome.message for _, outcome in made.run(task, [{}, {}])]
+    assert all(re.fullmatch(NO_STEP, message) for message in messages), messages
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["python", "compiled"])
@@ -97,6 +136,43 @@ def test_plain_simulation_is_refused_too(process, compiled):
     context = testbed.default_context()
     with pytest.raises(SignalError, match=r"the DPS commands force = \[nan\] at t = 0.3 s, which is not finite"):
         testbed.simulator(context).AdvanceTo(1.0)
+
+
+def test_ctrl_c_reaches_an_integrator_that_hangs(process, quick_look, monkeypatch):
+    task = RolloutTask(NonfiniteScenario(SimulatorConfig(), root="of wind", compiled=True), 1.0, Quality(abs, "time"))
+    assert [outcome.end for _, outcome in process.run(task, [{}])] == ["failed"]  # here it would hang
+    look = step_watch.StepWatch.look
+
+    def press_and_look(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        look(self)
+
+    monkeypatch.setattr(step_watch.StepWatch, "look", press_and_look)
+    with pytest.raises(KeyboardInterrupt):
+        list(SerialExecutor().run(task, [{}]))
+
+
+@pytest.mark.parametrize("scheme", ["runge_kutta3", "radau3"])
+def test_looks_change_no_bit_of_a_simulation(scheme, monkeypatch):
+    config = SimulatorConfig(integration_scheme=scheme, max_step_size=0.05, accuracy=1e-8)
+    task = RolloutTask(AcrobotScenario(simulator_config=config), 5.0, Quality(abs, SHOULDER))
+    with SerialExecutor() as made:
+        results = [outcome.quality for _, outcome in made.run(task, [{}])]
+        monkeypatch.setattr(step_watch, "PERIOD", 0.0)
+        results += [outcome.quality for _, outcome in made.run(task, [{}])]
+    assert len(results[0]) > 10 and np.array_equal(*results)
+
+
+def test_plain_simulation_of_a_world_that_becomes_nan_ends(process, quick_look):
+    scenario = NonfiniteScenario(SimulatorConfig(), root="of input")
+    assert result(process, "runge_kutta3", root="of input").end == "failed"  # here it would hang
+    testbed = scenario.build()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    with pytest.raises(NoProgressError, match=NO_STEP):
+        simulator.AdvanceTo(1.0)
+    assert context.get_time() == 0.25
+    assert np.isfinite(context.get_continuous_state_vector().CopyToVector()).all()
 
 
 @pytest.mark.parametrize("value", [float("nan"), inf])

@@ -21,6 +21,7 @@ from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, T
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.interrupt import Interruptible
+from vtbdrake.testbed.step_watch import NoProgressError
 
 
 class SimulationError(Exception):
@@ -70,6 +71,7 @@ class RolloutRunner:
         self._controls_error = controls_error(self.testbed.simulator_config) and bool(self._s0.num_continuous_states())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
+        self._step_watch = self.testbed.step_watch(self._simulator)
         self._world_state = _world_state(self.testbed, self._context)
         self._copier = self.testbed.copier_from(self.testbed)
         self._start_context = StartContext(self.testbed, self._s0, self._copier)
@@ -281,7 +283,7 @@ class RolloutRunner:
         if t == 0.0:
             return self._initialized  # A system may ask for the end there already.
         try:
-            with _failures_as_outcomes:
+            with _failures_as_outcomes, self._step_watch:
                 status = self._simulator.AdvanceTo(instant)
             self._refuse_nonfinite(t)
         except SimulationError as failure:
@@ -302,7 +304,7 @@ class RolloutRunner:
             except SimulationError as failure:
                 raise self._with_command(failure) from failure.__cause__
             if not np.isfinite(derivatives.CopyToVector()).all():
-                raise SimulationError("the time derivatives are not finite at t = 0 s")
+                raise SimulationError(self.testbed.reason_for_no_step(self._context))
 
     def _refuse_nonfinite(self, t: float) -> None:
         # NaN is allowed in a DPS, for unknown values, but not in the simulated world.
@@ -345,6 +347,8 @@ class _FailuresAsOutcomes:
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, NoProgressError):
+            raise SimulationError(str(error)) from error
         if isinstance(error, FAILURES) and not isinstance(error, SimulationError):
             raise SimulationError(error_text(error)) from error
 

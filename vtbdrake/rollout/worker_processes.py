@@ -55,8 +55,8 @@ class ProcessExecutor(Executor):
 
     Args:
         workers: The number of processes; by default the number of cores.
-        time_limit: The wall time for one rollout, in seconds; an hour by default, ``inf`` for none. Drake's integrators
-            can loop for ever, for example on a NaN, and nothing but the end of the process stops them.
+        time_limit: The wall time for one rollout, in seconds; an hour by default, ``inf`` for none. A
+            system that never returns is stopped by nothing but the end of the process.
         max_testbeds: The number of testbeds that each process keeps, for points with different scenario fields.
         growth: The number of bytes by which the memory of a process may grow after its first rollout.
     """

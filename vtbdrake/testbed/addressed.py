@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, P
 from pydrake.systems.primitives import ZeroOrderHold
 
 from vtbdrake.argument_checks import suggestion
+from vtbdrake.failures import FAILURES
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
@@ -19,9 +21,10 @@ from vtbdrake.state.snapshot import StateCopier
 from vtbdrake.state.systems import is_plant, is_python, leaves
 from vtbdrake.state.variables import X, check_address
 from vtbdrake.testbed.dps_state import DpsReader
-from vtbdrake.testbed.integrator import apply_simulator_config
+from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.slow_part import SlowPart, slow_parts
+from vtbdrake.testbed.step_watch import StepWatch
 from vtbdrake.testbed.switch import BOARD, COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
@@ -45,6 +48,18 @@ class _CenicSimulator(Simulator):
                 f"the simulation is at {boundary_time!r} s already, and CENIC takes no step of length zero: leave the "
                 "call out, or advance to a later time"
             )
+
+
+class WatchedSimulator(Simulator):
+    """Drake's Simulator, which raises a `NoProgressError` where its integrator would shorten a step for ever."""
+
+    def __init__(self, target: AddressedDiagram, context: Context) -> None:
+        super().__init__(target.diagram, context)
+        self._watch = target.step_watch(self)
+
+    def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        with self._watch:
+            return super().AdvanceTo(boundary_time, interruptible)
 
 
 class AddressedDiagram:
@@ -159,8 +174,49 @@ class AddressedDiagram:
         return simulator
 
     def _bare_simulator(self, context: Context) -> Simulator:
+        if self._can_get_stuck:
+            return WatchedSimulator(self, context)
         kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
         return kind(self.diagram, context)
+
+    @cached_property
+    def _can_get_stuck(self) -> bool:
+        return controls_error(self.simulator_config) and self.default_context().num_continuous_states() > 0
+
+    def step_watch(self, simulator: Simulator) -> AbstractContextManager[object]:
+        """Return a context manager for calls of AdvanceTo; see `StepWatch`. Without a need for one, it does nothing."""
+        return StepWatch(simulator, self.reason_for_no_step) if self._can_get_stuck else nullcontext()
+
+    def reason_for_no_step(self, context: Context) -> str:
+        """Return why no integration goes on from ``context``: the states whose time derivatives are not finite."""
+        begin, state = context.get_time(), context.get_continuous_state_vector().CopyToVector()
+        probe = self._own_context(context).Clone()
+        # Where the derivatives are finite, they may not be so just behind.
+        steps, rates = [0.0, *(max(1.0, abs(begin)) * 2.0 ** np.arange(-52, -3))], np.zeros_like(state)
+        with suppress(*FAILURES):
+            for step in steps:
+                probe.SetTime(begin + step)
+                probe.SetContinuousState(state + step * rates)
+                derivatives = self.diagram.EvalTimeDerivatives(probe).CopyToVector()
+                if not np.isfinite(derivatives).all():
+                    names = self._continuous_addresses(np.flatnonzero(~np.isfinite(derivatives)))
+                    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+                    return f"the time derivative of {', '.join(names[:3])}{more} is not finite at t = {begin:g} s"
+                if step == 0.0:
+                    rates = derivatives
+        return f"the integrator takes no step that leads further than t = {begin:g} s"
+
+    def _continuous_addresses(self, indices: Iterable[int]) -> list[str]:
+        """Return the addresses of entries of the continuous state."""
+        context, names = self.default_context(), dict[str, None]()
+        state = context.get_continuous_state_vector().CopyToVector()
+        for index in indices:
+            context.SetContinuousState(np.where(np.arange(state.size) == index, np.nan, state))
+            for address, variable in self._variables.items():
+                with suppress(*FAILURES):
+                    if not variable.derived and np.isnan(variable.get(context)).any():
+                        names[address] = None
+        return list(names) or ["a continuous state"]
 
     def _give_integrator(self, simulator: Simulator) -> None:
         # The config would set the time and the pace, too.

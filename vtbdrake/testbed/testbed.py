@@ -17,7 +17,7 @@ from vtbdrake.argument_checks import as_number
 from vtbdrake.failures import FAILURES
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
-from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.addressed import AddressedDiagram, WatchedSimulator
 from vtbdrake.testbed.signal import SignalError
 from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
@@ -162,11 +162,11 @@ def wanted_positions(
     return sides[0], sides[1]
 
 
-class _GuardedSimulator(Simulator):
+class _GuardedSimulator(WatchedSimulator):
     """Drake's Simulator, which names the actuator command that the guard before the world has refused."""
 
     def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
-        super().__init__(testbed.diagram, context)
+        super().__init__(testbed, context)
         self._testbed = testbed
 
     def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
