@@ -21,3 +21,6 @@ from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
 from vtbdrake.calibration.validation import Tolerance as Tolerance
 from vtbdrake.calibration.validation import compare as compare
+from vtbdrake.validity_domain import Departure as Departure
+from vtbdrake.validity_domain import ValidityDomain as ValidityDomain
+from vtbdrake.validity_domain import ValidityDomainError as ValidityDomainError

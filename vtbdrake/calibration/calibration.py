@@ -138,6 +138,7 @@ def calibrate(
     period: float | None = None,
     segment: float = 1.0,
     holdout: float = 0.2,
+    noise: Noise | None = None,
 ) -> Calibration:
     """Fit parameters of a scenario's plant and drives to recordings.
 
@@ -157,6 +158,8 @@ def calibrate(
             one, fast things that the model lacks (elastic gears, uneven sampling) count less.
         segment: Duration in s of a segment of the recordings: they are filtered side by side.
         holdout: Share of the segments that are kept back, to compare with.
+        noise: The noise, of an earlier calibration of this machine, which is not fitted again: that takes most of the
+            time.
 
     Raises:
         CalibrationError: A parameter is none of the model, a log does not fit the model, or nothing is varied.
@@ -173,6 +176,7 @@ def calibrate(
         measured_torque=measured_torque,
         period=period,
         segment=segment,
+        noise=noise,
     )
     return prepared.fitted(scenario, holdout)
 
@@ -224,6 +228,7 @@ class _Prepared:
         measured_torque: bool,
         period: float | None,
         segment: float,
+        noise: Noise | None = None,
     ) -> None:
         logs = [logs] if isinstance(logs, Log) else list(logs)
         if not (parameters or inertias):
@@ -248,8 +253,10 @@ class _Prepared:
             _log.warning("%s", remark)
         self.segments = Segments(model, recordings, duration=segment)
         self.z = fit.z
+        self._rounds = 1 if noise else _NOISE_ROUNDS
         try:
-            self.noise = self.segments.likeliest_noise(self.z, Noise.guess(recordings, fit.unexplained))
+            guess = Noise.guess(recordings, fit.unexplained)
+            self.noise = noise or self.segments.likeliest_noise(self.z, guess)
             slopes = self.segments.innovations(self.noise, self.segments.linearized(self.z)).slopes
         except CalibrationError as error:
             raise CalibrationError(". ".join([str(error), *self.doubts])) from error
@@ -266,7 +273,7 @@ class _Prepared:
             raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
         held_back = _kept_back(self.segments.count, holdout)
         z, noise = self.z, self.noise
-        for k in range(_NOISE_ROUNDS):
+        for k in range(self._rounds):
             noise = self.segments.likeliest_noise(z, noise) if k else noise
             z = _gauss_newton(self.segments, noise, z, ~held_back)
         return _result(scenario, self, noise, z, held_back)

@@ -1,5 +1,6 @@
 """The public names about residuals and live values."""
 
+from vtbdrake.monitoring.domain_monitor import DomainMonitor as DomainMonitor
 from vtbdrake.monitoring.live.client import LiveClient as LiveClient
 from vtbdrake.monitoring.live.client import LiveError as LiveError
 from vtbdrake.monitoring.live.client import LiveTimeoutError as LiveTimeoutError

@@ -29,6 +29,7 @@ from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.validity_domain import ValidityDomain
 
 _log = logging.getLogger(__name__)
 
@@ -89,6 +90,8 @@ class Reasoner:
         sample_period: Sample period of f, in seconds.
         search: How candidates are proposed, and where their rollouts run.
         belief: How the belief is used: samples, uncertainty, age, risk.
+        domain: The validity domain of the mental model: a decision whose plan leaves it says so. To decide for no such
+            plan, give a ``Constraint(domain.excess, of=domain.addresses, at_most=1.0)``, too.
         seed: Seed of the method and of the samples; for the method combined with the time at which a decision begins.
 
     Attributes:
@@ -119,6 +122,7 @@ class Reasoner:
         sample_period: float = 0.05,
         search: SearchConfig | None = None,
         belief: BeliefConfig | None = None,
+        domain: ValidityDomain | None = None,
         seed: int = 0,
     ) -> None:
         if not isinstance(quality, Quality):
@@ -146,7 +150,9 @@ class Reasoner:
         )
         self.space.find(self.problem.testbed.variables())
         # A quality that fails is a reason against a candidate, and no end of the DPS.
-        self.task = replace(self.problem.task, catch=True, pruning=search.pruning)
+        self._domain = domain
+        features = () if domain is None else domain.addresses
+        self.task = replace(self.problem.task, catch=True, pruning=search.pruning, record=features)
         testbed = self.problem.testbed
         self.belief_to_start = BeliefToStart(testbed, uncertainty=belief.uncertainty, seed=seed, max_age=belief.max_age)
         self._unbelieved = UnbelievedReadings(testbed, uncertain=belief.uncertainty or ())
@@ -256,10 +262,22 @@ class Reasoner:
             except StartError as error:
                 raise BeliefError(f"no rollout can begin from {believer!r}: {error}") from error
             doubts = self._unbelieved.warnings(believer) if isinstance(believer, Belief) else ()
+            doubts += self._departures(decision)
             if doubts and not self._has_warned:
                 _log.warning("the decision at t = %g s: %s", decision.time, doubts[0])
                 self._has_warned = True
             return replace(decision, warnings=(*decision.warnings, *doubts)) if doubts else decision
+
+    def _departures(self, decision: Decision) -> tuple[str, ...]:
+        """Return a sentence about where the plan of a decision first leaves the validity domain, if it does."""
+        if self._domain is None or decision.chosen is None:
+            return ()
+        rollouts = [each for each in decision.candidates[decision.chosen].rollouts if not each.failed]
+        departures = [departure for each in rollouts if (departure := self._domain.departure(each)) is not None]
+        if not departures:
+            return ()
+        first = min(departures, key=lambda departure: departure.time)
+        return (f"with this plan {first._replace(time=decision.time + first.time)}",)
 
     def _starts(self, believer: Belief | Start, now: float) -> Sequence[Start]:
         if isinstance(believer, Start):
