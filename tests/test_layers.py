@@ -61,9 +61,9 @@ BELOW["__main__"] = {"cli"}
 TOP = {"visualization", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
-# `visualization`, a scenario is deployed by `deployment`.
+# `visualization`, a scenario is deployed by `deployment`, and what was calibrated is drawn by `calibration`.
 MAY_DELEGATE: dict[str, set[str]] = {
-    "testbed": {"deployment", "visualization"},
+    "testbed": {"calibration", "deployment", "visualization"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
 }
 

@@ -46,7 +46,7 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
             f"{NAME}:\n  period: 0.1\n  simulator_config:\n    acuracy: 0.1\n",
             "line 4: SimulatorConfig has no field 'simulator_config.acuracy'; did you mean accuracy",
         ),
-        (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator_config, period, time_step"),
+        (f"{NAME}:\n  zzz: 0.1\n", "no field 'zzz'; it has: simulator_config, pedigree, period, time_step"),
         (f"{NAME}:\n  simulator_config: &a\n    <<: {{acuracy: 0.1}}\n", "'simulator_config.acuracy'"),
         (f"{NAME}:\n  period: 0.1\n  period: 0.2\n", "the key 'period' twice"),
         (f"{NAME}:\n  period: fast\n", "fast"),

@@ -8,20 +8,21 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import Innovations, JointRecording, Noise, Segments
-from vtbdrake.calibration.fisher import UNTOLD, Information, information_of
+from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.log_checks import check_log, check_torques
-from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError, Inertia, JointModel, inertia_of
+from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError, Inertia, JointModel
+from vtbdrake.calibration.posterior import PHYSICAL, body_function
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log
 from vtbdrake.recording.table_reader import GAP
 from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.pedigree import Number, Posterior
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +73,8 @@ class Calibration:
     """The result of `calibrate`.
 
     Attributes:
-        scenario: The calibrated scenario; its numbers are `values`.
+        scenario: The calibrated scenario, whose testbeds begin with the estimates: all of them, as those that are not
+            identifiable are right together. Its pedigree says so, and `Scenario.save` writes it.
         parameters: The results, by address. An `Inertia` appears as mass, centre of mass and moments.
         combinations: Combinations of parameters that the recordings do not determine, as sentences.
         noise: The noise that explains the innovations.
@@ -80,10 +82,10 @@ class Calibration:
             those that were kept back.
         correlation: The largest autocorrelation of the whitened innovations at the first ten lags, of any joint.
         reasons: Why the model is discrepant, or there is no evidence, as sentences.
-        remarks: What the checks of the recordings have noticed, as sentences.
-        information: What the recordings could tell, before the fit.
         segments: Number of segments of the fit.
         sources: The recordings.
+        remarks: What the checks of the recordings have noticed, as sentences.
+        information: What the recordings could tell, before the fit.
     """
 
     scenario: Scenario
@@ -94,10 +96,10 @@ class Calibration:
     holdout: float
     correlation: float
     reasons: tuple[str, ...]
-    remarks: tuple[str, ...]
-    information: Information
     segments: int
     sources: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+    information: Information | None = None
 
     @property
     def accepted(self) -> bool:
@@ -239,7 +241,7 @@ class _Prepared:
             if value is not None and not 0.0 < value < inf:
                 raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
         self.model = model = JointModel(scenario.build(), parameters, inertias, measured_torque=measured_torque)
-        self.sources = tuple(log.source for log in logs)
+        self.logs = {log.source: log.digest for log in logs}
         whole = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
         longest = _LONGEST if model.step_size > 0.0 else GAP
         recordings = [piece for recording in whole for piece in recording.pieces(longest=longest)]
@@ -325,9 +327,20 @@ def _result(
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
         verdict = Verdict.NO_EVIDENCE
         reasons.append("the start explains the segments that were kept back as well: nothing speaks for other values")
+    covariance = sandwich * np.outer(model.scales, model.scales)
+    results = _reported(model, z, sandwich, info, bounds, verdict)
+    n = model.scalars
+    posterior = Posterior(
+        addresses=model.names[:n],
+        inertias=list(model.bodies),
+        mean=z.tolist(),
+        covariance=(0.5 * (covariance + covariance.T)).tolist(),
+        lower=model.lower[:n].tolist(),
+        upper=model.upper[:n].tolist(),
+    )
     return Calibration(
-        scenario=scenario,
-        parameters=_reported(model, z, sandwich * np.outer(model.scales, model.scales), info.untold, bounds, verdict),
+        scenario=_calibrated(scenario, results, posterior, logs=prepared.logs, reasons=reasons),
+        parameters=results,
         combinations=info.combinations,
         noise=noise,
         fit=fit,
@@ -337,8 +350,29 @@ def _result(
         remarks=prepared.remarks,
         information=prepared.information,
         segments=int(used.sum()),
-        sources=prepared.sources,
+        sources=tuple(prepared.logs),
     )
+
+
+def _calibrated(
+    scenario: Scenario,
+    results: Mapping[str, Calibrated],
+    posterior: Posterior,
+    *,
+    logs: Mapping[str, str],
+    reasons: Sequence[str],
+) -> Scenario:
+    """Return the scenario with the estimates, and their pedigree."""
+    calibrated = scenario.with_values({address: each.value for address, each in results.items()})
+    pedigree = calibrated.pedigree
+    for address, each in results.items():
+        value = pedigree.numbers[address].value if address in pedigree.numbers else None
+        number = Number(source="calibrated", value=value, note=str(each.verdict))
+        if each.verdict != Verdict.NOT_IDENTIFIABLE:  # Its deviation is that with combinations held.
+            number = replace(number, deviation=each.deviation, lower=each.lower, upper=each.upper)
+        pedigree.numbers[address] = number
+    pedigree.posterior, pedigree.logs, pedigree.reasons = posterior, dict(logs), list(reasons)
+    return calibrated
 
 
 def _rms(white: Array) -> float:
@@ -392,7 +426,8 @@ class _Bounds:
         at = outward(model, z, gradient) | (z == model.lower) | (z == model.upper)
         self.intervals: dict[int, tuple[float, float]] = {}
         self.reasons: list[str] = []
-        for k in np.flatnonzero(at & (info.untold <= UNTOLD)):
+        identifiable = info.is_told(np.eye(len(z)), np.sqrt(variances))
+        for k in np.flatnonzero(at & identifiable):
             h = 1.0 / info.covariance[k, k]
             excess = variances[k] * h
             g = abs(float(gradient[k]))
@@ -414,35 +449,35 @@ def _autocorrelation(white: Array) -> float:
 
 
 def _reported(
-    model: JointModel, z: Array, covariance: Array, unknown: Array, bounds: _Bounds, verdict: Verdict
+    model: JointModel, z: Array, sandwich: Array, info: Information, bounds: _Bounds, verdict: Verdict
 ) -> dict[str, Calibrated]:
     """Return the numbers by address, of an inertia the physical ones."""
     results: dict[str, Calibrated] = {}
 
-    def add(address: str, start: float, value: float, variance: float, unknown: float) -> None:
-        deviation = float(np.sqrt(variance))
-        ends = value - _WIDE * deviation, value + _WIDE * deviation
-        judged = Verdict.NOT_IDENTIFIABLE if unknown > UNTOLD else verdict
-        results[address] = Calibrated(address, start, value, deviation, *ends, judged)
+    def add(addresses: Sequence[str], start: Array, values: Array, gradients: Array) -> None:
+        deviations = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradients, sandwich, gradients), 0.0))
+        identifiable = info.is_told(gradients, deviations)
+        for row in zip(
+            addresses, start.tolist(), values.tolist(), deviations.tolist(), identifiable.tolist(), strict=True
+        ):
+            address, first, value, deviation, is_told = row
+            ends = value - _WIDE * deviation, value + _WIDE * deviation
+            judged = verdict if is_told else Verdict.NOT_IDENTIFIABLE
+            results[address] = Calibrated(address, first, value, deviation, *ends, judged)
 
-    for k in range(model.scalars):
-        name = model.names[k]
-        add(name, model.start[k], z[k], covariance[k, k], unknown[k])
-        ends = results[name].lower, results[name].upper
-        lower, upper = bounds.intervals.get(k, (max(ends[0], model.lower[k]), min(ends[1], model.upper[k])))
-        judged = Verdict.AT_BOUND if k in bounds.intervals else results[name].verdict
-        results[name] = replace(results[name], lower=lower, upper=upper, verdict=judged)
-    symbol = casadi.SX.sym("z", INERTIA_SIZE)
-    physical = casadi.vertcat(*inertia_of(symbol))
-    convert = casadi.Function("inertia", [symbol], [physical, casadi.jacobian(physical, symbol)])
-    parts = ["mass", *(f"center_of_mass[{i}]" for i in range(3)), *(f"inertia[{i}]" for i in range(6))]
+    n = model.scalars
+    add(model.names[:n], model.start[:n], z[:n], np.diag(model.scales)[:n])
+    for k, name in enumerate(model.names[:n]):
+        each = results[name]
+        lower, upper = bounds.intervals.get(k, (max(each.lower, model.lower[k]), min(each.upper, model.upper[k])))
+        judged = Verdict.AT_BOUND if k in bounds.intervals else each.verdict
+        results[name] = replace(each, lower=float(lower), upper=float(upper), verdict=judged)
+    convert = body_function()
     for k, body in enumerate(model.bodies):
-        rows = slice(model.scalars + INERTIA_SIZE * k, model.scalars + INERTIA_SIZE * (k + 1))
+        rows = slice(n + INERTIA_SIZE * k, n + INERTIA_SIZE * (k + 1))
         value, J = (np.asarray(part) for part in convert(z[rows]))
         start = np.asarray(convert(model.start[rows])[0]).ravel()
-        C = J @ covariance[rows, rows] @ J.T
-        size = np.abs(J) @ np.ones(INERTIA_SIZE)
-        doubt = np.abs(J) @ unknown[rows] / np.maximum(size, 1e-300)
-        for i, part in enumerate(parts):
-            add(f"{body}.{part}", start[i], float(value[i, 0]), float(C[i, i]), float(doubt[i]))
+        gradients = np.zeros((len(PHYSICAL), len(z)))
+        gradients[:, rows] = J
+        add([f"{body}.{part}" for part in PHYSICAL], start, value.ravel(), gradients * model.scales)
     return results

@@ -15,8 +15,9 @@ from vtbdrake.calibration.inverse_dynamics import directions_of
 
 # A parameter changes nothing if its whole range changes all innovations together by less than this.
 _NOTHING = 1e-4
-# A parameter is not told if this share of it lies in directions that are not determined.
-UNTOLD = 0.1
+# A parameter is not told if what the undetermined directions leave of it, when they are known to be within the range
+# (evenly), exceeds this share of its deviation, or this share of the range anyway.
+_UNTOLD_SHARE, _LEAST_UNTOLD = 0.5, 1e-6
 _TERMS, _LEAST_TERM = 6, 0.2
 
 
@@ -50,17 +51,26 @@ class Information:
         return np.where(h > 0.0, self.scales / np.sqrt(np.maximum(h, 1e-300)), inf)
 
     @property
-    def together(self) -> Array:
-        """Return the least standard deviation of each parameter beside the others, (nz,); infinite if not told."""
-        values, directions, determined = self._directions
-        deviations = np.sqrt((directions[:, determined] ** 2 / values[determined]).sum(axis=1)) * self.scales
-        return np.where(self.untold > UNTOLD, inf, deviations)
+    def deviations(self) -> Array:
+        """Return the least standard deviations of the scaled parameters in determined directions, (nz,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def untold(self) -> Array:
-        """Return the share of each parameter that lies in directions that are not determined, from 0 to 1, (nz,)."""
+    def together(self) -> Array:
+        """Return the least standard deviation of each parameter beside the others, (nz,); infinite if not told."""
+        return np.where(self.is_told(np.eye(len(self.names)), self.deviations), self.deviations * self.scales, inf)
+
+    def is_told(self, gradients: Array, deviations: Array) -> NDArray[np.bool]:
+        """Return whether functions of the parameters are told, as the undetermined directions leave them alone, (n,).
+
+        Args:
+            gradients: Of the functions, by the scaled parameters, (n, nz).
+            deviations: Of the functions, in the directions that are determined, (n,).
+        """
         _, directions, determined = self._directions
-        return np.asarray(np.linalg.norm(directions[:, ~determined], axis=1))
+        left = np.linalg.norm(gradients @ directions[:, ~determined], axis=1) / np.sqrt(3.0)
+        size = np.linalg.norm(gradients, axis=1)
+        return np.asarray(left <= np.maximum(_UNTOLD_SHARE * deviations, _LEAST_UNTOLD * size))
 
     @property
     def covariance(self) -> Array:
@@ -83,7 +93,7 @@ class Information:
     @property
     def told(self) -> tuple[str, ...]:
         """Return the parameters that the recordings tell apart from all others."""
-        return tuple(name for name, part in zip(self.names, self.untold, strict=True) if part <= UNTOLD)
+        return tuple(name for name, deviation in zip(self.names, self.together, strict=True) if deviation < inf)
 
     def __str__(self) -> str:
         width = max(len(name) for name in self.names)

@@ -80,7 +80,7 @@ def check_log(log: Log, interface: Interface, *, position: str, torque: str) -> 
             "of another clock?"
         )
     for k in range(q.values.shape[1]):
-        seconds = _longest_run(q.values[:, k], others=np.delete(q.values, k, 1)) * q.uniformity.period
+        seconds = _longest_run(q.values[:, k], other_joints=np.delete(q.values, k, 1)) * q.uniformity.period
         if k not in dead and seconds > _FROZEN:
             remarks.append(
                 f"{log.source}: {position}[{k}] keeps one value for {seconds:.3g} s while another joint moves: a "
@@ -112,11 +112,11 @@ def _of_clock(label: str, series: Series) -> Iterator[str]:
         yield f"{label} comes unevenly: every {1e3 * period:.3g} ms, and half of the times {1e3 * jitter:.2g} ms off"
 
 
-def _longest_run(values: Array, *, others: Array) -> int:
-    """Return the largest number of equal samples in a row during which one of the others changes all the time."""
-    if not others.shape[1]:
+def _longest_run(values: Array, *, other_joints: Array) -> int:
+    """Return the largest number of equal samples in a row during which one of these joints changes all the time."""
+    if not other_joints.shape[1]:
         return 0
-    moving = (np.diff(others, axis=0) != 0.0).any(axis=1)
+    moving = (np.diff(other_joints, axis=0) != 0.0).any(axis=1)
     longest = run = 0
     for same in (np.diff(values) == 0.0) & moving:
         run = run + 1 if same else 0

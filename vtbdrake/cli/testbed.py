@@ -29,12 +29,16 @@ from vtbdrake.failures import one_line
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.settings import schema
 from vtbdrake.state import Snapshot, Variable, Variables
+from vtbdrake.state.variables import A, text_table
 from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.pedigree import Number
 from vtbdrake.testbed.testbed import MODES
 
 # The output port from which the motion of the simulated world is drawn.
 PLANT_STATE = "plant.state"
 
+# The number of entries of an array in a table of pedigrees.
+_SHOWN = 6
 # Larger arrays (images, clouds) get one line for all their entries.
 _MANY = 64
 
@@ -44,11 +48,15 @@ _MANY = 64
 @option("--match TEXT", "Show only addresses that contain TEXT.", default="")
 @option("--json", "Print a JSON list of objects instead of a table.", name="as_json", is_flag=True)
 @option("--schema", "Print the JSON Schema of the scenario's fields instead.", name="as_schema", is_flag=True)
-def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool) -> None:
+@option("--pedigree", "Show where the static numbers of the world are from instead.", name="by_source", is_flag=True)
+def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool, by_source: bool) -> None:
     """List the variables of a testbed, or the fields of its scenario.
 
     The table shows address, kind, shape, unit, bounds and the value in s0 of every element of the state. Kind x is the
     dynamic part of the state, kind a the static part. A derived variable can be read, but not set.
+
+    With --pedigree, the table shows the numbers of the simulated world that do not change, and numeric fields of the
+    scenario: their value, where they are from (assumed, datasheet, measured, calibrated), interval of 95 % and note.
 
     \b
     Example:
@@ -63,10 +71,44 @@ def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool) ->
     if not matches:
         raise BadInputError(f"no address contains {match!r}{suggestion(match, listed)}")
     context = testbed.default_context()
-    if as_json:
+    if by_source:
+        rows = _pedigree(scenario, [variable for variable in matches if not variable.derived], context, match)
+        titles = ("address", "value", "source", "interval", "note")
+        if as_json:
+            click.echo(json.dumps([dict(zip(titles, row, strict=True)) for row in rows], indent=2))
+        else:
+            click.echo(text_table(titles, rows))
+            sources = [row[2] for row in rows]
+            click.echo(", ".join(f"{sources.count(each)} {each}" for each in dict.fromkeys(sources)))
+    elif as_json:
         click.echo(json.dumps([_plain(variable, context) for variable in matches], indent=2))
     else:
         click.echo(listed.table(context, pattern=match))
+
+
+def _pedigree(
+    scenario: Scenario, variables: list[Variable], context: Context, match: str
+) -> list[tuple[str, str, str, str, str]]:
+    """Return rows (address, value, source, interval, note) of the static numbers of the world, and of fields."""
+    numbers = scenario.pedigree.numbers
+    texts: dict[str, str] = {}
+    for variable in variables:
+        array = np.ravel(variable.get(context)) + 0.0  # no negative zeros
+        entries = [f"{variable.address}[{i}]" for i in range(array.size)]
+        if any(entry in numbers for entry in entries):
+            texts |= {entry: f"{value:.6g}" for entry, value in zip(entries, array, strict=True)}
+        elif variable.address in numbers or (variable.kind == A and variable.address.startswith("sim.")):
+            texts[variable.address] = " ".join(f"{value:.6g}" for value in array[:_SHOWN])
+            texts[variable.address] += " ..." * (array.size > _SHOWN)
+    fields = {f"scenario.{name}": f"{value:.6g}" for name, value in scenario.numeric_fields().items()}
+    texts |= {address: text for address, text in fields.items() if match in address}
+    rows = []
+    for address, text in texts.items():
+        number = numbers.get(address, Number())
+        ends = [number.lower, number.upper]
+        interval = "" if None in ends else f"[{number.lower:.6g}, {number.upper:.6g}]"
+        rows.append((address, text, number.source, interval, number.note))
+    return rows
 
 
 def _plain(variable: Variable, context: Context) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -127,6 +128,17 @@ class Log:
     def end(self) -> float:
         """Return the time of the last sample of any signal, in s."""
         return max(float(series.times[-1]) for series in (*self.sense.values(), *self.act.values()))
+
+    @property
+    def digest(self) -> str:
+        """Return the SHA-256 of all names, times and samples, in hexadecimal."""
+        digest = hashlib.sha256()
+        for side, signals in (("sense", self.sense), ("act", self.act)):
+            for name in sorted(signals):
+                digest.update(f"{side}.{name} {signals[name].values.shape}".encode())
+                for array in (signals[name].times, signals[name].values):
+                    digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
 
     def between(self, start: float, end: float) -> Log:
         """Return the part from ``start`` to below ``end``, in s; a LogError if a signal has no sample there."""

@@ -149,6 +149,7 @@ class DrivenScenario(Scenario):
     def __post_init__(self) -> None:
         if self.scenario is not None:
             self.simulator_config = self.scenario.simulator_config
+            self.pedigree = self.scenario.pedigree
 
     def validate(self) -> None:
         super().validate()

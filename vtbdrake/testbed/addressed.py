@@ -91,9 +91,26 @@ class AddressedDiagram:
             skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
             extra=[clock, *extra],
         )
+        self._defaults = self._defaults_of(scenario)
         self._sampling = _sampling_part(diagram)
         if self._sampling is not None:
             self._sampling.sample_dps_by(self.dps_state)
+
+    def _defaults_of(self, scenario: Scenario | None) -> dict[str, float]:
+        """Return the values of the scenario's pedigree for this side: DPS, world or both.
+
+        Raises:
+            ValueError: There is no such variable, or it does not take the value.
+        """
+        sides = {address.partition(".")[0] for address in self._variables}
+        values = {} if scenario is None else scenario.pedigree.values
+        defaults = {address: value for address, value in values.items() if address.partition(".")[0] in sides}
+        for address, value in defaults.items():
+            try:
+                self._variables[address].check(value)
+            except ValueError as error:
+                raise ValueError(f"the pedigree of {scenario!r}: {error}") from error
+        return defaults
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"
@@ -106,6 +123,8 @@ class AddressedDiagram:
         if self.simulator_config.use_error_control:
             # By the accuracy, Drake finds the times of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
+        if self._defaults:
+            self._variables.write(context, self._defaults)
         self.attach(context)
         return context
 

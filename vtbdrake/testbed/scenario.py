@@ -9,7 +9,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass, replace
 from importlib.metadata import version
 from inspect import get_annotations
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -21,6 +21,7 @@ from pydrake.systems.framework import System
 from vtbdrake.argument_checks import suggestion
 from vtbdrake.settings import check_settings, check_value, field_types, plain_types
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
+from vtbdrake.testbed.pedigree import Number, Pedigree
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
 
@@ -34,6 +35,8 @@ _DRAKE = version("drake")
 _CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
 # The keys of these fields in files.
 FILE_KEYS = {"simulator_config": "simulator", "plant_config": "plant"}
+# Begin of the addresses of fields.
+_FIELD = "scenario."
 # Fields of SimulatorConfig that do not change a trajectory.
 _NO_IDENTITY = {"simulator.start_time", "simulator.target_realtime_rate", "simulator.publish_every_time_step"}
 
@@ -59,9 +62,11 @@ class Scenario(ABC):
     Attributes:
         simulator_config: The integrator. ``target_realtime_rate`` and ``publish_every_time_step`` hold for
             `VirtualTestbed.simulator`, not for rollouts and control loops.
+        pedigree: Where the numbers of the testbed are from. Those with a value begin with it in s0.
     """
 
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
+    pedigree: Pedigree = field(default_factory=Pedigree, kw_only=True)
 
     # Names of fields that tell where something lies, not what it is: no part of the identity.
     _PLACES: ClassVar[tuple[str, ...]] = ()
@@ -140,6 +145,9 @@ class Scenario(ABC):
         for key, value in _flat(self):  # Arrays, too.
             if isinstance(value, float) and not math.isfinite(value):
                 raise ScenarioError(f"{name}.{key} must be a finite number, not {value}")
+        for address, number in self.pedigree.numbers.items():
+            if address.startswith(_FIELD) and number.value is not None:
+                raise ScenarioError(f"{name}.pedigree gives {address} a value: set the field itself")
         config = self.simulator_config
         if not isinstance(config, SimulatorConfig):
             raise ScenarioError(f"{name}.simulator_config is a SimulatorConfig of Drake, not {config!r}")
@@ -250,9 +258,19 @@ class Scenario(ABC):
 
     def record(self) -> dict[str, Any]:
         """Return the identity of the scenario as plain data: its name and all fields, nested ones by dotted names."""
-        values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items() if key not in self._PLACES}
+        left_out = {*self._PLACES, "pedigree"}
+        values = {FILE_KEYS.get(key, key): value for key, value in _values(self).items() if key not in left_out}
         flat = {key: value for key, value in _flat(values) if key not in _NO_IDENTITY}
-        return {"scenario": self.name(), **flat}
+        return {"scenario": self.name(), **flat, **self.pedigree.values}
+
+    def numeric_fields(self) -> dict[str, float]:
+        """Return the fields that are numbers, nested ones by dotted names, without those of the integrator."""
+        values = {name: getattr(owner, name.rpartition(".")[2]) for name, owner, _ in _plain_fields(self)}
+        return {
+            name: value
+            for name, value in values.items()
+            if type(value) in (int, float) and not name.startswith(("simulator_config.", "pedigree."))
+        }
 
     def with_fields(self, values: Mapping[str, Any]) -> Self:
         """Return a copy in which some fields have other values.
@@ -280,6 +298,42 @@ class Scenario(ABC):
             setattr(owner, name.rpartition(".")[2], value)
         changed.validate()
         return changed
+
+    def with_values(self, values: Mapping[str, Any]) -> Self:
+        """Return a copy whose testbeds begin with some other values.
+
+        Args:
+            values: Values by address of a variable or of an entry of one, or by ``scenario.<field>``: one of `samples`,
+                say. Arrays are given entry by entry.
+
+        Raises:
+            ScenarioError: As in `with_fields`, or a value is no finite number.
+        """
+        fields = {a.removeprefix(_FIELD): value for a, value in values.items() if a.startswith(_FIELD)}
+        changed = self.with_fields(fields)
+        for address, value in values.items():
+            if not address.startswith(_FIELD):
+                number = changed.pedigree.numbers.get(address, Number())
+                changed.pedigree.numbers[address] = replace(number, value=float(value))
+        changed.validate()
+        return changed
+
+    def samples(self, count: int, *, seed: int = 0) -> list[dict[str, float]]:
+        """Return samples of the numbers that were calibrated, as they vary together: address -> value.
+
+        They are conditions of a `Problem`, values for `VirtualTestbed.write`, and other scenarios by `with_values`.
+        Every sample of an inertia is one of a body. Combinations that the recordings did not tell keep their estimate.
+
+        Args:
+            count: Number of samples.
+            seed: Determines the samples; the first ones of a larger number are the same.
+
+        Raises:
+            ScenarioError: Nothing was calibrated.
+        """
+        from vtbdrake.calibration.posterior import samples
+
+        return samples(self.pedigree.posterior, count, seed=seed)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a YAML file that `load_scenario` reads."""
@@ -335,6 +389,8 @@ def _changed_fields(owner: Any) -> str:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, Pedigree):
+        return repr(value)
     items = list(value.values()) if isinstance(value, dict) else value
     if isinstance(items, list) and any(hasattr(item, "__fields__") for item in items):
         return f"<{len(items)} {type(items[0]).__name__}>"

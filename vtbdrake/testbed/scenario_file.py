@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
@@ -17,11 +18,14 @@ import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 
 from vtbdrake.settings import field_types
+from vtbdrake.testbed.pedigree import Pedigree
 from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name
 
 S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
 _MOST_NODES = 100_000
+# What lies below the key in a file.
+_PEDIGREE = re.compile(r"^  pedigree:\n(?:    .*\n)*", re.MULTILINE)
 
 
 def load_scenario(source: str | os.PathLike[str]) -> Scenario:
@@ -83,7 +87,8 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
                     "numbers, texts, lists, dictionaries, dataclasses of them and Drake's configs"
                 ) from error
         raise
-    Path(path).write_text(text)
+    # A file without a pedigree is one that hardware_sim reads, too.
+    Path(path).write_text(text if scenario.pedigree != Pedigree() else _PEDIGREE.sub("", text))
 
 
 def _type_name(kind: Any) -> str:

@@ -1,0 +1,63 @@
+"""What a calibration leaves unknown: samples of the numbers that were fitted, as they vary together."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import casadi
+import numpy as np
+
+from vtbdrake.arrays import Array
+from vtbdrake.calibration.model import INERTIA_SIZE, inertia_of
+from vtbdrake.testbed.pedigree import Posterior
+from vtbdrake.testbed.scenario import ScenarioError
+
+# A sample outside the ranges is drawn again, so many times at most.
+_DRAWS = 1000
+PHYSICAL = ("mass", *(f"center_of_mass[{i}]" for i in range(3)), *(f"inertia[{i}]" for i in range(6)))
+"""The ten physical numbers of a body, below its address."""
+
+
+@cache
+def body_function() -> casadi.Function:
+    """Return the function z (10,) -> `PHYSICAL` (10,), and their Jacobian."""
+    symbol = casadi.SX.sym("z", INERTIA_SIZE)
+    physical = casadi.vertcat(*inertia_of(symbol))
+    return casadi.Function("inertia", [symbol], [physical, casadi.jacobian(physical, symbol)])
+
+
+def samples(posterior: Posterior, count: int, *, seed: int) -> list[dict[str, float]]:
+    """Return samples, address -> value; see `Scenario.samples`.
+
+    Raises:
+        ScenarioError: The posterior is empty, or its ranges hold next to nothing of it.
+    """
+    mean = np.array(posterior.mean)
+    if not mean.size:
+        raise ScenarioError("nothing was calibrated, so that there is nothing to draw: see vtbdrake.calibration")
+    values, axes = np.linalg.eigh(np.array(posterior.covariance).reshape(mean.size, mean.size))
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    generator = np.random.default_rng(seed)
+    return [_physical(posterior, _drawn(posterior, mean, root, generator)) for _ in range(count)]
+
+
+def _drawn(posterior: Posterior, mean: Array, root: Array, generator: np.random.Generator) -> Array:
+    size = len(posterior.addresses)
+    for _ in range(_DRAWS):
+        z: Array = mean + root @ generator.standard_normal(mean.size)
+        if (z[:size] >= posterior.lower).all() and (z[:size] <= posterior.upper).all():
+            return z
+    raise ScenarioError(
+        f"of {_DRAWS} samples none lies within the ranges of {', '.join(posterior.addresses)}: they exclude what was "
+        "estimated"
+    )
+
+
+def _physical(posterior: Posterior, z: Array) -> dict[str, float]:
+    size = len(posterior.addresses)
+    sample = dict(zip(posterior.addresses, z[:size].tolist(), strict=True))
+    for k, body in enumerate(posterior.inertias):
+        first = size + INERTIA_SIZE * k
+        numbers = np.asarray(body_function()(z[first : first + INERTIA_SIZE])[0]).ravel()
+        sample |= {f"{body}.{part}": float(number) for part, number in zip(PHYSICAL, numbers, strict=True)}
+    return sample
