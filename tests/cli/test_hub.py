@@ -41,7 +41,7 @@ def test_hub_prints_its_url_and_ends_cleanly(number: signal.Signals) -> None:
         second.publish("OTHER", b"handled")
         assert second.handle_timeout(30_000)
         program.send_signal(number)
-        stdout, stderr = program.communicate(timeout=30)
+        stdout, stderr = program.communicate(timeout=60)
     assert received == [b"command", b"handled"]
     assert program.returncode == 0
     assert stdout == "2 messages relayed, 1 rejected, 0 dropped for slow clients\n"
@@ -88,7 +88,7 @@ def test_default_protection(arguments: tuple[str, ...], channels: set[str], warn
     with running("--port", 0, *arguments) as (program, url):
         assert protected(url) == channels
         program.send_signal(signal.SIGINT)
-        _, stderr = program.communicate(timeout=30)
+        _, stderr = program.communicate(timeout=60)
     assert ("no channel of actuator commands is protected: give a SCENARIO" in stderr) == warns
     for channel in channels:
         assert channel in stderr

@@ -50,7 +50,7 @@ def test_machine_runs_until_it_is_interrupted(hub: Hub, ending: signal.Signals) 
         assert program.stdout is not None
         assert program.stdout.readline() == f"ready on {hub.url}\n"
         program.send_signal(ending)
-        output, errors = program.communicate(timeout=30)
+        output, errors = program.communicate(timeout=60)
     assert (program.returncode, errors) == (0, "")
     assert "deadlines missed" in output
 
@@ -62,7 +62,7 @@ def test_machine_dies_on_request(hub: Hub) -> None:
         program.stdout.readline()
         listener.next()
         listener.publish("VTB_MACHINE", json.dumps({"request": "die"}).encode())
-        program.communicate(timeout=30)
+        program.communicate(timeout=60)
     assert program.returncode == DIED
 
 

@@ -28,7 +28,7 @@ def machine(url: str, *options: object) -> Iterator[None]:
             yield
         finally:
             program.terminate()
-            program.communicate(timeout=30)
+            program.communicate(timeout=60)
 
 
 def test_machine_has_the_period_of_its_scenario(tmp_path: Path) -> None:

@@ -245,16 +245,18 @@ def test_a_stopped_dps_goes_on_with_the_machine_back(hub: Hub) -> None:
         assert any("the DPS commands" in line for line in program.stderr)
         machine.pause()
         assert any("the fallbacks command from now on" in line for line in program.stderr)
-        refused = run("reset", *patience)
-        machine.resume()
         limit = time.monotonic() + PATIENCE
+        # An earlier fault, of a computer that is busy, is over: its reset is accepted.
+        while not (refused := run("reset", *patience)).exit_code:
+            assert time.monotonic() < limit
+        machine.resume()
         while (released := run("reset", *patience)).exit_code:
             assert time.monotonic() < limit, released.stderr
         program.send_signal(signal.SIGTERM)
         program.communicate(timeout=PATIENCE)
     assert refused.exit_code == 1
     assert "is stale" in refused.stderr
-    assert released.stdout.startswith("this fault is over: sensor signal position is stale")
+    assert "this fault is over: sensor signal position is stale" in released.stdout
 
 
 def test_silent_machine_is_given_up(hub: Hub) -> None:
@@ -328,5 +330,5 @@ def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub) -> None:
         program.send_signal(signal.SIGTERM)
         output, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 1
-    assert "Error: the fallbacks took over: sensor signal" in errors
-    assert " s: sensor signal position is stale" in output
+    assert "Error: the fallbacks took over: " in errors
+    assert "sensor signal position is stale" in output

@@ -9,7 +9,7 @@ import numpy as np
 
 from vtbdrake.control.background_process import BackgroundProcess
 
-TIMEOUT = 30.0
+TIMEOUT = 60.0
 
 
 def echo(connection):

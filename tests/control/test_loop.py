@@ -347,9 +347,7 @@ def test_loop_reconnects_after_the_hub_was_killed() -> None:
             loop.begin()
             os.kill(first.pid, signal.SIGKILL)
             os.waitid(os.P_PID, first.pid, os.WEXITED | os.WNOWAIT)
-            loop.runtime.cycle()  # takes in what the hub had still sent
-            loop.runtime.cycle()
-            assert not loop.bridge.connected
+            loop.until(lambda: not loop.bridge.connected)  # when it has taken in what the hub had still sent
             assert loop.bridge.link.losses == 1
             loop.until(lambda: "is stale" in loop.latched)
             with Hub(port=port, protect=[COMMAND]):

@@ -374,7 +374,7 @@ def test_the_dashboard_shows_the_study_in_a_browser(study, url, tmp_path):
         )
     finally:
         process.terminate()
-        process.wait(timeout=20)
+        process.wait(timeout=60)
     assert "swing to the gap" in page
     assert f"Best Trial (number={study.best.number})" in page
     assert repr(study.best.value) in page

@@ -15,7 +15,7 @@ from tests.rollout.scenarios import child_pids
 from vtbdrake.reasoning import Belief, Budget
 
 # So long a worker waits at the gate, at most, in s; so that a test that fails ends.
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 @dataclass

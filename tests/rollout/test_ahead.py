@@ -101,22 +101,22 @@ def test_rollouts_that_kill_their_workers_have_two_tries_each(always, tmp_path):
 
 
 def _slow(theta):
-    time.sleep(0.25)
+    time.sleep(0.75)
     return abs(theta)
 
 
 def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
-    # Each has two samples, of half a second together, and has stood behind another one.
+    # Each has two samples, of 1.5 s together, and has stood behind another one.
     task = RolloutTask(PendulumScenario(), 0.5, Quality(_slow, THETA), sample_period=0.5)
-    with ProcessExecutor(1, time_limit=0.9) as executor:
-        list(executor.run(task, _points(1)))
+    with ProcessExecutor(1, time_limit=2.9) as executor:
+        list(executor.run(TASK, _points(1)))
         assert _watched(executor, task, _points(3))[1] == 2
     assert caplog.text == ""
 
 
 @pytest.mark.parametrize("seconds", [inf, 0.2])
 def test_a_worker_that_is_stopped_between_rollouts_is_replaced(seconds, caplog):
-    with ProcessExecutor(1, time_limit=1.0 if seconds == inf else inf) as executor:
+    with ProcessExecutor(1, time_limit=2.0 if seconds == inf else inf) as executor:
         list(executor.run(TASK, _points(1)))
         os.kill(executor._workers[0].child.pid, signal.SIGSTOP)
         results = dict(executor.run(TASK, _points(2), cutoff=Cutoff(deadline=time.monotonic() + seconds)))
@@ -137,8 +137,8 @@ class _SlowToBuild(PendulumScenario):
 
 def test_a_warm_worker_has_time_to_build_another_testbed(caplog):
     task = RolloutTask(_SlowToBuild(), 0.1, Quality(abs, THETA))
-    with ProcessExecutor(1, time_limit=1.0) as executor:
+    with ProcessExecutor(1, time_limit=2.0) as executor:
         list(executor.run(task, _points(1)))
-        ((_, result),) = executor.run(task, [{"scenario.seconds": 1.2}])
+        ((_, result),) = executor.run(task, [{"scenario.seconds": 2.2}])
     assert not result.failed
     assert caplog.text == ""

@@ -58,7 +58,7 @@ def test_rollouts_begin_at_their_starts(cluster):
 
 def test_dashboard_shows_the_workers(cluster):
     def page(path):
-        with urllib.request.urlopen(cluster.dashboard + path, timeout=20) as response:
+        with urllib.request.urlopen(cluster.dashboard + path, timeout=60) as response:
             return response.read().decode()
 
     workers = page("/info/main/workers.html")

@@ -104,7 +104,7 @@ def test_threads_that_want_the_same_new_testbed_build_it_once(built):
     testbeds, both = cache.Testbeds(), threading.Barrier(4)
 
     def get(_):
-        both.wait(timeout=10.0)
+        both.wait(timeout=60.0)
         return testbeds.get(CountedScenario(stiffness=5.0))
 
     with ThreadPoolExecutor(4) as pool:

@@ -66,26 +66,29 @@ def test_second_task_gets_its_own_results(make):
         _assert_right(executor, ANGLE, POINTS)
 
 
-def _slow_and_refuses_large_angles(theta):
-    if theta > 3.0:
-        raise RuntimeError("too large")
-    time.sleep(0.1)
-    return abs(theta)
-
-
 @pytest.mark.parametrize("make", [lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
-def test_executor_works_after_a_quality_error(make):
-    # The first point is refused at once, while the second one is on its way for 6 s.
-    troubled = RolloutTask(AcrobotScenario(), 3.0, Quality(_slow_and_refuses_large_angles, SHOULDER))
+def test_executor_works_after_a_quality_error(make, tmp_path):
+    samples = tmp_path / "samples"
+
+    def _slow_and_refuses_large_angles(theta):
+        if theta > 3.0:
+            raise RuntimeError("too large")
+        with samples.open("a") as file:
+            file.write("x")
+        time.sleep(0.1)
+        return abs(theta)
+
+    # The first point is refused at once, while the second one is on its way for a minute.
+    troubled = RolloutTask(
+        AcrobotScenario(), 6.0, Quality(_slow_and_refuses_large_angles, SHOULDER), sample_period=0.01
+    )
     with make() as executor:
         _assert_right(executor, ANGLE, POINTS[:2])
-        begin = time.monotonic()
         with pytest.raises(QualityError, match="_large_angles at t = 0 s, .* raises RuntimeError: too large"):
             list(executor.run(troubled, [{SHOULDER: 3.1}, {SHOULDER: 0.1}]))
-        error_after = time.monotonic() - begin
         assert not any(worker.jobs for worker in getattr(executor, "_workers", []))
+        assert not samples.exists() or samples.stat().st_size < 600
         _assert_right(executor, OTHER, POINTS)
-    assert error_after < 4.0
 
 
 def test_worker_that_died_while_idle_costs_nothing(caplog):
@@ -137,10 +140,10 @@ def test_error_in_a_thread_stops_the_others():
     def f(theta):
         if not calls:
             calls.append(theta)
-            both.wait(timeout=10.0)
+            both.wait(timeout=60.0)
             raise RuntimeError("too large")
         if len(calls) == 1:
-            both.wait(timeout=10.0)
+            both.wait(timeout=60.0)
         calls.append(theta)
         time.sleep(0.2)
         return abs(theta)
@@ -253,7 +256,7 @@ def test_forgotten_executor_leaves_no_threads():
     del executor
     gc.collect()
     for thread in threads:
-        thread.join(timeout=10.0)
+        thread.join(timeout=60.0)
     assert not any(thread.is_alive() for thread in threads)
 
 

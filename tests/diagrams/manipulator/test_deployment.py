@@ -26,7 +26,7 @@ from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
 
-PATIENCE = 30.0  # s
+PATIENCE = 60.0  # s
 
 
 def test_refused_reset_is_accepted_after_its_remedy() -> None:

@@ -16,7 +16,7 @@ import lcm
 
 from vtbdrake.lcm.hub import Hub, HubStatistics
 
-TIMEOUT = 30.0
+TIMEOUT = 60.0
 MEBIBYTE = 1024 * 1024
 
 GREETING = struct.pack(">II", 0x287617FB, 0x0100)

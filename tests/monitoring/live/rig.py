@@ -17,7 +17,7 @@ from vtbdrake.control.stepping import Cycle
 from vtbdrake.monitoring.live.service import LiveService
 from vtbdrake.testbed import DpsAlone
 
-PATIENCE = 30.0  # s for whatever has to happen
+PATIENCE = 60.0  # s for whatever has to happen
 T = TypeVar("T")
 
 
