@@ -17,6 +17,9 @@ from vtbdrake.calibration.regression import base_parameters as base_parameters
 from vtbdrake.calibration.regression import equations as equations
 from vtbdrake.calibration.regression import friction as friction
 from vtbdrake.calibration.regression import regress as regress
+from vtbdrake.calibration.rollout_calibration import RolloutCalibration as RolloutCalibration
+from vtbdrake.calibration.rollout_calibration import Window as Window
+from vtbdrake.calibration.rollout_calibration import calibrate_by_rollouts as calibrate_by_rollouts
 from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
 from vtbdrake.calibration.validation import Tolerance as Tolerance

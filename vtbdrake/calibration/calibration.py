@@ -77,7 +77,7 @@ class Calibration:
             identifiable are right together. Its pedigree says so, and `Scenario.save` writes it.
         parameters: The results, by address. An `Inertia` appears as mass, centre of mass and moments.
         combinations: Combinations of parameters that the recordings do not determine, as sentences.
-        noise: The noise that explains the innovations.
+        noise: The noise that explains the innovations; None where there are none.
         fit, holdout: Root mean square of the whitened innovations (1 is expected) in the segments of the fit, and in
             those that were kept back.
         correlation: The largest autocorrelation of the whitened innovations at the first ten lags, of any joint.
@@ -91,7 +91,7 @@ class Calibration:
     scenario: Scenario
     parameters: Mapping[str, Calibrated]
     combinations: tuple[str, ...]
-    noise: Noise
+    noise: Noise | None
     fit: float
     holdout: float
     correlation: float
@@ -116,8 +116,7 @@ class Calibration:
     def __str__(self) -> str:
         width = max(len(address) for address in self.parameters)
         lines = [
-            f"{len(self.sources)} recordings, {self.segments} segments: innovations {self.fit:.3g} (hold-out "
-            f"{self.holdout:.3g}, 1 is expected), largest autocorrelation {self.correlation:.2g}",
+            self._header(),
             f"{'':{width}}       start       value   deviation   interval of 95 %",
         ]
         for each in self.parameters.values():
@@ -126,6 +125,12 @@ class Calibration:
                 f"[{each.lower:.5g}, {each.upper:.5g}] {each.verdict}"
             )
         return "\n".join([*lines, *self.reasons, *self.combinations, *self.remarks])
+
+    def _header(self) -> str:
+        return (
+            f"{len(self.sources)} recordings, {self.segments} segments: innovations {self.fit:.3g} (hold-out "
+            f"{self.holdout:.3g}, 1 is expected), largest autocorrelation {self.correlation:.2g}"
+        )
 
 
 def calibrate(
