@@ -36,9 +36,8 @@ FAR = 0.01
 
 # The scatter of a first sample about the free flight before the first impact: rad, m, rad/s, m/s.
 _SCATTER = (2e-3, 1e-4, 0.2, 0.01)
-# Starts of each toss, the samples of a toss that the fit compares (0.43 s; later, most cubes rest), and the points of
-# the search before the fit.
-_STARTS, _SAMPLES, _POINTS = 2, 65, 16
+# The points of the search before the fit.
+_POINTS = 16
 
 
 def contact_models() -> dict[str, tuple[CubeTossScenario, vtb.Parameter]]:
@@ -136,10 +135,10 @@ def loss(times: Array, measured: Mapping[str, Array], simulated: Mapping[str, Ar
 
 
 def calibrated(
-    tosses: Sequence[Log], scenario: CubeTossScenario, restitution: vtb.Parameter, **options: Any
+    tosses: Sequence[Log], scenario: CubeTossScenario, restitution: vtb.Parameter, *, starts: int = 1, **options: Any
 ) -> RolloutCalibration:
     """Return the calibration of friction, and of the parameter that restitution depends on."""
-    windows = [window(toss, starts=_STARTS, samples=_SAMPLES) for toss in tosses]
+    windows = [window(toss, starts=starts) for toss in tosses]
     parameters = [vtb.Parameter("scenario.friction", 0.05, 0.4), restitution]
     return calibrate_by_rollouts(scenario, windows, parameters, loss, points=_POINTS, **options)
 
@@ -192,7 +191,8 @@ def split_tosses(tosses: Sequence[Log]) -> tuple[list[Log], list[Log]]:
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--model", "names", multiple=True, help="A contact model; by default, all.")
 @click.option("--figure", type=click.Path(dir_okay=False, path_type=Path), help="Save a figure of the errors.")
-def main(folder: Path, names: tuple[str, ...], figure: Path | None) -> None:
+@click.option("--starts", type=click.IntRange(1), default=1, help="Starts of a toss within the scatter of the first.")
+def main(folder: Path, names: tuple[str, ...], figure: Path | None, starts: int) -> None:
     """Calibrate the contact models with some tosses in FOLDER, and predict the others."""
     fitted, rest = split_tosses(recordings(folder))
     print(f"{len(rest)} tosses that no calibration has seen; medians with intervals of 95 % over them, means behind\n")
@@ -202,7 +202,7 @@ def main(folder: Path, names: tuple[str, ...], figure: Path | None) -> None:
     for name, (scenario, restitution) in contact_models().items():
         if names and name not in names:
             continue
-        results[name] = calibrated(fitted, scenario, restitution)
+        results[name] = calibrated(fitted, scenario, restitution, starts=starts)
         for label, each in ((f"{name}, friction 0.18", scenario), (f"{name}, calibrated", results[name].scenario)):
             curves[label] = errors(rest, each)
             print(f"{label:32}" + "".join(_cells(curves[label])), flush=True)

@@ -28,7 +28,9 @@ Loss = Callable[[Array, Record, Record], float]
 # A recording that is farther from the simulations than they are from each other, in more than this share of the
 # windows beyond what chance explains, is not explained by the model.
 OUTSIDE = 0.3
-_BOOTSTRAPS, _ROUNDS, _CANDIDATES = 400, 6, 1024
+_BOOTSTRAPS, _ROUNDS, _CANDIDATES = 400, 4, 1024
+# A difference is one if so large a share of the draws agrees about its sign.
+_SURE = 0.975
 # The half width of the box of the last fit, at first, as a share of the range; and its largest and least ratio of the
 # bootstrap's deviation to it: a quadratic fits in a box that is neither much smaller nor much larger than the doubt.
 _RADIUS, _NARROW, _WIDE = 0.15, 0.35, 0.1
@@ -333,7 +335,7 @@ def _matters(scores: _Scores, windows: Sequence[Window], estimate: Point, weight
         worse = (scores.matrix(ends, windows) - here) @ weights.T > 0.0
         # An end where rollouts fail is not as good as the estimate.
         failed = np.isnan(scores.matrix(ends, windows)).any(axis=1)
-        matters.append(bool((failed | (worse.mean(axis=1) >= 0.975)).any()))
+        matters.append(bool((failed | (worse.mean(axis=1) >= _SURE)).any()))
     return np.array(matters)
 
 
@@ -353,6 +355,11 @@ def _refined(
         draws = surface.minima(weights, rng.exponential(size=(_BOOTSTRAPS, surface.points)), rng)
         half = 0.5 * (upper - lower)
         ratio = draws.std(axis=0) / half
+        if (better := _better(scores, windows, estimate, weights)) is not None:
+            # The quadratic does not fit in this box.
+            center, radius = better, 0.5 * radius
+            estimate = better
+            continue
         moved = (abs(estimate - center) > 0.8 * radius) & (estimate > 0.0) & (estimate < 1.0)
         wider = ((lower > 0.0) | (upper < 1.0)) & (ratio > _NARROW)
         narrower = (ratio < _WIDE) & ~moved & (radius > 0.01)
@@ -362,6 +369,19 @@ def _refined(
         radius = np.where(wider, 2.0 * radius, np.where(narrower, 0.5 * radius, radius))
     point = tuple(parameter.from_unit(float(u)) for parameter, u in zip(parameters, estimate, strict=True))
     return point, draws
+
+
+def _better(scores: _Scores, windows: Sequence[Window], u: Array, weights: Array) -> Array | None:
+    """Return the best point so far, (n,) in the unit cube, if it surely fits better than the point u."""
+    parameters = scores.parameters
+    here = tuple(parameter.from_unit(float(x)) for parameter, x in zip(parameters, u, strict=True))
+    points = [*scores.evaluated_points(windows), here]
+    table = scores.matrix(points, windows)
+    means = np.where(np.isfinite(table).all(axis=1), table.mean(axis=1), np.inf)
+    best = int(np.argmin(means))
+    if not np.mean((table[-1] - table[best]) @ weights.T > 0.0) >= _SURE:
+        return None
+    return np.array([parameter.to_unit(x) for parameter, x in zip(parameters, points[best], strict=True)])
 
 
 def _evaluate_design(scores: _Scores, windows: Sequence[Window], lower: Array, upper: Array, *, seed: int) -> None:
@@ -471,7 +491,7 @@ def _result(
     scales = np.array([0.5 * (parameter.upper - parameter.lower) for parameter in scores.parameters])
     # The draws in units of half the ranges, on the scale of the search.
     spread = np.atleast_2d(np.cov(2.0 * draws.T)) + 1e-12 * np.eye(len(names))
-    information = Information(names, scales, np.linalg.inv(spread))
+    information = Information(names, scales, np.asarray(np.linalg.inv(spread), dtype=float))
     results = {}
     for k, (parameter, value) in enumerate(zip(scores.parameters, estimate, strict=True)):
         samples = np.array([parameter.from_unit(u) for u in draws[:, k]])
