@@ -344,7 +344,7 @@ def _result(
         upper=model.upper[:n].tolist(),
     )
     return Calibration(
-        scenario=_calibrated(scenario, results, posterior, logs=prepared.logs, reasons=reasons),
+        scenario=calibrated_scenario(scenario, results, posterior, logs=prepared.logs, reasons=reasons),
         parameters=results,
         combinations=info.combinations,
         noise=noise,
@@ -359,7 +359,7 @@ def _result(
     )
 
 
-def _calibrated(
+def calibrated_scenario(
     scenario: Scenario,
     results: Mapping[str, Calibrated],
     posterior: Posterior,

@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
-from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict
-from vtbdrake.calibration.fisher import UNTOLD, Information
+from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict, calibrated_scenario
+from vtbdrake.calibration.fisher import Information
 from vtbdrake.calibration.model import CalibrationError
 from vtbdrake.optimization import Parameter
 from vtbdrake.optimization.solvers import Evaluation, Point, make_solver
+from vtbdrake.recording.log import Log, Series
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
 from vtbdrake.rollout.executor import run_rollouts
-from vtbdrake.rollout.testbeds import split
 from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.testbed.pedigree import Posterior
 
 Record = Mapping[str, Array]
 Loss = Callable[[Array, Record, Record], float]
@@ -65,12 +66,20 @@ class Window:
                 raise CalibrationError(f"{address} of {self.source} has one finite value for each of the {n} times")
 
     @property
+    def digest(self) -> str:
+        """Return the SHA-256 of what was measured, see `Log.digest`."""
+        series = {
+            address: Series(self.times, values.reshape(len(values), -1)) for address, values in self.record.items()
+        }
+        return Log(self.source, series, {}).digest
+
+    @property
     def period(self) -> float:
         """Return the time between two samples, in s."""
         return float((self.times[-1] - self.times[0]) / (len(self.times) - 1))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RolloutCalibration(Calibration):
     """The result of `calibrate_by_rollouts`: a `Calibration` whose measure is the user's loss, not innovations.
 
@@ -162,8 +171,12 @@ def calibrate_by_rollouts(
         weights = _bootstrap(fitted, rng)
         estimate, draws = _refined(scores, fitted, best, weights, rng, seed=seed)
         matters = _matters(scores, fitted, estimate, weights)
-        # Then, every value is as good.
+        # Then, every value is as good, and the start remains.
         draws[:, ~matters] = rng.uniform(size=(len(draws), np.count_nonzero(~matters)))
+        estimate = tuple(
+            value if matter else min(max(before, parameter.lower), parameter.upper)
+            for parameter, value, matter, before in zip(parameters, estimate, matters, start, strict=True)
+        )
         at_estimate, at_holdout = (scores.of(estimate, part) for part in (fitted, held_back))
         as_good = _is_as_good(scores, held_back, start, estimate)
     finally:
@@ -499,14 +512,22 @@ def _result(
         own_verdict = verdict
         if not 1e-3 < parameter.to_unit(value) < 1.0 - 1e-3:
             own_verdict = Verdict.AT_BOUND
-        if information.untold[k] > UNTOLD:
+        if names[k] not in information.told:
             own_verdict = Verdict.NOT_IDENTIFIABLE
         results[names[k]] = Calibrated(
             names[k], start[k], float(value), float(samples.std()), float(lower), float(upper), own_verdict
         )
-    calibrated = {name: each.value for name, each in results.items() if each.verdict != Verdict.NOT_IDENTIFIABLE}
+    values = np.array([[p.from_unit(u) for p, u in zip(scores.parameters, draw, strict=True)] for draw in draws])
+    posterior = Posterior(
+        addresses=list(names),
+        mean=[each.value for each in results.values()],
+        covariance=np.atleast_2d(np.cov(values.T)).tolist(),
+        lower=[float(parameter.lower) for parameter in scores.parameters],
+        upper=[float(parameter.upper) for parameter in scores.parameters],
+    )
+    logs = {f"{window.source} from {window.times[0]:g} s": window.digest for window in windows}
     return RolloutCalibration(
-        scenario=scenario.with_fields(split(calibrated)[0]),
+        scenario=calibrated_scenario(scenario, results, posterior, logs=logs, reasons=reasons),
         parameters=results,
         combinations=information.combinations,
         noise=None,
