@@ -255,13 +255,15 @@ def equations(
     q = _low_pass(q, cutoff, period)
     v = np.gradient(q, period, axis=0)
     a = np.gradient(v, period, axis=0)
-    Y = model.matrix(q, v, a)
-    rows = slice(
-        round(margin / period), len(times) - round(margin / period), max(int(1.0 / (_PER_CUTOFF * band * period)), 1)
-    )
-    return Equations(
-        recording.source, times[rows], _low_pass(Y, band, period)[rows], _low_pass(tau, band, period)[rows]
-    )
+    # Ten samples in a period of the cutoff are enough from here on; the torques have faster parts, which would fold.
+    thin = max(int(1.0 / (10.0 * cutoff * period)), 1)
+    tau = tau if thin == 1 else _low_pass(tau, 3.0 * cutoff, period)
+    times, q, v, a, tau = (values[::thin] for values in (times, q, v, a, tau))
+    period = thin * period
+    ends = round(margin / period)
+    rows = slice(ends, len(times) - ends, max(int(1.0 / (_PER_CUTOFF * band * period)), 1))
+    Y, tau = (_low_pass(values, band, period)[rows] for values in (model.matrix(q, v, a), tau))
+    return Equations(recording.source, times[rows], Y, tau)
 
 
 def _resampled(times: Array, recorded: Array, values: Array) -> Array:
