@@ -173,6 +173,30 @@ def test_motor_coupled_to_two_joints_has_one_friction(double: TorqueRegressor) -
     np.testing.assert_allclose(Y[:, model.names.index("both.viscous")], [0.3, 0.3])
 
 
+def test_joint_that_stands_still_leaves_its_parameters_undetermined(double: TorqueRegressor) -> None:
+    log = recorded(double, 7)
+    q = log.q * [1.0, 0.0]
+    v = np.gradient(q, log.times, axis=0)
+    tau = double.matrix(q, v, np.gradient(v, log.times, axis=0)) @ double.vector(TRUTH)
+    still = JointRecording("elbow at rest", log.times, q, tau + np.random.default_rng(0).normal(size=q.shape))
+    fit = regress(double, equations(double, still, cutoff=30.0, band=8.0))
+    unknown = {name for name, deviation in zip(fit.names, fit.deviations, strict=True) if np.isinf(deviation)}
+    assert {"elbow.viscous", "elbow.coulomb", "elbow.rotor"} <= unknown
+    # The torque of the elbow tells the moment of the link that it carries.
+    assert not unknown & {"shoulder.viscous", "shoulder.coulomb", "lower.Iyy"}
+    assert any("not determined" in remark for remark in fit.remarks)
+
+
+def test_torques_of_the_other_sign_are_those_of_no_body(double: TorqueRegressor) -> None:
+    log = recorded(double, 8)
+    turned = equations(double, JointRecording("turned", log.times, log.q, -log.u), cutoff=30.0, band=8.0)
+    # The base parameters fit as well as ever, with negative masses.
+    assert np.max(regress(double, turned).residual) < 0.1
+    assert any("wrong signs" in remark for remark in regress(double, turned, consistent=True).remarks)
+    right = regress(double, equations(double, log, cutoff=30.0, band=8.0), consistent=True)
+    assert not right.remarks
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -180,6 +204,7 @@ def test_motor_coupled_to_two_joints_has_one_friction(double: TorqueRegressor) -
         ({"u": np.zeros((400, 2))}, "torques"),
         ({"times": np.r_[np.arange(250), np.arange(250)] * PERIOD}, "clock"),
         ({"times": np.arange(500) * 0.1}, "cannot be filtered"),
+        ({"u": np.full((500, 2), np.nan)}, "not finite"),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused(double: TorqueRegressor, change, message: str) -> None:

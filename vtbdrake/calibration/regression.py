@@ -40,6 +40,9 @@ _ORDER = 4  # of the Butterworth filters
 _PER_CUTOFF = 4  # samples that are kept in a period of the cutoff frequency
 _RANK = 1e-7  # of a column of the regressor that adds nothing, relative to its norm
 _ROUNDS = 3  # of the weights
+_DETERMINED = 1e-6  # least singular value of a direction that is told, relative to the largest
+_UNKNOWN = 0.01  # share of a parameter in directions that are not told, from which on it is not told itself
+_WORSE = 1.5  # how much more of the torques bodies may leave than parameters that none can have
 _NO_PRIOR = 1e3  # relative deviation of the plant's own numbers where they count only if nothing else does
 _MARGIN = 1e-4  # of mass and moments, in units of the model's mean ones, that each body has at least
 _BLOCKS_PER_PARAMETER = 3
@@ -241,6 +244,8 @@ def equations(
             f"{recording.source} has positions {recording.q.shape} and torques {recording.u.shape}, the model "
             f"{model.nq} joints"
         )
+    if not (np.isfinite(recording.q).all() and np.isfinite(recording.u).all()):
+        raise CalibrationError(f"{recording.source} has positions or torques that are not finite: cut them out")
     if np.min(np.diff(recording.times)) <= 0.0:
         raise CalibrationError(f"{recording.source}: its clock steps back or stands still")
     period, margin = recording.period, 2.0 / band
@@ -348,6 +353,7 @@ class Regression:
         blocks: Number of blocks of the sandwich; intervals are too small with less than 3 for each parameter.
         gains: By joint, the factor from recorded to actual torques.
         parameters: All of p, (P,): physically consistent if it was asked for, and else zero where nothing is told.
+        remarks: What to know before the numbers are used, as sentences.
     """
 
     model: TorqueRegressor
@@ -361,6 +367,7 @@ class Regression:
     blocks: int
     gains: Array
     parameters: Array
+    remarks: tuple[str, ...]
 
     def torques(self, equations: Equations) -> Array:
         """Return the torques (n, nq) that are expected in a recording, in its own units."""
@@ -384,11 +391,7 @@ class Regression:
         ):
             short = name if len(name) <= width else name[: width - 3] + "..."
             lines.append(f"{short:{width}}{value:12.5g}{deviation:12.2g}   [{low:.5g}, {high:.5g}]")
-        if self.blocks < _BLOCKS_PER_PARAMETER * len(self.names):
-            lines.append(
-                f"{self.blocks} blocks are too few for {len(self.names)} parameters: the intervals are too small"
-            )
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.remarks])
 
 
 def regress(
@@ -442,7 +445,7 @@ def regress(
         white, instruments = ((part / scale[:, np.newaxis]).reshape(-1, count) for part in (Y, Z))
         norms = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
         white, instruments = white / norms, instruments / norms
-        inverse = np.linalg.pinv(instruments.T @ white)
+        inverse = np.linalg.pinv(instruments.T @ white, rcond=_DETERMINED**2)
         values = inverse @ (instruments.T @ (tau / scale).ravel()) / norms
         left = tau - Y @ values
         scale = np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1e-12)
@@ -450,36 +453,49 @@ def regress(
             # Measured torques on the right side have errors, which expected ones have not.
             Z = Y.copy()
             Z[:, :, len(base.columns) :] = np.concatenate([_column(left - tau, joint) for joint in gains], axis=2)
-    condition = float(np.linalg.cond(white))
+    _, sizes, directions = np.linalg.svd(white, full_matrices=False)
+    undetermined = directions[sizes <= _DETERMINED * sizes[0]]
+    condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0.0 else np.inf
     scores = _scores(recordings, Z / scale[:, np.newaxis], left / scale, block) / norms
     sandwich = inverse @ (scores.T @ scores) @ inverse.T * len(scores) / max(len(scores) - 1, 1)
     # Never less than what errors leave that are not correlated.
     alone = inverse @ (instruments.T @ instruments) @ inverse.T
     deviations = np.sqrt(np.maximum(np.diag(sandwich), np.diag(alone))) / norms
+    deviations[np.linalg.norm(undetermined, axis=0) > _UNKNOWN] = np.inf
     wide = float(scipy.stats.t.ppf(0.975, max(len(scores) - 1, 1))) * deviations
     factors = np.ones(model.nq)
     factors[list(gains)] += values[len(base.columns) :]
     parameters = np.zeros(len(model.names))
     parameters[list(base.columns)] = values[: len(base.columns)]
     if consistent:
-        everything = np.concatenate([each.Y for each in recordings])
-        white_tau = tau * factors / scale
-        parameters = _consistent(
-            model, everything / scale[:, np.newaxis], white_tau, _NO_PRIOR if prior is None else prior
-        )
+        everything, acting = np.concatenate([each.Y for each in recordings]), tau * factors
+        weight = _NO_PRIOR if prior is None else prior
+        parameters = _consistent(model, everything / scale[:, np.newaxis], acting / scale, weight)
     names = (*base.names, *(f"gain {joint} - 1" for joint in gains))
+    remarks = []
+    if len(scores) < _BLOCKS_PER_PARAMETER * count:
+        remarks.append(f"{len(scores)} blocks are too few for {count} parameters: the intervals are too small")
+    if unknown := [name for name, deviation in zip(names, deviations, strict=True) if not np.isfinite(deviation)]:
+        remarks.append(f"not determined: {'; '.join(unknown)}")
+    if consistent:
+        ratio = np.linalg.norm((acting - everything @ parameters) / scale) / np.linalg.norm(left / scale)
+        if ratio > _WORSE:
+            remarks.append(
+                f"bodies with positive masses leave {ratio:.2g} times as much of the torques: wrong signs or frames?"
+            )
     return Regression(
-        model,
-        names,
-        values,
-        deviations,
-        values - wide,
-        values + wide,
-        scale,
-        condition,
-        len(scores),
-        factors,
-        parameters,
+        model=model,
+        names=names,
+        values=values,
+        deviations=deviations,
+        lower=values - wide,
+        upper=values + wide,
+        residual=scale,
+        condition=condition,
+        blocks=len(scores),
+        gains=factors,
+        parameters=parameters,
+        remarks=tuple(remarks),
     )
 
 
