@@ -8,6 +8,7 @@ import pytest
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from vtbdrake.calibration import CalibrationError, Inertia, JointModel
+from vtbdrake.calibration.filtering import JointRecording, Noise
 from vtbdrake.calibration.model import inertia_of, log_cholesky
 from vtbdrake.optimization import Parameter
 
@@ -104,3 +105,11 @@ def test_a_whole_inertia_begins_where_the_body_is() -> None:
     assert float(mass) == pytest.approx(1.0)
     np.testing.assert_allclose(center.full().ravel(), [0.0, 0.0, -0.3], atol=1e-12)
     np.testing.assert_allclose(moments.full().ravel(), [0.02, 0.02, 0.02, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_noise_of_a_smooth_motion_is_guessed_from_its_differences() -> None:
+    times, rng = np.arange(0.0, 20.0, 0.005), np.random.default_rng(0)
+    deviation = np.array([1e-3, 4e-3])
+    q = np.stack([np.sin(times), np.cos(2.0 * times)], axis=1) + deviation * rng.normal(size=(len(times), 2))
+    recording = JointRecording("drawn", times, q, np.zeros((len(times), 2)))
+    np.testing.assert_allclose(Noise.guess([recording], np.zeros((1, 2))).measurement, deviation, rtol=0.05)

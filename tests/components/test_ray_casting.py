@@ -177,6 +177,18 @@ def test_each_ray_sees_the_bodies_at_its_own_time() -> None:
     assert np.ptp(still(caster, directions, X_WL, X_WB).distances - moving.distances) > 0.1
 
 
+def test_body_on_a_turning_arm_is_hit_where_it_was() -> None:
+    """A sphere circles at 2 m; half a second before, it was 3 m from where it is at the time of the poses."""
+    caster = RayCaster(*plant_with(Sphere(0.3), X_BG=RigidTransform([2.0, 0.0, 0.0])))
+    angle = 3.0 * -0.5
+    center = 2.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    X_WL = RigidTransform(center - [0.0, 5.0, 0.0])
+    V_WB = SpatialVelocity(w=[0.0, 0.0, 3.0], v=[0.0, 0.0, 0.0])
+    motion = {"X_WL": X_WL, "V_WL": AT_REST, "X_WB": [RigidTransform()] * 2, "V_WB": [AT_REST, V_WB]}
+    hits = caster.cast(np.array([[0.0, 1.0, 0.0]]), np.array([-0.5]), **motion)
+    np.testing.assert_allclose(hits.distances, [4.7], atol=1e-3)
+
+
 def test_welded_bodies_and_the_world_are_scenes_of_their_own() -> None:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     inertia, white = SpatialInertia.SolidSphereWithMass(1.0, 0.1), [1.0, 1.0, 1.0, 1.0]

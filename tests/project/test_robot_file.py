@@ -57,6 +57,7 @@ def test_an_assumed_drive_carries_the_robot_in_every_posture() -> None:
     """The tilted head weighs at most m g r = 0.9 kg 9.81 m/s^2 |(0.05, 0.02) m| on its tilt."""
     tilt = read_robot(MODELS / "bare.urdf").joints[1]
     assert tilt.effort > 0.9 * 9.81 * np.hypot(0.05, 0.02)
+    assert tilt.effort == float(f"{tilt.effort:.2g}")  # an assumption pretends no more digits
 
 
 def test_a_free_base_is_welded_where_the_file_places_it() -> None:

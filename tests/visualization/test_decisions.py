@@ -53,6 +53,9 @@ def test_the_chosen_candidate_is_drawn_last_as_a_star(swung_up):
     star = right.get_lines()[-1]
     assert star.get_marker() == "*"
     assert star.get_ydata()[0] == max(c.quality for c in decision.candidates if c.status == "eligible")
+    (plan_in_use,) = [line for line in right.get_lines() if line.get_marker() == "s"]
+    first = decision.candidates[0]
+    assert tuple(plan_in_use.get_xydata()[0]) == (first.values["u.switch"], first.quality)
     curve = [line for line in left.get_lines() if line.get_gid() == "trajectory"][-1]
     np.testing.assert_array_equal(curve.get_ydata(), decision.candidates[decision.chosen].rollouts[0].quality)
 

@@ -166,6 +166,17 @@ def test_landscape_is_the_worst_h_with_the_best_point(conditions: int) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("sim.sys.payload.mass [kg]", "sim.env.ground.friction")
 
 
+def test_cells_of_a_logarithmic_parameter_end_at_geometric_means() -> None:
+    parameters = (Parameter("x", 1.0, 100.0, log=True), FRICTION)
+    points = np.array([[x, y] for x in (1.0, 10.0, 100.0) for y in (0.2, 0.8)])
+    results = [rollout(np.full(3, value)) for value in range(6)]
+    axes = plot_sweep(sweep(points, results, parameters=parameters, units=("1", "1"))).axes[0]
+    (mesh,) = [c for c in axes.collections if c.get_gid() == "h"]
+    corners = mesh.get_coordinates()
+    np.testing.assert_allclose(corners[0, :, 0], np.sqrt([0.1, 10.0, 1e3, 1e5]))
+    np.testing.assert_allclose(corners[:, 0, 1], [-0.1, 0.5, 1.1])
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("failed", [(), (1, 4)])
 def test_failed_points_of_a_landscape_are_crosses(failed: tuple[int, ...]) -> None:

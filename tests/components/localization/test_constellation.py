@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
+from vtbdrake.components.localization.pair_votes import LocalPairs
 from vtbdrake.components.localization.planar import inverse, transform, wrap
 from vtbdrake_diagrams.forest.studies.trials import Case, run
 from vtbdrake_diagrams.forest.world.stand import ACCURATE, POOR, Stand
@@ -57,6 +58,19 @@ def log_likelihoods(poses, local, places, variance, *, share):
         normal = np.exp(-0.5 * square / variance) / (2.0 * pi * variance)
         total += np.log(1.0 - share + share * (normal / density).sum(axis=1))
     return total
+
+
+def test_deviations_of_pairs_are_those_of_drawn_distances():
+    """Map errors that are correlated over 5 m displace two landmarks 4 m apart in nearly the same way."""
+    places, variances, variance, length = np.array([[0.0, 0.0], [4.0, 0.0]]), np.array([0.01, 0.02]), 0.09, 5.0
+    diameters = {"diameters": np.full(2, 0.2), "diameter_variances": np.full(2, np.inf)}
+    for correlation in (0.0, length):
+        pairs = LocalPairs.of(places, variances, map_variance=variance, correlation=correlation, **diameters)
+        rho = np.exp(-0.5 * (4.0 / correlation) ** 2) if correlation else 0.0
+        rng = np.random.default_rng(0)
+        here = np.sqrt(variances) * rng.normal(size=(200_000, 2))
+        mapped = rng.multivariate_normal([0.0, 0.0], variance * np.array([[1.0, rho], [rho, 1.0]]), 200_000)
+        np.testing.assert_allclose(pairs.deviations, np.std(np.diff(here - mapped)), rtol=0.01)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -150,6 +150,8 @@ def test_the_lean_aside_displaces_no_far_trunk():
     assert sorted(truth) == [0, 1, 2, 3]
     across = np.sum((trunks.positions[which] - places[truth]) * left[truth], axis=1)
     assert np.abs(across).max() < 0.005
+    # Their rows lie beside each other, which makes them no thicker.
+    np.testing.assert_allclose(trunks.diameters[which], 0.25, atol=0.015)
 
 
 @pytest.mark.parametrize(("bushes", "recall", "precision"), [(0, 0.95, 0.99), (100, 0.93, 0.97)])

@@ -281,6 +281,12 @@ def test_impossible_board_is_rejected(ids: list[int], size: float, message: str)
         MarkerBoard(np.array(ids), np.zeros((2, 3, 4)), size)
 
 
+@pytest.mark.parametrize(("ids", "shape"), [([[1, 2]], (1, 3, 4)), ([], (0, 3, 4)), ([1, 2], (1, 3, 4))])
+def test_board_whose_arrays_do_not_fit_is_rejected(ids: list[int], shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"has ids \(n,\) and poses \(n, 3, 4\), not"):
+        MarkerBoard(np.array(ids), np.zeros(shape), 0.1)
+
+
 def test_impossible_detector_is_rejected() -> None:
     with pytest.raises(ValueError, match="refinement must be one of lines, subpixel, none, not 'apriltag'"):
         MarkerDetectorConfig(refinement="apriltag")
