@@ -192,7 +192,8 @@ def split_tosses(tosses: Sequence[Log]) -> tuple[list[Log], list[Log]]:
 @click.option("--model", "names", multiple=True, help="A contact model; by default, all.")
 @click.option("--figure", type=click.Path(dir_okay=False, path_type=Path), help="Save a figure of the errors.")
 @click.option("--starts", type=click.IntRange(1), default=1, help="Starts of a toss within the scatter of the first.")
-def main(folder: Path, names: tuple[str, ...], figure: Path | None, starts: int) -> None:
+@click.option("--as-is", is_flag=True, help="Calibrate nothing, which takes minutes for each model.")
+def main(folder: Path, names: tuple[str, ...], figure: Path | None, starts: int, as_is: bool) -> None:
     """Calibrate the contact models with some tosses in FOLDER, and predict the others."""
     fitted, rest = split_tosses(recordings(folder))
     print(f"{len(rest)} tosses that no calibration has seen; medians with intervals of 95 % over them, means behind\n")
@@ -202,8 +203,11 @@ def main(folder: Path, names: tuple[str, ...], figure: Path | None, starts: int)
     for name, (scenario, restitution) in contact_models().items():
         if names and name not in names:
             continue
-        results[name] = calibrated(fitted, scenario, restitution, starts=starts)
-        for label, each in ((f"{name}, friction 0.18", scenario), (f"{name}, calibrated", results[name].scenario)):
+        scenarios: dict[str, Scenario] = {f"{name}, friction 0.18": scenario}
+        if not as_is:
+            results[name] = calibrated(fitted, scenario, restitution, starts=starts)
+            scenarios[f"{name}, calibrated"] = results[name].scenario
+        for label, each in scenarios.items():
             curves[label] = errors(rest, each)
             print(f"{label:32}" + "".join(_cells(curves[label])), flush=True)
     for name, result in results.items():
@@ -225,10 +229,11 @@ def plot(curves: Mapping[str, Array]) -> Figure:
     """Return a figure of the shares of tosses with at most some position error, by label."""
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = figure.subplots()
-    for k, (label, rows) in enumerate(curves.items()):
+    models = list(dict.fromkeys(label.partition(",")[0] for label in curves))
+    for label, rows in curves.items():
         values = np.sort(rows[:, 0])
-        style = ":" if k % 2 == 0 else "-"  # As it was, and calibrated.
-        axes.plot(values, np.arange(1, len(values) + 1) / len(values), style, color=f"C{k // 2}", label=label)
+        style, color = "-" if label.endswith("calibrated") else ":", f"C{models.index(label.partition(',')[0])}"
+        axes.plot(values, np.arange(1, len(values) + 1) / len(values), style, color=color, label=label)
     axes.set(xlabel="mean position error / % of the edge", ylabel="share of tosses", xlim=(0.0, 80.0), ylim=(0.0, 1.0))
     axes.legend(fontsize="x-small")
     return figure
