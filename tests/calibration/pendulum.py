@@ -71,6 +71,7 @@ def recorded(
     noise: float = 2e-4,
     disturbance: float = 0.0,
     scenario: PendulumScenario | None = None,
+    noise_seed: int | None = None,
 ) -> Log:
     """Return noisy positions of the true pendulum, and the torques without the disturbance."""
     generator = np.random.default_rng(seed)
@@ -92,5 +93,7 @@ def recorded(
     for time in times:
         simulator.AdvanceTo(time)
         positions.append(float(testbed.read(context, f"{ARM}.pivot.position")))
+    if noise_seed is not None:
+        generator = np.random.default_rng(noise_seed)
     measured = np.array(positions) + noise * generator.normal(size=times.size)
     return read_table({"time": times, "q": measured, "u": torque}, sense={"position": "q"}, act={"torque": "u"})

@@ -21,6 +21,7 @@ from vtbdrake.calibration.posterior import PHYSICAL, body_function
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log
 from vtbdrake.recording.table_reader import GAP
+from vtbdrake.state import VariableError
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.pedigree import Number, Posterior
 
@@ -85,7 +86,7 @@ class Calibration:
         segments: Number of segments of the fit.
         sources: The recordings.
         remarks: What the checks of the recordings have noticed, as sentences.
-        information: What the recordings could tell, before the fit.
+        information: What the recordings tell about the parameters, as far as the model holds.
     """
 
     scenario: Scenario
@@ -199,15 +200,17 @@ def information(
     measured_torque: bool = False,
     period: float | None = None,
     segment: float = 1.0,
+    noise: Noise | None = None,
 ) -> Information:
-    """Return what recordings, measured or simulated, can tell about parameters; nothing is fitted but a start.
+    """Return what recordings, measured or simulated, can tell about parameters.
 
-    It is computed with the noise and at the parameters with which `calibrate` begins. For the arguments see there.
+    It is computed with the likeliest noise, or that which is given, and at parameters that are fitted in a first round.
+    For the arguments see `calibrate`.
 
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
-    return _Prepared(
+    prepared = _Prepared(
         scenario,
         logs,
         parameters,
@@ -217,7 +220,14 @@ def information(
         measured_torque=measured_torque,
         period=period,
         segment=segment,
-    ).information
+        noise=noise,
+    )
+    z, segments = prepared.z, prepared.segments
+    if noise is None:
+        # Until here, it holds the errors of the start, too.
+        z = _gauss_newton(segments, prepared.noise, z, np.ones(segments.count, bool))
+        noise = segments.likeliest_noise(z, prepared.noise)
+    return prepared.information(noise, z)
 
 
 class _Prepared:
@@ -245,7 +255,8 @@ class _Prepared:
         for name, value in (("period", period), ("segment", segment)):
             if value is not None and not 0.0 < value < inf:
                 raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
-        self.model = model = JointModel(scenario.build(), parameters, inertias, measured_torque=measured_torque)
+        self.testbed = scenario.build()
+        self.model = model = JointModel(self.testbed, parameters, inertias, measured_torque=measured_torque)
         self.logs = {log.source: log.digest for log in logs}
         whole = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
         longest = _LONGEST if model.step_size > 0.0 else GAP
@@ -264,10 +275,14 @@ class _Prepared:
         try:
             guess = Noise.guess(recordings, fit.unexplained)
             self.noise = noise or self.segments.likeliest_noise(self.z, guess)
-            slopes = self.segments.innovations(self.noise, self.segments.linearized(self.z)).slopes
+            self._first = self.information(self.noise, self.z)
         except CalibrationError as error:
             raise CalibrationError(". ".join([str(error), *self.doubts])) from error
-        self.information = information_of(slopes.reshape(-1, len(self.z)), model.names, model.scales)
+
+    def information(self, noise: Noise, z: Array) -> Information:
+        """Return what the recordings tell with this noise, at these parameters."""
+        slopes = self.segments.innovations(noise, self.segments.linearized(z)).slopes
+        return information_of(slopes.reshape(-1, len(z)), self.model.names, self.model.scales)
 
     def fitted(self, scenario: Scenario, holdout: float) -> Calibration:
         """Return the result of the fit.
@@ -276,7 +291,7 @@ class _Prepared:
             CalibrationError: A parameter changes nothing.
         """
         scalars = set(self.model.names[: self.model.scalars])
-        if nothing := [name for name in self.information.nothing if name in scalars]:
+        if nothing := [name for name in self._first.nothing if name in scalars]:
             raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
         held_back = _kept_back(self.segments.count, holdout)
         z, noise = self.z, self.noise
@@ -334,6 +349,13 @@ def _result(
         reasons.append("the start explains the segments that were kept back as well: nothing speaks for other values")
     covariance = sandwich * np.outer(model.scales, model.scales)
     results = _reported(model, z, sandwich, info, bounds, verdict)
+    values = {address: each.value for address, each in results.items()}
+    try:
+        prepared.testbed.write(prepared.testbed.default_context(), values)
+    except VariableError as error:
+        reasons.append(f"no testbed takes the estimates: {error}")
+        verdict = Verdict.DISCREPANT
+        results = _reported(model, z, sandwich, info, bounds, verdict)
     n = model.scalars
     posterior = Posterior(
         addresses=model.names[:n],
@@ -353,7 +375,7 @@ def _result(
         correlation=correlation,
         reasons=tuple(reasons),
         remarks=prepared.remarks,
-        information=prepared.information,
+        information=info,
         segments=int(used.sum()),
         sources=tuple(prepared.logs),
     )

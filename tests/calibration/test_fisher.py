@@ -1,0 +1,118 @@
+"""Information and intervals against SciPy's on a linear case, against finite differences, and against profiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.signal
+
+from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
+from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, TRUTH, VISCOUS, calibrated
+from vtbdrake.calibration import JointModel, JointRecording, Noise, calibrate, information
+from vtbdrake.calibration.calibration import Verdict
+from vtbdrake.calibration.filtering import Segments
+from vtbdrake.calibration.fisher import information_of
+from vtbdrake.optimization import Parameter
+
+pytestmark = pytest.mark.one_python
+
+NOISE = Noise(np.array([2e-4]), np.array([1e-6]), 0.05)
+RANGES = [Parameter(MOMENT, 0.02, 0.2), Parameter(VISCOUS, 0.0, 0.5)]
+
+
+def test_intervals_are_those_of_scipy_where_the_model_is_linear() -> None:
+    """A balanced wheel: I a = u - b v, with torque and friction held for a period, as the drives do.
+
+    Only positions are noisy, and the whole recording is one segment, so that the filter is a least-squares fit of
+    positions whose begin is free.
+    """
+    round_wheel = dict.fromkeys((f"{ARM}.link.inertia[0]", MOMENT, f"{ARM}.link.inertia[2]"), 0.08)
+    wheel = PendulumScenario().with_values({**round_wheel, FIRST: 0.0, VISCOUS: 0.05, COULOMB: 0.0})
+    log = recorded({}, 31, seconds=6.0, scenario=wheel)
+    start = wheel.with_values({MOMENT: 0.07, VISCOUS: 0.04})
+    options = {"position": "position", "torque": "torque", "segment": 6.0}
+    result = calibrate(start, log, RANGES, noise=NOISE, **options)
+    acting = np.concatenate([[0.0], log.act["torque"].values[:-1, 0]])  # read one period after it was given
+
+    def positions(times: np.ndarray, moment: float, viscous: float, q: float, v: float) -> np.ndarray:
+        decay = 1.0 - PERIOD * viscous / moment
+        speeds, _ = scipy.signal.lfilter([0.0, PERIOD / moment], [1.0, -decay], acting, zi=[v])
+        steps = PERIOD * speeds + 0.5 * PERIOD**2 * (acting - viscous * speeds) / moment
+        return q + np.concatenate([[0.0], np.cumsum(steps[:-1])])
+
+    fit, covariance = scipy.optimize.curve_fit(
+        positions,
+        log.sense["position"].times,
+        log.sense["position"].values[:, 0],
+        p0=[0.08, 0.05, 0.0, 0.0],
+        sigma=np.full(1500, 2e-4),
+        absolute_sigma=True,
+    )
+    deviations = np.sqrt(np.diag(covariance))
+    for k, parameter in enumerate(RANGES):
+        each = result.parameters[parameter.address]
+        assert each.value == pytest.approx(fit[k], abs=0.1 * deviations[k])
+        # By 30 blocks of the sandwich, and never less than without.
+        assert 0.99 < each.deviation / deviations[k] < 1.4
+    assert result.information is not None
+    np.testing.assert_allclose(result.information.together, deviations[:2], rtol=0.07)
+
+
+def test_information_is_that_of_finite_differences() -> None:
+    model = JointModel(PendulumScenario().build(), PARAMETERS)
+    recording = JointRecording.of(recorded(TRUTH, 6, seconds=2.0), model, position="position", torque="torque")
+    segments, noise = Segments(model, [recording], duration=0.5), Noise(np.array([2e-4]), np.array([0.1]), 0.05)
+    z = np.array([-0.35, 0.028, 0.19, 0.03])
+    linearized = segments.linearized(z)
+    slopes = segments.innovations(noise, linearized).slopes.reshape(-1, 4)
+    columns = []
+    for k, step in enumerate((1e-5, 1e-6, 1e-5, 1e-5)):
+        # The gain of the filter is that of z.
+        ends = [
+            segments.innovations(noise, linearized._replace(defects=segments.linearized(at).defects)).white
+            for at in (z + step * np.eye(4)[k], z - step * np.eye(4)[k])
+        ]
+        columns.append((ends[0] - ends[1]).ravel() / (2.0 * step) * model.scales[k])
+    J = np.stack(columns, axis=1)
+    information = information_of(slopes, model.names, model.scales)
+    np.testing.assert_allclose(information.H, J.T @ J, rtol=1e-4)
+    np.testing.assert_allclose(information.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
+
+
+def test_what_a_recording_will_tell_is_known_before_the_fit() -> None:
+    log = recorded(TRUTH, 1, seconds=4.0)
+    told = information(PendulumScenario(), log, PARAMETERS, position="position", torque="torque")
+    result = calibrated(recorded(TRUTH, 1, seconds=4.0, noise_seed=8))
+    deviations = [each.deviation for each in result.parameters.values()]
+    # A fifth of the segments is kept back, and the sandwich has few blocks.
+    assert np.all((deviations / told.together > 0.7) & (deviations / told.together < 1.7)), (deviations, told)
+    assert set(told.told) == set(result.parameters) and not told.combinations
+    assert np.all(told.alone <= told.together)
+
+
+def test_interval_at_a_bound_is_the_profile_of_the_likelihood() -> None:
+    # No viscous friction: the best value would be negative in half of all recordings.
+    truth = {**TRUTH, VISCOUS: 0.0}
+    for seed in range(40, 46):
+        log = recorded(truth, seed, seconds=4.0)
+        result = calibrated(log)
+        viscous = result.parameters[VISCOUS]
+        if viscous.verdict == Verdict.AT_BOUND:
+            break
+    assert viscous.value == viscous.lower == 0.0 < viscous.upper
+    assert not result.reasons  # The bound is right, and the others are accepted.
+    assert result.parameters[COULOMB].verdict == Verdict.ACCEPTED
+
+    def squares(value: float) -> float:
+        """Return the sum of squares of the fit with the parameter held there."""
+        held = PendulumScenario().with_values({VISCOUS: value})
+        rest = [each for each in PARAMETERS if each.address != VISCOUS]
+        fit = calibrate(held, log, rest, position="position", torque="torque", noise=result.noise)
+        assert fit.segments == result.segments
+        return fit.fit**2 * fit.segments * round(1.0 / PERIOD)
+
+    risen = squares(viscous.upper) - squares(0.0)
+    # 3.84, and more where the sandwich is wider than the information.
+    assert 3.5 < risen < 6.0
+    assert f"{DRIVES}.viscous" in VISCOUS
