@@ -274,6 +274,23 @@ def test_an_uncertain_parameter_of_the_world_varies_around_its_value_there(track
     assert runner.run({}, start=starts[heavy]).record[ARM_MASS][0] == masses[heavy]
 
 
+def test_samples_of_numbers_that_vary_together_are_worlds_in_their_order(tracked):
+    testbed, context, mental = tracked
+    com, inertia = (ARM_MASS.replace("mass", name) for name in ("center_of_mass", "inertia"))
+    samples = [
+        {ARM_MASS: m, f"{com}[2]": -0.5 / m, f"{inertia}[0]": 0.1 * m, f"{inertia}[1]": 0.1 * m} for m in (1.0, 2.0)
+    ]
+    to_start = BeliefToStart(mental, uncertainty=samples)
+    starts = to_start.starts(Belief.of(testbed, context), samples=3)
+    assert to_start.uncertain == tuple(sorted((ARM_MASS, com, inertia)))
+    runner = RolloutRunner(RolloutTask(TrackedScenario(), 0.1, record=[ARM_MASS, com, inertia]), mental)
+    for start, sample in zip(starts, [*samples, samples[0]], strict=True):
+        record = runner.run({}, start=start).record
+        assert record[ARM_MASS][0] == sample[ARM_MASS]
+        assert record[ARM_MASS][0] * record[com][0, 2] == pytest.approx(-0.5)
+        assert record[inertia][0, 1] == pytest.approx(sample[f"{inertia}[1]"])
+
+
 def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
     testbed, context, mental = tracked
     first, second = BeliefToStart(mental).starts(Belief.of(testbed, context), samples=2)
@@ -284,6 +301,8 @@ def test_a_certain_belief_has_the_same_start_for_all_samples(tracked):
     ("uncertainty", "why"),
     [
         (0.1, "uncertainty is given by address"),
+        ([{"sim.sys.Pendulum.theta.positon": 0.1}], "a sample of the belief does not fit .*did you mean"),
+        ([0.1], "or as samples"),
         ({"dps.rate": 0.1}, "unlike dps.rate"),
         ({THETA: -1.0}, "is a standard deviation"),
         ({THETA: [0.1, 0.2]}, "of shape"),

@@ -29,7 +29,9 @@ _log = logging.getLogger(__name__)
 
 # Innovations are called coloured, or a hold-out worse, beyond these; tests of significance reject any real model.
 COLOURED, WORSE = 0.2, 1.3
-_ITERATIONS, _NOISE_ROUNDS, _CONVERGED = 25, 2, 1e-3
+_ITERATIONS, _CONVERGED = 25, 1e-3
+# The noise is fitted again, at the new parameters, until its logarithms change by less; so many rounds at most.
+_NOISE_CHANGE, _NOISE_ROUNDS = 0.1, 4
 _BLOCK = 0.2  # s, of the sandwich estimator
 # A discrete plant steps by its own step, so that a position that is missing is a gap.
 _LONGEST = 1.5
@@ -295,9 +297,12 @@ class _Prepared:
             raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
         held_back = _kept_back(self.segments.count, holdout)
         z, noise = self.z, self.noise
-        for k in range(self._rounds):
-            noise = self.segments.likeliest_noise(z, noise) if k else noise
+        for _ in range(self._rounds - 1):
             z = _gauss_newton(self.segments, noise, z, ~held_back)
+            noise, before = self.segments.likeliest_noise(z, noise), noise
+            if noise.change(before) < _NOISE_CHANGE:
+                break
+        z = _gauss_newton(self.segments, noise, z, ~held_back)
         return _result(scenario, self, noise, z, held_back)
 
 

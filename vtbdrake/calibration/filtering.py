@@ -138,6 +138,11 @@ class Noise:
         measurement = np.sqrt(np.mean(differences**2, axis=0) / 70.0)
         return cls(np.maximum(measurement, _LEAST), np.maximum(np.std(unexplained, axis=0), 1e-6), 0.05)
 
+    def change(self, before: Noise) -> float:
+        """Return the largest change of the logarithm of a deviation."""
+        deviations = [np.concatenate([noise.measurement, noise.torque]) for noise in (self, before)]
+        return float(np.max(abs(np.log(deviations[0] / deviations[1]))))
+
 
 class Linearization(NamedTuple):
     """The model along the trajectory of W segments of N steps.

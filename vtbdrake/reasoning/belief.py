@@ -108,6 +108,8 @@ class Belief:
 # How an estimate is uncertain: a standard deviation (scalar or of the variable's shape), a covariance matrix, or a
 # function that draws: (believed value, random generator) -> value.
 Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
+# By address; or samples of variables that vary together, such as those of `Scenario.samples`.
+Uncertainties = Mapping[str, Uncertainty] | Sequence[Mapping[str, ArrayLike]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +119,8 @@ class BeliefConfig:
     Attributes:
         samples: Number of samples of an uncertain belief from which each candidate is simulated, at least 2; 1 if the
             belief is certain.
-        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world; see `BeliefToStart`.
+        uncertainty: Uncertainty of the belief, by address of a variable of the simulated world, or samples; see
+            `BeliefToStart`.
         max_age: The largest age of a belief, in seconds.
         risk: How the qualities under several samples become one: ``worst``, ``mean``, `Quantile` or `CVaR`.
 
@@ -126,7 +129,7 @@ class BeliefConfig:
     """
 
     samples: int = 1
-    uncertainty: Mapping[str, Uncertainty] | None = None
+    uncertainty: Uncertainties | None = None
     max_age: float = inf
     risk: str | Risk = "worst"
 
@@ -158,11 +161,15 @@ class BeliefToStart:
     A rule with a ``period`` extrapolates its estimates to the present. Variables set by other rules are late, by the
     age of the estimates and by up to a sample period.
 
+    Attributes:
+        uncertain: The addresses of the variables that are drawn.
+
     Args:
         mental: The testbed of the rollouts.
         uncertainty: Uncertainty of the belief, by address of a variable of the simulated world: a standard deviation, a
             covariance matrix, or a function (believed value, random generator) -> value. For a variable without a
-            rule, the believed value is that of the mental scenario.
+            rule, the believed value is that of the mental scenario. Or samples (address -> value) of variables that
+            vary together, as `Scenario.samples` draws them: world n takes sample n, and begins again after the last.
         seed: With the number of a sample, determines its random numbers, in the same way for every belief.
         max_age: The largest age of a belief in seconds.
 
@@ -174,15 +181,17 @@ class BeliefToStart:
         self,
         mental: VirtualTestbed,
         *,
-        uncertainty: Mapping[str, Uncertainty] | None = None,
+        uncertainty: Uncertainties | None = None,
         seed: int = 0,
         max_age: float = inf,
     ) -> None:
         if not max_age > 0.0:
             raise ValueError(f"the largest age of a belief is a positive time, not {max_age} s")
-        if not isinstance(uncertainty, Mapping | None):
+        is_samples = isinstance(uncertainty, Sequence) and all(isinstance(each, Mapping) for each in uncertainty)
+        if not isinstance(uncertainty, Mapping | None) and not is_samples:
             raise BeliefError(
-                f"uncertainty is given by address, {{address: standard deviation}}, not as {uncertainty!r}"
+                f"uncertainty is given by address, {{address: standard deviation}}, or as samples {{address: value}}, "
+                f"not as {uncertainty!r}"
             )
         self._mental = mental
         self._max_age = max_age
@@ -191,11 +200,15 @@ class BeliefToStart:
         self._context = mental.default_context()
         self._default = mental.start_layout.take(self._context)
         self._dps = mental.dps_layout.indices_in(mental.start_layout)
+        self._samples = [self._whole(sample) for sample in uncertainty] if isinstance(uncertainty, Sequence) else []
+        spreads = uncertainty if isinstance(uncertainty, Mapping) else {}
+        uncertain = {*spreads, *(address for sample in self._samples for address in sample)}
+        self.uncertain = tuple(sorted(uncertain))
         vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
         self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and can_resume(s)}
         self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and can_resume(s)}
         self._targets = [_Target(mental, rule) for rule in mental.belief_rules]
-        self._copied = _Copied([t for t in self._targets if t.is_copy and t.rule.target not in (uncertainty or {})])
+        self._copied = _Copied([t for t in self._targets if t.is_copy and t.rule.target not in uncertain])
         self._computed = [target for target in self._targets if target not in self._copied.targets]
         self._estimates = {
             address: (variable, mental.dps_layout.slice_of(variable))
@@ -203,11 +216,21 @@ class BeliefToStart:
             for address in target.rule.of
             for variable in [self._variables[address]]
         }
-        self._draws = {address: self._draw(address, how) for address, how in (uncertainty or {}).items()}
+        self._draws = {address: self._draw(address, how) for address, how in spreads.items()}
         # The believed values of uncertain variables without a rule.
-        self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in self._draws}
+        self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in uncertain}
         set_by = [*self._prior, *(target.rule.target for target in self._targets)]
         self._kinds = {a: (v.kind, mental.start_layout.slice_of(v)) for a in set_by for v in [self._variables[a]]}
+
+    def _whole(self, sample: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+        """Return a sample by the addresses of whole variables, in place of their entries."""
+        context = self._mental.default_context()
+        try:
+            self._variables.write(context, sample)
+            addresses = dict.fromkeys(address.partition("[")[0] for address in sample)
+            return {address: np.asarray(self._variables[address].get(context)) for address in addresses}
+        except ValueError as error:
+            raise BeliefError(f"a sample of the belief does not fit the mental world: {error}") from error
 
     def _draw(self, address: str, how: Uncertainty) -> Callable[[np.ndarray, np.random.Generator], ArrayLike]:
         variable = self._variables[address]
@@ -258,7 +281,7 @@ class BeliefToStart:
         Raises:
             BeliefError: As in `start`.
         """
-        if not self._draws or belief.world is not None:
+        if not (self._draws or self._samples) or belief.world is not None:
             return [self.start(belief, now=now)] * samples
         self._check_belief(belief, now)
         believed = self._believed(belief.dps)
@@ -266,6 +289,7 @@ class BeliefToStart:
         for n in range(samples):
             rng = np.random.default_rng([self._seed, n])
             drawn = {a: self._drawn(a, draw(np.asarray(believed[a]), rng)) for a, draw in self._draws.items()}
+            drawn |= self._samples[n % len(self._samples)] if self._samples else {}
             starts.append(self._start(belief.dps, believed | drawn))
         return starts
 

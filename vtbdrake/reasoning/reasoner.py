@@ -155,7 +155,7 @@ class Reasoner:
         self.task = replace(self.problem.task, catch=True, pruning=search.pruning, record=features)
         testbed = self.problem.testbed
         self.belief_to_start = BeliefToStart(testbed, uncertainty=belief.uncertainty, seed=seed, max_age=belief.max_age)
-        self._unbelieved = UnbelievedReadings(testbed, uncertain=belief.uncertainty or ())
+        self._unbelieved = UnbelievedReadings(testbed, uncertain=self.belief_to_start.uncertain)
         # Reads values from a start.
         self._start_context = StartContext(testbed, testbed.default_context(), testbed.copier_from(testbed))
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
