@@ -177,7 +177,7 @@ def test_parameter_that_changes_nothing_is_refused_by_its_name() -> None:
     with pytest.raises(CalibrationError, match=r"change nothing in the recordings: sim.sys.pendulum.link.inertia\[0\]"):
         calibrated(pendulum_log(), [*PARAMETERS, idle])
     told = information(PendulumScenario(), pendulum_log(), [*PARAMETERS, idle], position="position", torque="torque")
-    assert told.nothing == (idle.address,) and set(told.told) == {each.address for each in PARAMETERS}
+    assert told.nothing == (idle.address,) and set(told.identifiable) == {each.address for each in PARAMETERS}
     assert np.isinf(told.together[-1]) and "changes nothing: sim.sys" in str(told)
 
 

@@ -206,8 +206,8 @@ def information(
 ) -> Information:
     """Return what recordings, measured or simulated, can tell about parameters.
 
-    It is computed with the likeliest noise, or that which is given, and at parameters that are fitted in a first round.
-    For the arguments see `calibrate`.
+    It is that of the likeliest noise, or of the noise that is given, at the parameters that fit all segments best:
+    deviations by the model alone, without verdicts. For the arguments see `calibrate`.
 
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
@@ -224,11 +224,7 @@ def information(
         segment=segment,
         noise=noise,
     )
-    z, segments = prepared.z, prepared.segments
-    if noise is None:
-        # Until here, it holds the errors of the start, too.
-        z = _gauss_newton(segments, prepared.noise, z, np.ones(segments.count, bool))
-        noise = segments.likeliest_noise(z, prepared.noise)
+    z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
     return prepared.information(noise, z)
 
 
@@ -281,6 +277,17 @@ class _Prepared:
         except CalibrationError as error:
             raise CalibrationError(". ".join([str(error), *self.doubts])) from error
 
+    def converged(self, used: NDArray[np.bool]) -> tuple[Array, Noise]:
+        """Return the parameters that fit the segments best, and the likeliest noise."""
+        z, noise = self.z, self.noise
+        for _ in range(self._rounds - 1):
+            # Until then, the noise holds the errors of the start, too.
+            z = _gauss_newton(self.segments, noise, z, used)
+            noise, before = self.segments.likeliest_noise(z, noise), noise
+            if noise.change(before) < _NOISE_CHANGE:
+                break
+        return _gauss_newton(self.segments, noise, z, used), noise
+
     def information(self, noise: Noise, z: Array) -> Information:
         """Return what the recordings tell with this noise, at these parameters."""
         slopes = self.segments.innovations(noise, self.segments.linearized(z)).slopes
@@ -296,13 +303,7 @@ class _Prepared:
         if nothing := [name for name in self._first.nothing if name in scalars]:
             raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
         held_back = _kept_back(self.segments.count, holdout)
-        z, noise = self.z, self.noise
-        for _ in range(self._rounds - 1):
-            z = _gauss_newton(self.segments, noise, z, ~held_back)
-            noise, before = self.segments.likeliest_noise(z, noise), noise
-            if noise.change(before) < _NOISE_CHANGE:
-                break
-        z = _gauss_newton(self.segments, noise, z, ~held_back)
+        z, noise = self.converged(~held_back)
         return _result(scenario, self, noise, z, held_back)
 
 

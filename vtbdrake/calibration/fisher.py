@@ -91,7 +91,7 @@ class Information:
         return f"not determined: {' '.join(terms)} (in scaled parameters; deviation {left:.2g} of the range)"
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def identifiable(self) -> tuple[str, ...]:
         """Return the parameters that the recordings tell apart from all others."""
         return tuple(name for name, deviation in zip(self.names, self.together, strict=True) if deviation < inf)
 

@@ -512,7 +512,7 @@ def _result(
         own_verdict = verdict
         if not 1e-3 < parameter.to_unit(value) < 1.0 - 1e-3:
             own_verdict = Verdict.AT_BOUND
-        if names[k] not in information.told:
+        if names[k] not in information.identifiable:
             own_verdict = Verdict.NOT_IDENTIFIABLE
         results[names[k]] = Calibrated(
             names[k], start[k], float(value), float(samples.std()), float(lower), float(upper), own_verdict
