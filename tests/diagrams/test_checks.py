@@ -1,5 +1,7 @@
 """Every scenario of the library passes the checks that users' scenarios are put through."""
 
+import pytest
+
 from vtbdrake.testing import parametrize_with_checks
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
@@ -46,10 +48,20 @@ EXPECTED = {
 }
 
 
+# Scenarios of studies: variants of others, for which one Python is enough.
+VARIANTS = (ArmMotionScenario, LightingScenario, ApproachScenario, RouteScenario)
+
+
 @parametrize_with_checks(
-    [kind() for kind in SCENARIOS],
+    [kind() for kind in SCENARIOS if kind not in VARIANTS],
     values=lambda scenario: SCENARIOS[type(scenario)],
     expected_failed_checks=lambda scenario: EXPECTED.get(type(scenario), {}),
 )
 def test_scenario(scenario, check):
+    check(scenario)
+
+
+@pytest.mark.one_python
+@parametrize_with_checks([kind() for kind in VARIANTS], values=lambda scenario: SCENARIOS[type(scenario)])
+def test_variant(scenario, check):
     check(scenario)

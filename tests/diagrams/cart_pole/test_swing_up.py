@@ -77,6 +77,7 @@ def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
     assert np.abs(swing.states[:, 0]).max() < 3.0
 
 
+@pytest.mark.one_python
 def test_over_lcm_the_dps_decides_for_a_machine_process(tmp_path: Path) -> None:
     scenario = CartPoleScenario(onboard=True, rollouts=8)
     swing = swing_up_on_machine(scenario, seconds=0.8, record=tmp_path / "swing.lcm")

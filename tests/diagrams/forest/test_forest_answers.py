@@ -19,6 +19,7 @@ from vtbdrake_diagrams.forest.studies.drives import (
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors, Stand
 
 
+@pytest.mark.one_python
 def test_unit_over_lcm_finds_the_simulated_pose() -> None:
     found = over_lcm(ForestScenario(seed=1, length=50.0, width=50.0, start=12.0), cycles=40)
     assert found.agrees

@@ -50,6 +50,7 @@ def result(campaign: Campaign) -> CampaignResult:
     return campaign.run(executor="serial", progress=False)
 
 
+@pytest.mark.one_python
 def test_campaign_judges_the_true_motion(campaign: Campaign, result: CampaignResult) -> None:
     """Criteria equal what the plant's own kinematics and two samples in a row say."""
     assert result.is_met and result.passed == 1
