@@ -31,7 +31,12 @@ LARGEST_TOOL = 15.0
 
 
 def make_dps(
-    law: str = "cartesian_impedance", *, period: float = 0.001, arm: Arm | None = None, compile: bool = True
+    law: str = "cartesian_impedance",
+    *,
+    period: float = 0.001,
+    arm: Arm | None = None,
+    compile: bool = True,
+    knows_tool: bool = False,
 ) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
 
@@ -48,6 +53,8 @@ def make_dps(
         arm: The arm that the controller assumes.
         compile: Compile the arithmetic if there is a C compiler, which is needed at the first use only; the results are
             the same, bit for bit.
+        knows_tool: Add ``tool``, whose parameters ``mass`` (kg) and ``center`` (3, m) are what the DPS knows about the
+            tool. Mental rollouts and predictions use them; the control law and ``env`` do not.
 
     Raises:
         ValueError: There is no such law.
@@ -69,6 +76,12 @@ def make_dps(
     builder.Connect(perceived, impl.GetInputPort("perceived"))
     builder.Connect(impl.GetOutputPort(_STATE), act.GetInputPort("controlled"))
     builder.ExportOutput(act.get_output_port(), "joint_torque")
+    if knows_tool:
+        tool = NamedVector(
+            mass=Quantity(model.arm.tool_mass, "kg"), center=Quantity(model.arm.tool_inertia().get_com(), "m")
+        )
+        source = builder.AddNamedSystem("tool", ConstantVectorSource(tool.array()))
+        source.variables = tuple(tool.elements(PARAMETER, 0))
     dps = builder.Build()
     dps.set_name("dps")
     return dps

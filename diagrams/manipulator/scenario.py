@@ -41,6 +41,9 @@ from vtbdrake_diagrams.manipulator.safety import CONTINUITY, JUMP_TOLERANCE, arm
 LARGEST_DELAY = 50
 """The largest latency of commands to the drives, in periods."""
 
+KNOWN_TOOL = {"sim.sys.arm.tool.mass": "dps.tool.mass", "sim.sys.arm.tool.center_of_mass": "dps.tool.center"}
+"""What the DPS knows about its tool, by the variable of the simulated world."""
+
 
 def _plant() -> MultibodyPlantConfig:
     # Unsampled: reaction forces follow from the state, so that copies of it continue with the same readings.
@@ -57,6 +60,9 @@ class ManipulatorScenario(Scenario):
     period: float = setting(0.001, "The sample period of sensors, DPS and drives.", unit="s", gt=0.0)
     compile: bool = setting(
         True, "Whether to compile the arithmetic of the DPS if there is a C compiler; the results are the same."
+    )
+    knows_tool: bool = setting(
+        False, "Whether mass and centre of the tool in mental rollouts and predictions are those of dps.tool."
     )
     wall: bool = setting(False, "Whether there is a wall; False is free space.")
     wall_distance: float = setting(
@@ -160,7 +166,7 @@ class ManipulatorScenario(Scenario):
         return replace(self, **{name: getattr(self, name).without_chance() for name in names})
 
     def make_dps(self) -> Diagram:
-        return make_dps(self.law, period=self.period, compile=self.compile)
+        return make_dps(self.law, period=self.period, compile=self.compile, knows_tool=self.knows_tool)
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the robot runs without a plant.
@@ -209,6 +215,10 @@ class ManipulatorScenario(Scenario):
         builder.connect(plant.get_state_output_port(), drives.GetInputPort("state"))
         builder.connect(drives.get_output_port(), plant.get_actuation_input_port(instance))
         builder.sim_actuator("joint_torque", drives.GetInputPort("command"))
+
+        if self.knows_tool:
+            for variable, address in KNOWN_TOOL.items():
+                builder.believe(variable, of=[address])
 
         push = builder.add("env", "push", Push(plant, "tip"))
         builder.connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())

@@ -9,6 +9,8 @@ from vtbdrake.calibration.fisher import Information as Information
 from vtbdrake.calibration.model import CalibrationError as CalibrationError
 from vtbdrake.calibration.model import Inertia as Inertia
 from vtbdrake.calibration.model import JointModel as JointModel
+from vtbdrake.calibration.refit import ModelRefit as ModelRefit
+from vtbdrake.calibration.refit import Refit as Refit
 from vtbdrake.calibration.regression import Drive as Drive
 from vtbdrake.calibration.regression import Equations as Equations
 from vtbdrake.calibration.regression import Regression as Regression

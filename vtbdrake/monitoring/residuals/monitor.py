@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from math import inf, isnan, prod
+from math import ceil, inf, isnan, prod
 from typing import Self
 
 import numpy as np
@@ -76,6 +76,7 @@ class ResidualMonitor:
         worker: Whether a worker process computes. Otherwise the loop's process computes, and the loop waits: for tests,
             replays, and loops without a clock.
         memory: Number of windows, and of alarms, that are kept.
+        keep: Time in s for which the values of the samples are kept, too, for `samples`.
 
     Attributes:
         config: The configuration.
@@ -103,6 +104,7 @@ class ResidualMonitor:
         learn: bool = False,
         worker: bool = True,
         memory: int = 60_000,
+        keep: float = 0.0,
     ) -> None:
         target, interface, reported = runtime.target, runtime.target.interface, runtime.bridge.reported
         self.config = config = config or (
@@ -134,6 +136,8 @@ class ResidualMonitor:
             self._worker.post(self._rows)
         else:
             self._comparison = Comparison(predictor, self._rows, config, mode=mode)
+        self.keep = keep
+        self._recent: deque[Array] = deque(maxlen=ceil(keep / config.window))
         self._results = 0
         self._late = False
         self._is_warned = False
@@ -181,6 +185,7 @@ class ResidualMonitor:
 
     def _send_block(self) -> None:
         block = self._block[: self._filled]
+        self._recent.append(block)
         if self._comparison is not None:
             self._take_report(_checked(self._comparison, self._detector, block))
         elif self._worker is not None:
@@ -256,6 +261,31 @@ class ResidualMonitor:
         table |= {name: residuals[:, place] for name, place in self.places.items()}
         statistics = [window.statistic for window in windows if window.statistic is not None]
         return table | {"statistic": np.array(statistics)} if statistics else table
+
+    def samples(self, since: float) -> dict[str, tuple[Array, Array]]:
+        """Return the values of the samples that are kept, from a time of the DPS in s on.
+
+        Returns:
+            By signal, ``sense.<name>`` and ``act.<name>``, times (n,) by the machine's samples in s, the first of them
+            at ``since``, and values (n, size). Actuator commands are those that the machine reports, else those of the
+            DPS, at the times from which on they acted.
+        """
+        blocks = [block[block[:, TIME] >= since] for block in self._recent]
+        rows = np.concatenate([*blocks, self._rows.empty(0)])
+        config = self.config
+        begin = rows[0, INDEX] if len(rows) else 0.0
+        times = since + config.period * (rows[:, INDEX] - begin)
+        series = {f"sense.{name}": (times, rows[:, place]) for name, place in self._rows.sense.items()}
+        for name, place in self._rows.actuation.items():
+            if name in self._rows.reported:
+                series[f"act.{name}"] = times - config.period, rows[:, self._rows.reported[name]]
+            else:
+                series[f"act.{name}"] = times + config.delay * config.period, rows[:, place]
+        return {
+            name: (at[whole], values[whole])
+            for name, (at, values) in series.items()
+            for whole in [np.isfinite(values).all(axis=1)]
+        }
 
     def active(self) -> list[Alarm]:
         """Return the alarms that have not ended."""
