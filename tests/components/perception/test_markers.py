@@ -98,6 +98,33 @@ def test_refinement_decides_the_accuracy(world: Diagram, refinement: str, limit:
     assert limit / 5.0 < rms < limit
 
 
+def test_upscaling_finds_smaller_markers_and_each_once(world: Diagram) -> None:
+    """The markers are 8 pixels wide; what is found as it is stays as it was."""
+    plain, finer = 0, 0
+    for k in range(6):
+        X_CT = RigidTransform(RollPitchYaw(0.05 * k, -0.03 * k, 0.3 * k), [0.03 * k, -0.1, 5.7])
+        image = photograph(world, X_CT)
+        first = detect_markers(image, MarkerDetectorConfig(min_width=4.0))
+        found = detect_markers(image, MarkerDetectorConfig(min_width=4.0, upscaling=2))
+        assert len(found.ids) == len(set(found.ids))
+        np.testing.assert_array_equal(found.corners[: len(first.ids)], first.corners)
+        expected = project(board().corners[board().find(found.ids)].reshape(-1, 3), X_CT, INTRINSICS)
+        assert np.median(np.abs(found.corners.reshape(-1, 2) - expected)) < 0.5
+        plain, finer = plain + len(first.ids), finer + len(found.ids)
+    assert finer > 1.2 * plain > 0
+
+
+def test_smallest_width_counts_in_pixels_of_any_image(world: Diagram) -> None:
+    image = detect_markers(photograph(world, OBLIQUE)).corners
+    narrowest = np.linalg.norm(np.diff(image, axis=1), axis=2).min()
+    grey = photograph(world, OBLIQUE).data[:, :, 0]
+    wider = np.pad(grey, ((0, 300), (0, 700)), mode="edge")  # The same markers, in an image three times as wide.
+    for data in (grey, wider):
+        found = detect_markers(np.ascontiguousarray(data), MarkerDetectorConfig(min_width=0.8 * narrowest))
+        assert len(found.ids) == 4
+        assert not len(detect_markers(np.ascontiguousarray(data), MarkerDetectorConfig(min_width=2.0 * narrowest)).ids)
+
+
 def test_pose_from_an_image_is_within_its_covariance(world: Diagram) -> None:
     distances = []
     for turn in np.linspace(-0.4, 0.4, 8):
@@ -140,7 +167,7 @@ def test_errors_of_poses_are_as_large_as_their_covariances_say(photographed: tup
         collect(diagram).write(context, {"camera.seed": seed})
         Simulator(diagram, context).Initialize()
         image = camera.GetOutputPort("color_image").Eval(camera.GetMyContextFromRoot(context))
-        seen = detect_markers(image, MarkerDetectorConfig(min_perimeter=0.05)).on(board())
+        seen = detect_markers(image, MarkerDetectorConfig(min_width=4.0)).on(board())
         if len(seen.ids) < 3:
             continue
         expected = project(board().corners[board().find(seen.ids)].reshape(-1, 3), X_CT, INTRINSICS)

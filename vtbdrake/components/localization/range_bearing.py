@@ -11,7 +11,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.settings import check_settings, setting
 
 
-@dataclass(frozen=True)
+@dataclass
 class RangeBearingConfig:
     """The pose of the sensor in the level frame H, and the accuracy of its detector.
 

@@ -7,13 +7,13 @@ steered, and B stays level.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, tan
+from math import inf
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.localization.dead_reckoning import MOTION, POSE, history_size
-from vtbdrake.components.localization.planar import chord, compose
+from vtbdrake.components.localization.planar import Numbers, chord, compose
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
 
@@ -21,7 +21,7 @@ from vtbdrake.state import AddressedSystem, Quantity
 _LARGEST_SPEED, _LARGEST_ANGLE = 1e3, 1.4
 
 
-@dataclass(frozen=True)
+@dataclass
 class SteeringConfig:
     """The geometry of a car with steered front wheels, and the calibration of its sensors."""
 
@@ -37,7 +37,9 @@ class SteeringConfig:
         check_settings(self)
 
 
-def bicycle_motion(speed: float, angle: float, *, wheel_base: float, wheel_offset: float = 0.0) -> tuple[float, float]:
+def bicycle_motion(
+    speed: Numbers, angle: Numbers, *, wheel_base: float, wheel_offset: float = 0.0
+) -> tuple[Numbers, Numbers]:
     r"""Return the speed of the middle of the axle that is not steered (m/s), and the turn rate (rad/s).
 
     .. math:: v = \frac{v_m}{1 - d \tan(\alpha) / l}, \qquad \dot\theta = v \tan(\alpha) / l
@@ -46,12 +48,12 @@ def bicycle_motion(speed: float, angle: float, *, wheel_base: float, wheel_offse
     steered wheels.
 
     Args:
-        speed: The speed v_m in m/s, positive forwards.
+        speed: The speed v_m in m/s, positive forwards; one or an array.
         angle: The angle alpha in rad, positive to the left.
         wheel_base: The wheel base l in m.
         wheel_offset: The distance d in m.
     """
-    curvature = tan(angle) / wheel_base
+    curvature = np.tan(angle) / wheel_base
     v = speed / (1.0 - wheel_offset * curvature)
     return v, v * curvature
 

@@ -1,0 +1,118 @@
+"""A car that localizes itself in a park: simulated, and on recordings of a real one."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.real import recordings
+from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import compose, inverse, transform
+from vtbdrake.components.localization.unit import TRACKING
+from vtbdrake_diagrams.park import ParkScenario
+from vtbdrake_diagrams.park.reality import (
+    judged_by_positions,
+    laid_onto,
+    localized,
+    prepared,
+    reckoned,
+    victoria_park,
+)
+from vtbdrake_diagrams.park.scenario import PERIOD
+from vtbdrake_diagrams.park.survey import SurveyConfig, survey
+
+pytestmark = pytest.mark.one_python
+
+
+def test_simulated_car_finds_itself_and_says_how_well():
+    testbed = ParkScenario(seed=1).build()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    position = np.zeros(2)
+    squares = []
+    for k in range(1, 13):
+        simulator.AdvanceTo(k - PERIOD)
+        position = np.array(testbed.read(context, "sim.sys.car.position"))
+        simulator.AdvanceTo(k)
+        if k < 3:
+            continue
+        # What is shown holds for the last update of the DPS, one period ago.
+        assert testbed.read(context, "dps.env.pose.status") == TRACKING
+        error = testbed.read(context, "dps.env.pose.position") - position
+        C = np.reshape(testbed.read(context, "dps.env.pose.covariance"), (3, 3))[:2, :2]
+        squares.append(error @ np.linalg.solve(C, error))
+        claim = testbed.read(context, "sim.act.display.discrete_state_0")
+        np.testing.assert_allclose(claim[:2], position, atol=0.3)
+        assert claim[3] < 0.2
+    # 2 are expected of a clock like that of the real car; here, all scans are dated exactly.
+    assert np.mean(squares) < 3.0
+
+
+def test_survey_finds_trees_and_poses_from_positions_and_detections():
+    """A simulated drive of two rounds with drifting odometry and positions that err by half a metre."""
+    rng, n = np.random.default_rng(0), 240
+    places = rng.uniform(-35.0, 35.0, (60, 2))
+    angles = np.linspace(0.0, 4.0 * np.pi, n)
+    poses = np.column_stack([20.0 * np.cos(angles), 20.0 * np.sin(angles), angles + 0.5 * np.pi])
+    motions = [compose(inverse(a), b) for a, b in pairwise(poses)]
+    reckoned_poses = [np.zeros(3)]
+    for motion in motions:
+        drift = [0.02 * rng.normal(), 0.0, 0.004 + 0.004 * rng.normal()]
+        reckoned_poses.append(compose(reckoned_poses[-1], motion + np.array(drift)))
+    odometry = np.array(reckoned_poses)
+    odometry[:, 2] = np.unwrap(odometry[:, 2])
+    scans = []
+    for pose in poses:
+        seen = transform(inverse(pose), places)
+        rows = np.flatnonzero((np.hypot(*seen.T) < 25.0) & (seen[:, 0] > 0.0))
+        noise = 0.05 * rng.normal(size=(len(rows), 2))
+        C = np.tile(0.05**2 * np.eye(2), (len(rows), 1, 1))
+        scans.append(Landmarks(seen[rows] + noise, C, np.full(len(rows), 0.3), np.full(len(rows), 0.05)))
+    times = 0.5 * np.arange(n)
+    positions = np.column_stack([times, poses[:, :2] + 0.5 * rng.normal(size=(n, 2))])[1:]
+    result = survey(
+        times, odometry, scans, positions, drift=SteeringDriftModel(), config=SurveyConfig(memory=0.4, deviation=0.5)
+    )
+    gaps = np.linalg.norm(result.trees.positions[:, None] - places, axis=2)
+    assert len(result.trees) >= 50 and gaps.min(axis=1).max() < 0.3
+    error = result.trees.positions - places[gaps.argmin(axis=1)]
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.trees.covariances), error).mean()
+    assert 0.3 < nees < 5.0  # 2 are expected; the error of the whole map is one sample.
+    assert np.hypot(*(result.poses[:, :2] - poses[:, :2]).T).max() < 0.4
+    assert result.correlation > 20.0
+
+
+def test_points_are_laid_onto_others_by_a_rigid_motion():
+    X, points = np.array([3.0, -2.0, 2.5]), np.random.default_rng(0).normal(size=(20, 2))
+    np.testing.assert_allclose(laid_onto(points, transform(X, points)), X)
+
+
+def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path):
+    """The end of the drive is where it began. The whole: python -m vtbdrake_diagrams.park.reality."""
+    drive = victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
+    half = prepared(drive.between(0.0, 200.0))
+    end = drive.between(1477.0, 1500.0)
+    claims, report = localized(end, half.with_map(tmp_path), tmp_path / "drive.lcm")
+    assert report.identical
+    assert claims.has_pose.mean() > 0.8
+    judgement = judged_by_positions(claims, end.steady_positions, half.antenna, noise=half.noise)
+    assert judgement.rms < 2.5 and judgement.wrong == 0 and judgement.count > 20
+    nowhere, _ = localized(end, half.with_map(tmp_path, mirrored=True), tmp_path / "mirrored.lcm")
+    assert not nowhere.has_pose.any()
+
+
+def test_steering_and_wheels_alone_follow_the_real_path():
+    """The odometry in the second half, calibrated in the first: over 25 s it keeps to the positions within a metre."""
+    drive = victoria_park(recordings("victoria_park/inputs.dat")[0].parent)
+    car = replace(ParkScenario().car, steering_scale=1.0445, steering_offset=0.0044)
+    distances = []
+    for start in np.arange(775.0, 1500.0, 25.0):
+        rows = drive.positions[abs(drive.positions[:, 0] - start - 12.5) < 12.5]
+        if len(rows) < 30:
+            continue
+        poses = reckoned(drive.log.sense["odometry"], car, rows[:, 0])
+        path = transform(laid_onto(poses[:, :2], rows[:, 1:]), poses[:, :2])
+        distances.extend(np.hypot(*(path - rows[:, 1:]).T))
+    assert len(distances) > 1000 and np.median(distances) < 1.0
