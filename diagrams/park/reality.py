@@ -313,8 +313,8 @@ def shares(claims: Localized, drive: Drive, whole: Localized, mapped: Landmarks,
     tree, counts = cKDTree(mapped.positions), []
     poses = whole.poses[np.clip(np.searchsorted(whole.times, trees.times), 0, len(whole.times) - 1)]
     for pose, row in zip(poses, trees.values, strict=True):
-        seen = transform(pose, range_bearing_landmarks(row, scenario.detector).positions)
-        counts.append((tree.query(seen)[0] < _MATCHES).sum() if len(seen) else 0)
+        points = transform(pose, range_bearing_landmarks(row, scenario.detector).positions)
+        counts.append((tree.query(points)[0] < _MATCHES).sum() if len(points) else 0)
     at = claims.at(trees.times + _ANSWERED)
     return np.array([at.has_pose.mean(), at.confirmed.mean(), np.mean(np.array(counts) >= 3)])
 

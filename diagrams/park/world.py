@@ -176,8 +176,8 @@ class TreeDetector(AddressedSystem):
                 ),
             ]
         )
-        seen = np.flatnonzero(is_detected & (r > 1.0) & (r < config.largest_range) & (abs(bearing) < pi / 2.0))
-        nearest = rows[seen[np.argsort(r[seen])][: self._rows]]
+        visible = np.flatnonzero(is_detected & (r > 1.0) & (r < config.largest_range) & (abs(bearing) < pi / 2.0))
+        nearest = rows[visible[np.argsort(r[visible])][: self._rows]]
         reading: Array = np.zeros(3 * self._rows)
         reading[: nearest.size] = nearest.ravel()
         state.set_value(reading)

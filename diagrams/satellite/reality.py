@@ -58,7 +58,7 @@ class Outcome:
 
     Attributes:
         errors: Root mean squares over the four corners of each tag of AprilTag 3 in pixels, (n,); NaN if it is missed.
-        further: The number of tags that AprilTag 3 has not found.
+        further: The number of tags that AprilTag 3 has not detections.
         false: The number of tags with another number.
     """
 
@@ -89,9 +89,9 @@ def photographs(folder: Path) -> list[Photograph]:
 
 def outcome(photograph: Photograph, detector: MarkerDetectorConfig) -> Outcome:
     """Return what a detector finds in a photograph; a tag is the same if the middle of one lies within the other."""
-    found = detect_markers(photograph.grey, detector)
+    detections = detect_markers(photograph.grey, detector)
     errors, further = np.full(len(photograph.corners), np.nan), 0
-    for corners in found.corners[found.ids == NUMBER]:
+    for corners in detections.corners[detections.ids == NUMBER]:
         gaps = np.linalg.norm(photograph.corners.mean(axis=1) - corners.mean(axis=0), axis=1)
         nearest = int(np.argmin(gaps))
         width = np.linalg.norm(np.diff(corners, axis=0), axis=1).max()
@@ -99,7 +99,7 @@ def outcome(photograph: Photograph, detector: MarkerDetectorConfig) -> Outcome:
             errors[nearest] = corner_error(corners, photograph.corners[nearest])
         else:
             further += 1
-    return Outcome(errors, further, int((found.ids != NUMBER).sum()))
+    return Outcome(errors, further, int((detections.ids != NUMBER).sum()))
 
 
 def corner_error(corners: Array, expected: Array) -> float:
