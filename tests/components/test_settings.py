@@ -52,7 +52,7 @@ INTERVALS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
             "ground_height": "(-inf, inf)",
             "roughness": "[0, inf)",
             "reference_height": "[0, inf)",
-            "least_diameter": "(0, 0.7)",  # the largest diameter
+            "least_diameter": "(0, 1)",  # the largest diameter
             "largest_diameter": "(0.04, inf)",  # the least diameter
             "upright_share": "[0, 1]",
             "typical_diameter": "(0, inf)",

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.components.localization.planar import rotations
+from vtbdrake.components.localization.planar import rotations, wrap
 from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
 from vtbdrake.settings import setting
 
@@ -44,9 +44,15 @@ _GATE = 4.0
 # The largest sine of the angle of incidence with which ranges are predicted.
 _GRAZING = 0.98
 # The gate of a range contains its noise and an error of the model with this standard deviation, as a share of r.
-_DEPTH = 0.2
-# A column of rays counts if it has at least this share of the hits of the fullest one: branches are hit in few rows.
-_PERSISTENCE = 0.35
+_DEPTH = 0.1
+# A column of rays shows a face if it has at least this share of the hits of the fullest one: branches are hit in few
+# rows. Where no trunk is found with the first share, as among many branches, the second one is tried.
+_PERSISTENCE = (0.35, 0.65)
+# The hits of a face in one column lie within this depth, and what the noise adds. Columns are at least so wide. In m.
+_FACE, _COLUMN = 0.15, 0.03
+# A trunk is opaque: of the rays towards it, within this share of its radius, that end on it, behind it or less than
+# this distance (m) in front of it, this share ends on it.
+_INNER, _SURROUNDINGS, _OPAQUE = 0.85, 0.5, 0.8
 # The more the error of an edge exceeds this number of standard deviations, the less it counts: it may be a branch.
 _DOUBT = 4.0
 # A negligible information in 1/m^2, which keeps matrices regular where no point is left.
@@ -73,9 +79,9 @@ class TrunkDetectorConfig(ScanDetectorConfig):
         1.3, "Height over the ground of the point of the axis that is the position of the landmark.", unit="m", ge=0.0
     )
     least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", gt=0.0)
-    largest_diameter: float = setting(0.7, "The largest diameter of a trunk.", unit="m", gt=0.0)
+    largest_diameter: float = setting(1.0, "The largest diameter of a trunk.", unit="m", gt=0.0)
     upright_share: float = setting(
-        0.5, "The least share of the rows of rays passing a place that a trunk there returns.", ge=0.0, le=1.0
+        0.6, "The least share of the rows of rays passing a place that a trunk there returns.", ge=0.0, le=1.0
     )
     typical_diameter: float = setting(0.2, "Mean of the prior of the diameters.", unit="m", gt=0.0)
     diameter_spread: float = setting(0.15, "Standard deviation of the prior of the diameters.", unit="m", gt=0.0)
@@ -126,34 +132,50 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_
         ValueError: The points have another shape, or are not finite.
     """
     scene = Scene.of(points_H, p_HoLo_H, detector)
-    clusters = _upright(scene, detector)
-    if not len(clusters.rows):
-        return Landmarks.empty()
-    return _Fit(clusters, detector).trunks(np.asarray(p_HoLo_H)[:2])
+    clusters, trunks = _upright(scene, detector), []
+    for persistence in _PERSISTENCE:
+        if not len(clusters.rows):
+            break
+        fit = _Fit(clusters, detector, persistence)
+        trunks.append(fit.trunks(np.asarray(p_HoLo_H)[:2]))
+        clusters = fit.rest
+    return Landmarks.joined(trunks)
 
 
 def _upright(scene: Scene, detector: TrunkDetectorConfig) -> Clusters:
     """Return the points that stand above each other in the slice."""
     low, high = detector.heights
     in_slice = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
-    heights, distances = scene.heights[in_slice], scene.distances[in_slice]
     cells = Cells.of(scene.points[in_slice], size=detector.cell, reach=detector.reach)
-    layer = (high - low) / _LAYERS
     filled = np.zeros((cells.side**2, _LAYERS), dtype=bool)
-    filled[cells.flat, np.minimum((heights - low) / layer, _LAYERS - 1).astype(np.intp)] = True
+    filled[cells.flat, _layers(scene.heights[in_slice], detector)] = True
     bits = np.packbits(filled.ravel()).reshape(cells.side, cells.side)
     # With the neighbours of each cell, along x and along y.
     bits[1:-1] = bits[1:-1] | bits[2:] | bits[:-2]
     bits[:, 1:-1] = bits[:, 1:-1] | bits[:, 2:] | bits[:, :-2]
     filled_layers = np.bitwise_count(bits.ravel()[cells.flat])
-    # The layers in which rays passed: no more than the field of view has rows there.
-    eye_heights = heights - scene.points[in_slice, 2]
-    top = np.minimum(eye_heights + distances * scene.slopes.max(initial=-inf), high)
-    bottom = np.maximum(eye_heights + distances * scene.slopes.min(initial=inf), low)
-    passed = (top - bottom) / np.maximum(detector.elevation_step * distances, layer)
+    passed = _passed(scene, in_slice, detector)
     upright = np.flatnonzero(filled_layers >= np.maximum(detector.upright_share * passed, 2.0))
     rows, owners = cells.connected(upright)
     return Clusters(scene, in_slice[rows], owners)
+
+
+def _layers(heights: Array, detector: TrunkDetectorConfig) -> Indices:
+    """Return the layers of the slice, from 0, in which points at these heights over the ground (n,) lie, (n,)."""
+    low, high = detector.heights
+    layers: Indices = np.clip((heights - low) * _LAYERS / (high - low), 0, _LAYERS - 1).astype(np.intp)
+    return layers
+
+
+def _passed(scene: Scene, rows: Indices, detector: TrunkDetectorConfig) -> Array:
+    """Return how many layers of the slice rays pass at these points, (n,): no more than the field of view has rows."""
+    low, high = detector.heights
+    heights, distances = scene.heights[rows], scene.distances[rows]
+    eye_heights = heights - scene.points[rows, 2]
+    top = np.minimum(eye_heights + distances * scene.slopes.max(initial=-inf), high)
+    bottom = np.maximum(eye_heights + distances * scene.slopes.min(initial=inf), low)
+    passed: Array = (top - bottom) / np.maximum(detector.elevation_step * distances, (high - low) / _LAYERS)
+    return passed
 
 
 class _Fit:
@@ -163,15 +185,16 @@ class _Fit:
     [x, y, r, l_x, l_y]: its axis at the reference height, its radius, its lean.
     """
 
-    def __init__(self, clusters: Clusters, detector: TrunkDetectorConfig) -> None:
+    def __init__(self, clusters: Clusters, detector: TrunkDetectorConfig, persistence: float) -> None:
         self._clusters, self._detector = clusters, detector
         # Heights over the reference height.
         self._heights = clusters.scene.heights[clusters.rows] - detector.reference_height
         self._variance = detector.range_noise**2 + detector.roughness**2
         self._cosines, self._sines = np.cos(clusters.azimuths), np.sin(clusters.azimuths)
         self._hidden = clusters.hidden_edges(detector, gap=detector.cell + _GATE * self._variance**0.5)
-        self._columns = self._persistent()
         self._radii = 0.4 * detector.least_diameter, 0.6 * detector.largest_diameter
+        self._columns, self._nearest = self._faces(persistence)
+        self._good = np.zeros(len(clusters.starts), dtype=bool)
 
     def trunks(self, origin: Array) -> Landmarks:
         """Return the cylinders that are trunks, if the scanner is at ``origin`` (2,)."""
@@ -184,40 +207,115 @@ class _Fit:
         count = np.maximum(clusters.sums(on.astype(float)), 1.0)
         misfit = clusters.sums(on * squares) / count
         diameters, covariances = 2.0 * cylinders[:, 2], self._covariances(cylinders, on)
-        good = (count >= 3) & (count >= 0.5 * clusters.counts) & (misfit < detector.largest_misfit)
+        good = (count >= 3) & self._are_upright(on) & self._are_opaque(cylinders) & (misfit < detector.largest_misfit)
         good &= (diameters >= detector.least_diameter) & (diameters <= detector.largest_diameter)
         # A fit to too few points locates the trunk no better than the cluster does.
-        good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (0.5 * detector.largest_diameter) ** 2
+        good &= np.trace(covariances[:, :2, :2], axis1=1, axis2=2) < (2.0 * detector.cell) ** 2
         good &= (np.abs(cylinders[:, 3:]) < 5.0 * detector.lean).all(axis=1)
+        self._good = good
         R = rotations(clusters.bearings[good])
         positions = origin + np.einsum("kij,kj->ki", R, cylinders[good, :2])
         P = R @ covariances[good, :2, :2] @ R.transpose(0, 2, 1) + detector.position_floor**2 * np.eye(2)
         deviations = np.hypot(2.0 * np.sqrt(covariances[good, 2, 2]), detector.diameter_floor)
         return Landmarks(positions, P, diameters[good], deviations)
 
+    @property
+    def rest(self) -> Clusters:
+        """The clusters that `trunks` found no trunk in."""
+        keep = ~self._good[self._clusters.owners]
+        owners = np.cumsum(~self._good) - 1
+        return Clusters(self._clusters.scene, self._clusters.rows[keep], owners[self._clusters.owners[keep]])
+
     def _start(self) -> tuple[Array, NDArray[np.bool_]]:
         """Return first cylinders (k, 5), and which points may be on them (n,)."""
-        clusters = self._clusters
-        ranked = clusters.distances[np.lexsort((clusters.distances, clusters.owners))]
-        middle = ranked[clusters.starts + clusters.counts // 2]
-        on = np.abs(clusters.distances - middle[clusters.owners]) < self._detector.largest_diameter
-        on &= self._columns
+        clusters, on = self._clusters, self._columns
+        count = np.maximum(clusters.sums(on.astype(float)), 1.0)
+        middle = clusters.sums(on * clusters.distances) / count
         zero = np.zeros_like(middle)
-        _, width, *_ = self._edges(zero, middle, on)
+        azimuth, width, *_ = self._edges(zero, middle, on)
         radius = np.clip(0.5 * middle * width, *self._radii)
-        return np.column_stack([middle + 0.8 * radius, zero, radius, zero, zero]), on
+        # Behind the face, only what may be on the cylinder.
+        depth = clusters.distances - self._nearest[clusters.owners]
+        on = on & (depth < (radius + _FACE)[clusters.owners])
+        return np.column_stack([self._nearest + radius, middle * azimuth, radius, zero, zero]), on
 
-    def _persistent(self) -> NDArray[np.bool_]:
-        """Return which points (n,) are in a column of rays, or next to one, that hits the cluster in enough rows."""
+    def _faces(self, persistence: float) -> tuple[NDArray[np.bool_], Array]:
+        """Find the most upright face in each cluster: neighbouring columns of rays that hit it in many rows.
+
+        Around a trunk there may be bushes, branches and other trunks. In a column of rays that hits a trunk, most rows
+        end at the same distance; in foliage, they end anywhere.
+
+        Returns:
+            Which points (n,) are in columns of the face, near it, and the distance of the face in m, (k,).
+        """
         clusters = self._clusters
+        k, depth = len(clusters.starts), _FACE + 3.0 * self._variance**0.5
         right = np.minimum.reduceat(clusters.azimuths, clusters.starts)
-        columns = ((clusters.azimuths - right[clusters.owners]) / self._detector.azimuth_step + 1.5).astype(np.intp)
-        width = int(columns.max()) + 2
-        places = clusters.owners * width + columns
-        hits = np.bincount(places, minlength=len(right) * width).reshape(-1, width)
-        enough = hits >= _PERSISTENCE * hits.max(axis=1, keepdims=True)
-        enough[:, 1:-1] = enough[:, 1:-1] | enough[:, 2:] | enough[:, :-2]
-        return enough.ravel()[places]
+        step = np.maximum(self._detector.azimuth_step, _COLUMN * clusters.counts / clusters.sums(clusters.distances))
+        column = ((clusters.azimuths - right[clusters.owners]) / step[clusters.owners] + 1.5).astype(np.intp)
+        width = int(column.max()) + 2
+        place = clusters.owners * width + column
+        # How many points of the same column are up to so much farther away than each point.
+        order = np.lexsort((clusters.distances, place))
+        keys = place[order] * (4.0 * self._detector.reach) + clusters.distances[order]
+        counts = np.searchsorted(keys, keys + depth, side="right") - np.arange(len(keys))
+        hits = np.zeros((k, width))
+        np.maximum.at(hits, (clusters.owners[order], column[order]), counts)
+        smooth = hits.copy()
+        smooth[:, 1:-1] += 0.5 * (hits[:, 2:] + hits[:, :-2])
+        peak = smooth.argmax(axis=1)
+        most = np.take_along_axis(hits, peak[:, None], axis=1)
+        owners = clusters.owners[order]
+        first = (column[order] == peak[owners]) & (counts == most[owners, 0])
+        nearest = np.full(k, inf)
+        np.minimum.at(nearest, owners[first], clusters.distances[order][first])
+        behind = clusters.distances - nearest[clusters.owners]
+        near = (behind > -depth) & (behind < 0.35 * self._detector.largest_diameter + depth)
+        enough = np.bincount(place[near], minlength=k * width).reshape(k, width) >= persistence * most
+        # Columns of a face are less than two cells apart: dark bark returns no rays.
+        at = np.flatnonzero(enough)
+        gap = np.maximum(2.0 * self._detector.cell / (step * nearest), 2.0)[at // width]
+        faces = np.zeros((k, width), dtype=np.intp)
+        faces.flat[at] = np.cumsum((np.diff(at, prepend=-1) > gap) | (np.diff(at // width, prepend=-1) > 0))
+        on = (faces == np.take_along_axis(faces, peak[:, None], axis=1)) & enough
+        on[:, 1:-1] = on[:, 1:-1] | on[:, 2:] | on[:, :-2]
+        return near & on.ravel()[place], nearest
+
+    def _are_opaque(self, cylinders: Array) -> NDArray[np.bool_]:
+        """Return whether rays towards the cylinders (k, 5) end on them, (k,): foliage lets some pass."""
+        scene, step = self._clusters.scene, self._detector.azimuth_step
+        low, high = self._detector.heights
+        rows = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
+        rows = rows[scene.azimuths[rows].argsort()]
+        azimuths = scene.azimuths[rows]
+        bearings = self._clusters.bearings
+        x, y, r, _, ly = cylinders.T
+        half = np.arcsin(np.minimum(r / x, 0.95)) + np.abs(ly) * (high - low) / x + step
+        middle = wrap(bearings + np.arctan2(y, x))
+        turns = 2.0 * np.pi * np.arange(-1.0, 2.0)[:, None]
+        begins = np.searchsorted(azimuths, (middle - half + turns).ravel())
+        ends = np.searchsorted(azimuths, (middle + half + turns).ravel())
+        lengths = ends - begins
+        owners = np.repeat(np.tile(np.arange(len(x)), 3), lengths)
+        at = rows[np.arange(lengths.sum()) + np.repeat(begins - np.cumsum(lengths) + lengths, lengths)]
+        azimuth, z = scene.azimuths[at] - bearings[owners], scene.heights[at] - self._detector.reference_height
+        x, y, r, lx, ly = cylinders[owners].T
+        x, y, c, s = x + lx * z, y + ly * z, np.cos(azimuth), np.sin(azimuth)
+        sine = (y * c - x * s) / r
+        errors = scene.distances[at] - (x * c + y * s - r * np.sqrt(np.maximum(1.0 - sine**2, 0.0)))
+        inner = (np.abs(sine) < _INNER) & (errors > -_SURROUNDINGS)
+        on = inner & (np.abs(errors) < _GATE * np.sqrt(self._variance + (_DEPTH * r) ** 2))
+        rays, hits = (np.bincount(owners[mask], minlength=len(cylinders)) for mask in (inner, on))
+        return hits > _OPAQUE * rays
+
+    def _are_upright(self, on: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return whether the points of the cylinders, a mask (n,), are in enough layers of the slice, (k,)."""
+        detector, clusters = self._detector, self._clusters
+        filled = np.zeros((len(clusters.starts), _LAYERS), dtype=bool)
+        layers = _layers(self._heights + detector.reference_height, detector)
+        filled[clusters.owners[on], layers[on]] = True
+        passed = _passed(clusters.scene, clusters.rows, detector)
+        return filled.sum(axis=1) >= detector.upright_share * clusters.sums(passed) / clusters.counts
 
     def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
         """Return which points are on the cylinders (n,), and their weighted squared errors (n,).

@@ -1,0 +1,293 @@
+"""Real forests: stems of real scans on real field maps, and the detector of trunks in real point clouds.
+
+``python -m vtbdrake_diagrams.forest.reality FOLDER`` prints the tables of docs/reality_forest.md. FOLDER holds the
+recordings that `vtbdrake_diagrams.forest.studies.recordings` describes, and point clouds of the R packages TreeLS and
+spanner (GPL-3), which need ``laspy[lazrs]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from vtbdrake.arrays import Array
+from vtbdrake.cli.output import table
+from vtbdrake.components.localization.constellation import ConstellationMap, Fix
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import rotation
+from vtbdrake.components.localization.trunks import TrunkDetectorConfig, detect_trunks
+from vtbdrake_diagrams.forest.studies.clouds import PARTIAL, Cloud, Scanner, rings, virtual_scan
+from vtbdrake_diagrams.forest.studies.recordings import read_r, rioja, stems
+
+# The displacement of neighbouring plots of La Rioja in their common frame: each plot's shift is a multiple of both.
+_STEPS = np.array([[18.976, -6.318], [6.318, 18.976]])
+_SAME = 0.02
+"""Entries of overlapping inventories that are nearer than this (m) are one tree."""
+
+CLOUDS = {"pine plantation": "treels/pine_plot.laz", "ponderosa, TLS": "spanner/TLS_Clip.laz"}
+"""Clouds with the range noise of a terrestrial scanner."""
+MOBILE = {"ponderosa, mobile": "spanner/MLS_Clip.laz"}
+"""Clouds that were scanned while walking, whose points scatter more."""
+_NOISE, _MOBILE_NOISE = 0.02, 0.03
+SCANNER = Scanner(rows=32, columns=1800, elevation=np.radians(40.0))
+_EYE = 2.0
+_BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
+# A detection is right within this distance (m) of a stem; nearer than the second one to any ring, it is of a stem.
+_RIGHT, _STEM = 0.25, 0.6
+
+
+def rioja_map(inventories: dict[str, Any], *, deviation: float = 0.3, diameter: float = 0.03) -> Landmarks:
+    """Return the trees of all plots of La Rioja once, in one frame: that of plot 1.
+
+    Overlapping plots repeat trees, to the millimetre: the shift of a plot is the multiple of the steps with which most
+    of its trees coincide with those that are placed already.
+    """
+    plots = {plot: stems(inventories, plot, deviation=deviation, diameter=diameter) for plot in range(1, 17)}
+    placed = plots.pop(1)
+    shifts = np.array([a * _STEPS[0] + b * _STEPS[1] for a in range(-8, 9) for b in range(-8, 9)])
+    while plots:
+        tree = cKDTree(placed.positions)
+        votes = {
+            plot: [int((tree.query(part.positions + shift)[0] < _SAME).sum()) for shift in shifts]
+            for plot, part in plots.items()
+        }
+        plot = max(votes, key=lambda each: max(votes[each]))
+        if max(votes[plot]) < 3:
+            raise ValueError(f"plots {sorted(plots)} of La Rioja share no three trees with the others")
+        moved = plots.pop(plot).seen_from([*shifts[int(np.argmax(votes[plot]))], 0.0])
+        placed = Landmarks.joined([placed, moved.select(tree.query(moved.positions)[0] >= _SAME)])
+    return placed
+
+
+def halves(landmarks: Landmarks) -> tuple[Landmarks, Landmarks]:
+    """Return two maps with every other landmark each, in the order of x: what they say of a pose is independent."""
+    order = landmarks.positions[:, 0].argsort()
+    return landmarks.select(order[::2]), landmarks.select(order[1::2])
+
+
+def petawawa(folder: Path) -> tuple[Landmarks, Landmarks]:
+    """Return the stems of mobile scanning and the field inventory of the plot PRF025, both around its centre."""
+    field = read_r(folder / "treematching_prf/PRF025_Field.rda")["PRF025_Field"]
+    scanned = read_r(folder / "treematching_prf/PRF025_Lidar.rda")["PRF025_Lidar"]
+    center = np.array([field["Easting"][0], field["Northing"][0]])
+    return (
+        _landmarks(np.column_stack([scanned["X"], scanned["Y"]]) - center, scanned["DBH"], deviation=0.1),
+        _landmarks(np.column_stack([field["Field_X"], field["Field_Y"]]), field["DBH"] / 100.0, deviation=0.3),
+    )
+
+
+def airborne(folder: Path) -> tuple[Landmarks, Landmarks]:
+    """Return 69 stems measured on the ground, and the map of treetops from the air, without diameters."""
+    ground = np.genfromtxt(folder / "treematcher/Ground_Positions.txt", names=True)
+    tops = np.genfromtxt(folder / "treematcher/Air_Positions.txt", names=True)
+    mapped = _landmarks(np.column_stack([tops["X"], tops["Y"]]), np.full(len(tops), 0.25), deviation=0.7)
+    local = _landmarks(np.column_stack([ground["X"], ground["Y"]]), ground["STEMDIAM"] / 100.0, deviation=0.2)
+    unknown = np.full(len(mapped), 0.2)
+    return local, Landmarks(mapped.positions, mapped.covariances, mapped.diameters, unknown)
+
+
+def _landmarks(places: Array, diameters: Array, *, deviation: float, diameter: float = 0.03) -> Landmarks:
+    n = len(places)
+    return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), diameters, np.full(n, diameter))
+
+
+def field_rows(folder: Path) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each scan on its field map: is it sure, and the difference between two halves of the map."""
+    scans, inventories = rioja(folder)
+    surveyed = rioja_map(inventories)
+    whole, parts = ConstellationMap(surveyed), [ConstellationMap(half) for half in halves(surveyed)]
+    for plot in range(1, 17):
+        local = stems(scans, plot, deviation=0.1, diameter=0.03)
+        yield _field_row(f"La Rioja {plot}", local, whole, parts)
+    local, inventory = petawawa(folder)
+    yield _field_row("Petawawa", local, ConstellationMap(inventory), [ConstellationMap(h) for h in halves(inventory)])
+    local, tops = airborne(folder)
+    yield _field_row("from the air", local, ConstellationMap(tops), [])
+
+
+def _field_row(name: str, local: Landmarks, whole: ConstellationMap, parts: list[ConstellationMap]) -> tuple[str, ...]:
+    fix = whole.locate(local)
+    fixes = [part.locate(local) for part in parts]
+    difference = ""
+    if fix.is_sure and fixes and all(each.is_sure for each in fixes):
+        distance, squared = disagreement(*fixes)
+        difference = f"{distance:.3f} m, NEES {squared:.1f}"
+    elif fixes:
+        difference = f"{sum(each.is_sure for each in fixes)} of 2 sure"
+    return (
+        name,
+        str(len(local)),
+        "sure" if fix.is_sure else "not sure",
+        str(len(fix.pairs)),
+        f"{fix.log_likelihood:.0f}",
+        f"{np.degrees(fix.pose[2]):.2f}" if fix.is_sure else "",
+        difference,
+    )
+
+
+def disagreement(first: Fix, second: Fix) -> tuple[float, float]:
+    """Return the distance (m) of two independent fixes, and their squared difference (x, y, heading) by covariance."""
+    delta = first.pose - second.pose
+    delta[2] = (delta[2] + np.pi) % (2.0 * np.pi) - np.pi
+    nees = delta @ np.linalg.solve(first.covariance + second.covariance, delta)
+    return float(np.hypot(*delta[:2])), float(nees)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """The detector in one virtual scan, against the rings of the cloud.
+
+    Attributes:
+        distances: Distances of the stems that the scan shows, (k,) in m.
+        right: Which of them are detected, (k,).
+        errors: Position error and error of the diameter of the detections that are right, (m, 2) in m.
+        beside: Distances of detections of a stem that are off by more than `_RIGHT`.
+        false: Distances of detections where the cloud shows no stem, not even one seen from one side.
+        trunks: The detections, in the frame of the cloud turned by nothing, around the scanner.
+        eye: The position of the scanner, (3,).
+    """
+
+    distances: Array
+    right: Array
+    errors: Array
+    beside: Array
+    false: Array
+    trunks: Landmarks
+    eye: Array
+
+
+def detections(cloud: Cloud, full: Array, partial: Array, *, noise: float, step: float) -> Iterator[Detection]:
+    """Yield the detector's results for scanners on a grid of places where there is room."""
+    low, high = cloud.points[:, :2].min(axis=0), cloud.points[:, :2].max(axis=0)
+    obstacles = cKDTree(cloud.points[(cloud.heights > 0.3) & (cloud.heights < 2.5), :2])
+    detector = TrunkDetectorConfig(
+        azimuth_step=2.0 * np.pi / SCANNER.columns,
+        elevation_step=SCANNER.elevation / SCANNER.rows,
+        range_noise=noise,
+    )
+    for x in np.arange(low[0] + 1.0, high[0] - 0.5, step):
+        for y in np.arange(low[1] + 1.0, high[1] - 0.5, step):
+            if obstacles.query([x, y])[0] < 0.6:
+                continue
+            eye = np.array([x, y, cloud.ground(np.array([x, y])) + _EYE])
+            points = virtual_scan(cloud, eye, SCANNER)
+            trunks = detect_trunks(points - eye + [0.0, 0.0, _EYE], detector, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
+            yield _judged(points, eye, trunks, full, partial)
+
+
+def _judged(points: Array, eye: Array, trunks: Landmarks, full: Array, partial: Array) -> Detection:
+    shown = np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
+    places = trunks.positions + eye[:2]
+    apart = np.linalg.norm(full[:, None, :2] - places[None], axis=2)
+    stem, detection = linear_sum_assignment(np.minimum(apart, 1.0))
+    near = apart[stem, detection] < _RIGHT
+    stem, detection = stem[near], detection[near]
+    right = np.zeros(len(full), dtype=bool)
+    right[stem] = True
+    rest = np.setdiff1d(np.arange(len(places)), detection)
+    nearest = cKDTree(np.vstack([full, partial])[:, :2]).query(places[rest])[0] if len(rest) else np.zeros(0)
+    away = np.linalg.norm(places[rest] - eye[:2], axis=1)
+    errors = np.column_stack([apart[stem, detection], trunks.diameters[detection] - full[stem, 2]])
+    distances = np.linalg.norm(full[:, :2] - eye[:2], axis=1)
+    return Detection(distances[shown], right[shown], errors, away[nearest < _STEM], away[nearest >= _STEM], trunks, eye)
+
+
+def _is_shown(points: Array, eye: Array, stem: Array) -> bool:
+    """Return whether a scan shows a stem from edge to edge, by at least ten points."""
+    arm = stem[:2] - eye[:2]
+    forward = arm / np.linalg.norm(arm)
+    delta, radius = points[:, :2] - stem[:2], 0.5 * stem[2]
+    heights = points[:, 2] - eye[2] + _EYE
+    on = (np.abs(np.linalg.norm(delta, axis=1) - radius) < 0.06) & (heights > 0.4) & (heights < 3.2)
+    on &= delta @ forward < 0.6 * radius
+    across = delta[on] @ np.array([-forward[1], forward[0]]) / radius
+    return bool(on.sum() >= 10 and (np.histogram(across, [-1.3, -0.6, -0.2, 0.2, 0.6, 1.3])[0] > 0).all())
+
+
+def cloud_row(name: str, results: list[Detection]) -> tuple[str, ...]:
+    """Return the row of the table of one cloud."""
+    distances, right = (np.concatenate([getattr(each, part) for each in results]) for part in ("distances", "right"))
+    errors = np.vstack([each.errors for each in results])
+    beside, false = (np.concatenate([getattr(each, part) for each in results]) for part in ("beside", "false"))
+    parts = [
+        f"{right[inside].sum()} of {inside.sum()}, {(false[(false >= low) & (false < high)]).size}"
+        for low, high in pairwise(_BINS)
+        for inside in [(distances >= low) & (distances < high)]
+    ]
+    return (
+        name,
+        str(len(results)),
+        *parts,
+        str(len(beside)),
+        f"{np.median(errors[:, 0]):.3f}",
+        f"{np.median(errors[:, 1]):+.3f}, {np.sqrt(np.mean(errors[:, 1] ** 2)):.3f}",
+    )
+
+
+def chain_row(name: str, full: Array, results: list[Detection]) -> tuple[str, ...]:
+    """Return the row of scans that are located on the rings of their own cloud, turned and moved, without a guess."""
+    X_WC = np.array([100.0, -50.0, 2.0])
+    mapped = _landmarks(full[:, :2], full[:, 2], deviation=0.05).seen_from(X_WC)
+    constellation = ConstellationMap(mapped)
+    sure = wrong = 0
+    errors = []
+    for each in results:
+        fix = constellation.locate(each.trunks)
+        truth = X_WC[:2] + rotation(X_WC[2]) @ each.eye[:2]
+        error = np.hypot(*(fix.pose[:2] - truth))
+        sure += fix.is_sure
+        wrong += fix.is_sure and error > 0.5
+        errors += [error] if fix.is_sure else []
+    shown = [len(each.trunks) for each in results]
+    return (
+        name,
+        str(len(full)),
+        f"{np.median(shown):.0f}",
+        f"{sure} of {len(results)}",
+        str(wrong),
+        f"{np.median(errors):.3f}" if errors else "",
+    )
+
+
+FIELD_HEADER = ("scan", "stems", "pose", "matched", "ln L", "heading, deg", "halves of the map differ by")
+CLOUD_HEADER = (
+    "cloud",
+    "scans",
+    *(f"{low:g} to {high:g} m: found, false" for low, high in pairwise(_BINS)),
+    "beside a stem",
+    "position, m",
+    "diameter, m: bias, RMS",
+)
+CHAIN_HEADER = ("cloud", "stems on the map", "trunks in a scan", "sure", "wrong", "error, m")
+
+
+def cloud_results(folder: Path) -> Iterator[tuple[str, Array, list[Detection]]]:
+    """Yield the name, the stems and the results of each cloud."""
+    for clouds, noise in ((CLOUDS, _NOISE), (MOBILE, _MOBILE_NOISE)):
+        for name, path in clouds.items():
+            cloud = Cloud.read(folder / path)
+            full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
+            step = 2.0 if np.ptp(cloud.points[:, 0]) < 15.0 else 4.0
+            yield name, full, list(detections(cloud, full, partial, noise=noise, step=step))
+
+
+@click.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+def main(folder: Path) -> None:
+    """Locate real scans on real maps, and detect trunks in real clouds, of FOLDER."""
+    print(table(FIELD_HEADER, list(field_rows(folder))), "\n")
+    results = list(cloud_results(folder))
+    print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, _, scans in results]), "\n")
+    print(table(CHAIN_HEADER, [chain_row(name, full, scans) for name, full, scans in results]))
+
+
+if __name__ == "__main__":
+    main()
