@@ -86,7 +86,8 @@ class CubeTossScenario(Scenario):
             AddCompliantHydroelasticProperties(0.5 * self.edge, self.modulus, properties)
             plant.RegisterCollisionGeometry(cube, RigidTransform(), shape, "cube", properties)
         ground = self._material(rigid=True)
-        AddRigidHydroelasticProperties(ground)
+        if self.plant_config.contact_model != "point":
+            AddRigidHydroelasticProperties(ground)
         plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", ground)
         plant.Finalize()
         builder.sim_sensor("cube_state", plant.get_state_output_port())
