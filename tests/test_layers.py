@@ -30,7 +30,18 @@ BELOW: dict[str, set[str]] = {
     "deployment": {"state", "testbed", "control", "lcm", "recording", "monitoring"},
     "station": {"state", "testbed", "control", "lcm", "monitoring", "deployment"},
     "components": {"state"},
-    "calibration": {"state", "testbed", "rollout", "optimization", "control", "recording", "monitoring", "components"},
+    "calibration": {
+        "state",
+        "testbed",
+        "rollout",
+        "optimization",
+        "control",
+        "recording",
+        "monitoring",
+        "components",
+        "lcm",
+        "machine",
+    },
 }
 # Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
 # travel to them, when the names of a package are imported, what a cache keeps, arrays, splines, laser scans, and where

@@ -133,3 +133,14 @@ def test_before_the_first_plan_it_is_the_initial_value() -> None:
     run.plan(begin=5 * PERIOD)
     np.testing.assert_array_equal(run.at(4), [0.5, -0.5])
     np.testing.assert_allclose(run.at(5), W[0])
+
+
+def test_a_repeated_plan_begins_again_at_its_end() -> None:
+    run, once = Run(command("bspline", repeat=True)), Run(command("bspline"))
+    run.plan(0.1)
+    once.plan(0.1)
+    period = round(DURATION / PERIOD)
+    first = [once.at(5 + k) for k in range(period)]
+    # The second and the third time, from the first sample after the end on.
+    again = [run.at(5 + k) for k in range(3 * period)]
+    np.testing.assert_allclose(again, first * 3, atol=1e-12)

@@ -3,6 +3,8 @@
 from vtbdrake.calibration.calibration import Calibration as Calibration
 from vtbdrake.calibration.calibration import calibrate as calibrate
 from vtbdrake.calibration.calibration import information as information
+from vtbdrake.calibration.excitation_design import Excitation as Excitation
+from vtbdrake.calibration.excitation_design import excitation as excitation
 from vtbdrake.calibration.filtering import JointRecording as JointRecording
 from vtbdrake.calibration.filtering import Noise as Noise
 from vtbdrake.calibration.fisher import Information as Information
@@ -22,6 +24,10 @@ from vtbdrake.calibration.regression import regress as regress
 from vtbdrake.calibration.rollout_calibration import RolloutCalibration as RolloutCalibration
 from vtbdrake.calibration.rollout_calibration import Window as Window
 from vtbdrake.calibration.rollout_calibration import calibrate_by_rollouts as calibrate_by_rollouts
+from vtbdrake.calibration.trials import SelfTest as SelfTest
+from vtbdrake.calibration.trials import SelfTestTrial as SelfTestTrial
+from vtbdrake.calibration.trials import machine_log as machine_log
+from vtbdrake.calibration.trials import self_test as self_test
 from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
 from vtbdrake.calibration.validation import Tolerance as Tolerance

@@ -38,6 +38,7 @@ _FEWEST, _SMOOTHED = 50, 15
 _NOISE_SEGMENTS = 12
 # Commands with less jitter than this share of their period come by a clock.
 _REGULAR = 0.2
+_DIFFERENCE = 1e-5  # of the logarithm of a deviation
 _LEAST = 1e-9  # of a deviation, in rad or m
 
 
@@ -198,6 +199,15 @@ def stale(commands: Series, times: Array) -> NDArray[np.bool]:
     return np.asarray(times - commands.times[np.maximum(newest, 0)] > GAP * period)
 
 
+class _Filtered(NamedTuple):
+    """As `Innovations`, for K noises: (N, K, W, nq), (N, K, W, nq, nz), (K,) and (N + 1, K, W, 2 nq)."""
+
+    white: Array
+    slopes: Array
+    log_determinant: Array
+    states: Array
+
+
 class Segments:
     """Recordings in segments of equal length.
 
@@ -288,51 +298,63 @@ class Segments:
 
     def innovations(self, noise: Noise, model: Linearization, *, selection: slice = slice(None)) -> Innovations:
         """Return the innovations of the chosen segments."""
-        n = self.model.nq
+        result = self._filtered([noise], model, selection)
+        log_determinant = float(result.log_determinant[0])
+        return Innovations(result.white[:, 0], result.slopes[:, 0], log_determinant, result.states[:, 0])
+
+    def _filtered(self, noises: Sequence[Noise], model: Linearization, selection: slice) -> _Filtered:
+        """Return the innovations for each of K noises, which are filtered side by side.
+
+        An array has K in front of the segments; the logarithm of the determinant is one for each noise, (K,).
+        """
+        n, K = self.model.nq, len(noises)
         A, B, defects, slopes = (part[:, selection] for part in model)
         trajectory, q = self.trajectory[:, selection], self._q[:, selection]
         N, W, nz = len(A), A.shape[1], slopes.shape[3]
-        decay = float(np.exp(-self.period / noise.correlation_time))
-        transition = np.zeros((W, 3 * n, 3 * n))
-        transition[:, 2 * n :, 2 * n :] = decay * np.eye(n)
-        Q = np.zeros((3 * n, 3 * n))
-        Q[2 * n :, 2 * n :] = np.diag((1.0 - decay**2) * noise.torque**2)
-        R = np.diag(noise.measurement**2)
+        # With an axis for the segments.
+        measurement = np.array([noise.measurement for noise in noises])[:, np.newaxis]
+        torque = np.array([noise.torque for noise in noises])[:, np.newaxis]
+        decay = np.exp(-self.period / np.array([noise.correlation_time for noise in noises]))[:, np.newaxis, np.newaxis]
+        transition = np.zeros((K, W, 3 * n, 3 * n))
+        transition[..., 2 * n :, 2 * n :] = decay[..., np.newaxis] * np.eye(n)
+        nothing = np.zeros((K, 1, 2 * n))
+        Q = _diagonal(np.concatenate([nothing, (1.0 - decay**2) * torque**2], axis=2))
+        R = _diagonal(measurement**2)
         # A smoothed velocity is about as good as a difference over a few samples.
-        speed = (noise.measurement / self.period) ** 2
-        P = np.broadcast_to(np.diag([*noise.measurement**2, *speed, *noise.torque**2]), (W, 3 * n, 3 * n)).copy()
+        start = np.concatenate([measurement**2, (measurement / self.period) ** 2, torque**2], axis=2)
+        P = np.broadcast_to(_diagonal(start), transition.shape).copy()
         # The state, relative to the trajectory, and its derivatives by the parameters, side by side.
-        X = np.zeros((W, 3 * n, 1 + nz))
-        white, by_z = np.empty((N, W, n)), np.empty((N, W, n, nz))
-        states = np.empty((N + 1, W, 2 * n))
+        X = np.zeros((K, W, 3 * n, 1 + nz))
+        white, by_z = np.empty((N, K, W, n)), np.empty((N, K, W, n, nz))
+        states = np.empty((N + 1, K, W, 2 * n))
         states[0] = trajectory[0]
-        log_determinant = 0.0
+        log_determinant = np.zeros(K)
         for k in range(N):
-            transition[:, : 2 * n, : 2 * n] = A[k]
-            transition[:, : 2 * n, 2 * n :] = B[k]
+            transition[..., : 2 * n, : 2 * n] = A[k]
+            transition[..., : 2 * n, 2 * n :] = B[k]
             X = transition @ X
-            X[:, : 2 * n, 0] += defects[k]
-            X[:, : 2 * n, 1:] += slopes[k]
-            P = transition @ P @ np.swapaxes(transition, 1, 2) + Q
+            X[..., : 2 * n, 0] += defects[k]
+            X[..., : 2 * n, 1:] += slopes[k]
+            P = transition @ P @ np.swapaxes(transition, 2, 3) + Q
             try:
-                L = np.linalg.cholesky(P[:, :n, :n] + R)
+                L = np.linalg.cholesky(P[..., :n, :n] + R)
             except np.linalg.LinAlgError:
                 raise CalibrationError(
                     "the model runs away from the recordings within a step, for the parameters that fit their torques "
                     "best: another machine, other units, or ranges of the parameters that are too wide"
                 ) from None
             # Of the innovations: measured - expected.
-            rest = -X[:, :n]
-            rest[:, :, 0] += q[k + 1] - trajectory[k + 1, :, :n]
-            solved = np.linalg.solve(L, np.concatenate([rest, P[:, :n]], axis=2))
-            innovation, gain = solved[:, :, : 1 + nz], solved[:, :, 1 + nz :]
-            transposed = np.swapaxes(gain, 1, 2)
+            rest = -X[..., :n, :]
+            rest[..., 0] += q[k + 1] - trajectory[k + 1, :, :n]
+            solved = np.linalg.solve(L, np.concatenate([rest, P[..., :n, :]], axis=3))
+            innovation, gain = solved[..., : 1 + nz], solved[..., 1 + nz :]
+            transposed = np.swapaxes(gain, 2, 3)
             X = X + transposed @ innovation
             P = P - transposed @ gain
-            white[k], by_z[k] = innovation[:, :, 0], innovation[:, :, 1:]
-            log_determinant += 2.0 * float(np.log(np.einsum("wii->wi", L)).sum())
-            states[k + 1] = trajectory[k + 1] + X[:, : 2 * n, 0]
-        return Innovations(white, by_z, log_determinant, states)
+            white[k], by_z[k] = innovation[..., 0], innovation[..., 1:]
+            log_determinant += 2.0 * np.log(np.einsum("kwii->kwi", L)).sum(axis=(1, 2))
+            states[k + 1] = trajectory[k + 1] + X[..., : 2 * n, 0]
+        return _Filtered(white, by_z, log_determinant, states)
 
     def likeliest_noise(self, z: Array, guess: Noise) -> Noise:
         """Return the noise of the largest likelihood, in some segments all over the recordings."""
@@ -344,14 +366,23 @@ class Segments:
         def noise_of(logs: Array) -> Noise:
             return Noise(np.exp(logs[:n]), np.exp(logs[n : 2 * n]), float(np.exp(logs[-1])))
 
-        def unlikelihood(logs: Array) -> float:
-            innovations = self.innovations(noise_of(logs), model, selection=selection)
-            return float((innovations.white**2).sum()) + innovations.log_determinant
+        def unlikelihood(logs: Array) -> tuple[float, Array]:
+            # With its differences by each number: side by side, they cost little more than one of them.
+            points = np.vstack([logs, logs + _DIFFERENCE * np.eye(len(logs))])
+            filtered = self._filtered([noise_of(point) for point in points], model, selection)
+            values = (filtered.white**2).sum(axis=(0, 2, 3)) + filtered.log_determinant
+            return float(values[0]), (values[1:] - values[0]) / _DIFFERENCE
 
         start = np.log([*guess.measurement, *guess.torque, guess.correlation_time])
         widths = np.array([3.0] * n + [6.0] * n)
         bounds = [(max(s - w, np.log(_LEAST)), s + w) for s, w in zip(start[:-1], widths, strict=True)]
         # Correlated for a period at least, for a segment at most.
         bounds.append((np.log(self.period), np.log(self.period * self.steps)))
-        fit = scipy.optimize.minimize(unlikelihood, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 15})
+        options = {"maxiter": 15}
+        fit = scipy.optimize.minimize(unlikelihood, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return noise_of(fit.x)
+
+
+def _diagonal(values: Array) -> Array:
+    """Return diagonal matrices (..., n, n) of the values (..., n)."""
+    return np.asarray(values[..., np.newaxis] * np.eye(values.shape[-1]))

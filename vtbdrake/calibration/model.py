@@ -193,6 +193,16 @@ class JointModel:
         """Return whether the delay of the drives is one of the parameters."""
         return "delay" in self._drive_names
 
+    @property
+    def drive_times(self) -> dict[str, int]:
+        """Return the places in z of those that are varied of the drives' ``delay`` and ``time_constant``."""
+        return dict(zip(self._drive_names, self.drive_parameters, strict=True))
+
+    @property
+    def drive_period(self) -> float:
+        """Return the sample period of the drives in s, the unit of their delay; 0 without drives."""
+        return self._drive_period
+
     def _check_ranges(self) -> None:
         for name, value, low, high in zip(self.names, self.start, self.lower, self.upper, strict=True):
             if not low <= value <= high:

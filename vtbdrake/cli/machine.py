@@ -30,7 +30,8 @@ from vtbdrake.testbed import Scenario
 _DEFAULT = MachineConfig()
 
 
-def _parse_noise(text: str) -> tuple[str, float]:
+def parse_deviation(text: str) -> tuple[str, float]:
+    """Parse ``SIGNAL=STD``, a standard deviation of a signal."""
     try:
         name, value = parse_setting(text)
     except click.BadParameter as error:
@@ -52,9 +53,17 @@ def _parse_noise(text: str) -> tuple[str, float]:
     _DEFAULT,
     "--noise SIGNAL=STD",
     "Add normal noise to a sensor signal, in its unit. May be repeated.",
-    parse=_parse_noise,
+    parse=parse_deviation,
     multiple=True,
 )
+@config_option(
+    _DEFAULT,
+    "--disturbance SIGNAL=STD",
+    "Add a correlated disturbance to what acts on an actuator, in its unit. May be repeated.",
+    parse=parse_deviation,
+    multiple=True,
+)
+@config_option(_DEFAULT, "--disturbance-time S")
 @config_option(_DEFAULT, "--seed N")
 @option("--sense-latency MS", "The latency of sensor messages, in milliseconds; whole cycles.", default=0.0)
 @option("--act-latency MS", "The latency of commands, in milliseconds; whole cycles.", default=0.0)
@@ -74,6 +83,7 @@ def machine(
     cycles: int | None,
     values: tuple[Setting, ...],
     noise: tuple[tuple[str, float], ...],
+    disturbance: tuple[tuple[str, float], ...],
     sense_latency: float,
     act_latency: float,
     brake: str | None,
@@ -95,6 +105,7 @@ def machine(
     config = MachineConfig(
         values=settings(values),
         noise=dict(noise),
+        disturbance=dict(disturbance),
         sense_latency=1e-3 * sense_latency,
         act_latency=1e-3 * act_latency,
         brake=brake or "",

@@ -31,7 +31,8 @@ class SplineCommand(AddressedSystem):
     becomes the spline's value at t - t_begin. So one vector is the whole plan, whether it is given by an operator (a
     command u), by a slow part or in a rollout; and a plan that arrives late is followed from its present value on.
 
-    Before t_begin the value does not change. After the end of the plan it is the last one, or ``after``.
+    Before t_begin the value does not change. After the end of the plan it is the last one, or ``after``; or the plan
+    begins again, if it is repeated.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class SplineCommand(AddressedSystem):
         period: float,
         size: int = 1,
         after: ArrayLike | None = None,
+        repeat: bool = False,
         initial: ArrayLike = 0.0,
         unit: str = "1",
     ) -> None:
@@ -52,6 +54,7 @@ class SplineCommand(AddressedSystem):
             size: Entries m of the value.
             after: The value after the end of the plan, a scalar or shape (m,), for example a force of 0 if nobody
                 decides any more. None holds the last value of the plan.
+            repeat: Whether the plan begins again at its end.
             initial: The value until the first plan begins, a scalar or shape (m,).
             unit: Unit of the value.
 
@@ -64,7 +67,7 @@ class SplineCommand(AddressedSystem):
             raise ValueError(f"SplineCommand: period is positive, in s, not {period}")
         if size < 1:
             raise ValueError(f"SplineCommand: a value has at least one entry, not {size}")
-        self._spline, self._size = spline, int(size)
+        self._spline, self._size, self._repeat = spline, int(size), bool(repeat)
         # Computed here, since it takes longer than a cycle of a loop.
         _ = spline.pieces
         self._after = None if after is None else _vector("after", after, self._size)
@@ -81,6 +84,9 @@ class SplineCommand(AddressedSystem):
         t = context.get_time() - float(plan[0])
         if t < -_ROUNDING:
             return
+        if self._repeat:
+            # Rounded down a little before the end: the sample at the end is the first again.
+            t = (t + _ROUNDING) % spline.duration - _ROUNDING
         value = self._value.mutable_array(state)
         if t > spline.duration + _ROUNDING and self._after is not None:
             value[:] = self._after

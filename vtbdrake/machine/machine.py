@@ -65,7 +65,14 @@ class MachineConfig:
     noise: Mapping[str, float] = setting(
         default_factory=dict, doc="Vector sensor signal -> standard deviation of its normal noise, in its unit.", ge=0.0
     )
-    seed: int = setting(0, "The seed of perturbation, noise and faults.", ge=0)
+    disturbance: Mapping[str, float] = setting(
+        default_factory=dict,
+        doc="Vector actuator signal -> standard deviation of a disturbance that is added to what acts, in its unit. "
+        "It changes with the time constant `disturbance_time`, and no message contains it.",
+        ge=0.0,
+    )
+    disturbance_time: float = setting(0.05, "The correlation time of the disturbances.", unit="s", gt=0.0)
+    seed: int = setting(0, "The seed of perturbation, noise, disturbances and faults.", ge=0)
     sense_latency: float = setting(
         0.0, "The latency of messages to the controller, rounded up to whole cycles.", unit="s", ge=0.0
     )
@@ -162,8 +169,8 @@ class Machine:
         self.world = world = world or WorldAlone(scenario)
         self.cycle = 0
         self._epoch = epoch
-        seeds = np.random.SeedSequence(config.seed).spawn(4)
-        perturbation, noise, sense, act = (np.random.default_rng(seed) for seed in seeds)
+        seeds = np.random.SeedSequence(config.seed).spawn(5)
+        perturbation, noise, sense, act, disturbance = (np.random.default_rng(seed) for seed in seeds)
         self._context = world.default_context()
         self.perturbed = perturbed_values(world, self._context, config.perturb, perturbation) if config.perturb else {}
         self.perturbed.update(config.values)
@@ -179,6 +186,7 @@ class Machine:
         self._feed = world.feed(self._context)
         self._actuation = dict(self._brake.idle)  # What acts, by actuator signal.
         self._sensors = _Sensors(world, self.protocol, period, config.noise, noise, actuation=self._actuation)
+        self._disturbances = _Disturbances(world, period, config, disturbance)
         signals = {signal.name: signal for signal in world.interface.act}
         self._received = {name: ReceivedSignal() for name in signals}
         self._readers = {
@@ -270,8 +278,11 @@ class Machine:
 
     def _apply(self, name: str, value: Any) -> None:
         # Every message makes a new object: the same object has not changed.
-        if self._actuation[name] is not value:
-            self._actuation[name] = value
+        changed = self._actuation[name] is not value
+        self._actuation[name] = value
+        if name in self._disturbances:
+            self._feed(name, value + self._disturbances.following(name))
+        elif changed:
             self._feed(name, value)
 
     def messages(self) -> list[tuple[str, bytes]]:
@@ -368,6 +379,32 @@ class HoldingBrake:
                     joint.Lock(plant_context)
                 else:
                     joint.Unlock(plant_context)
+
+
+class _Disturbances:
+    r"""First-order Gauss-Markov processes that are added to what acts, one for each entry of an actuator signal.
+
+    d_k = r d_{k-1} + sqrt(1 - r^2) sigma n_k with r = exp(-period / disturbance_time) and n of N(0, 1).
+    """
+
+    def __init__(self, world: WorldAlone, period: float, config: MachineConfig, random: np.random.Generator) -> None:
+        sizes = {signal.name: signal.size for signal in world.interface.act if signal.size is not None}
+        for name in config.disturbance:
+            if name not in sizes:
+                raise ValueError(f"a disturbance acts on vector actuator signals ({', '.join(sizes)}), not on {name!r}")
+        self._random, self._decay = random, float(np.exp(-period / config.disturbance_time))
+        self._deviations = config.disturbance
+        self._values = {name: std * random.standard_normal(sizes[name]) for name, std in config.disturbance.items()}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def following(self, name: str) -> np.ndarray:
+        """Return the disturbance of a signal in the next cycle."""
+        value = self._values[name]
+        drive = self._deviations[name] * np.sqrt(1.0 - self._decay**2)
+        self._values[name] = self._decay * value + drive * self._random.standard_normal(value.shape)
+        return self._values[name]
 
 
 class _Sensors:

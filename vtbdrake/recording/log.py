@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike
 from vtbdrake.arrays import Array, immutable
 from vtbdrake.recording.log_format import LogError
 
+# Times are sums with rounding errors: they are the same within this time in s.
+_ROUNDING = 1e-9
+
 
 class Uniformity(NamedTuple):
     """How regular the times of a series are, in seconds.
@@ -69,8 +72,11 @@ class Series:
         return Uniformity(period, float(np.median(abs(steps - period))), float(steps.max()))
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the newest sample at each of the times (m,), (m, size); NaN before the first."""
-        indices = np.searchsorted(self.times, np.asarray(times, dtype=float), side="right") - 1
+        """Return the newest sample at each of the times (m,), (m, size); NaN before the first.
+
+        A sample is there at its own time, however both are rounded.
+        """
+        indices = np.searchsorted(self.times, np.asarray(times, dtype=float) + _ROUNDING, side="right") - 1
         samples: Array = np.where((indices >= 0)[:, np.newaxis], self.values[np.maximum(indices, 0)], np.nan)
         return samples
 

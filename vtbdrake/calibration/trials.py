@@ -1,0 +1,224 @@
+"""Self-test: how near a calibration comes to truths that are hidden from it, before any hardware is touched."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+
+from vtbdrake.arrays import Array
+from vtbdrake.calibration.calibration import Calibration, Verdict, calibrate
+from vtbdrake.calibration.model import CalibrationError, Inertia, inertia_of, log_cholesky
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.machine import MachineConfig, MachineProcess
+from vtbdrake.optimization import Parameter
+from vtbdrake.recording import Log, read_log
+from vtbdrake.state.variables import text_table
+from vtbdrake.testbed import Scenario
+
+_log = logging.getLogger(__name__)
+
+_PATIENCE = 60.0  # s
+# How far the numbers of a hidden inertia lie from those of the scenario: 0.05 is 10 % of the mass.
+_INERTIA_SPREAD = 0.05
+_BODY = ("mass", "center_of_mass", "inertia")
+
+
+@dataclass(frozen=True, eq=False)
+class SelfTestTrial:
+    """One hidden truth, and what the calibration made of its log.
+
+    Attributes:
+        truth: The values of the machine, by address.
+        calibration: The calibration, which did not know them.
+    """
+
+    truth: Mapping[str, float]
+    calibration: Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class SelfTest:
+    """The result of `self_test`.
+
+    Attributes:
+        trials: The trials.
+    """
+
+    trials: tuple[SelfTestTrial, ...]
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Return the calibrated numbers."""
+        return tuple(self.trials[0].truth)
+
+    def errors(self, address: str) -> Array:
+        """Return the differences of the estimates from the truths, shape (trials,)."""
+        pairs = [(trial.calibration.parameters[address].value, trial.truth[address]) for trial in self.trials]
+        return np.array([value - truth for value, truth in pairs])
+
+    def covered(self, address: str) -> Array:
+        """Return in which trials the interval of 95 % contains the truth, shape (trials,).
+
+        Trials in which the number was not identifiable claim nothing, and are left out.
+        """
+        results = [(trial.calibration.parameters[address], trial.truth[address]) for trial in self.trials]
+        return np.array(
+            [r.lower <= truth <= r.upper for r, truth in results if r.verdict != Verdict.NOT_IDENTIFIABLE], dtype=bool
+        )
+
+    @property
+    def coverage(self) -> float:
+        """Return the share of all intervals that contain the truth; 0.95 is expected, NaN without an interval."""
+        covered = np.concatenate([self.covered(address) for address in self.addresses])
+        return float(covered.mean()) if covered.size else float("nan")
+
+    def __str__(self) -> str:
+        rows, total = [], 0
+        for address in self.addresses:
+            sizes, covered = abs(self.errors(address)), self.covered(address)
+            scale = float(np.median([abs(trial.truth[address]) for trial in self.trials]))
+            median, most = np.quantile(sizes, [0.5, 0.95])
+            relative = [f"{100.0 * value / scale:.2g} %" if scale > 0.0 else "" for value in (median, most)]
+            verdicts = [str(trial.calibration.parameters[address].verdict) for trial in self.trials]
+            counts = ", ".join(f"{verdicts.count(name)} {name}" for name in dict.fromkeys(verdicts))
+            total += covered.size
+            errors = [f"{median:.3g}", relative[0], f"{most:.3g}", relative[1]]
+            rows.append((address, *errors, f"{covered.sum()} of {covered.size}", counts))
+        header = ("calibrated", "median error", "", "95 % within", "", "covered", "verdicts")
+        summary = f"{len(self.trials)} hidden truths: {self.coverage:.1%} of {total} intervals of 95 % contain theirs"
+        return f"{text_table(header, rows)}\n{summary}"
+
+
+def self_test(
+    scenario: Scenario,
+    parameters: Sequence[Parameter] = (),
+    *,
+    inertias: Sequence[Inertia] = (),
+    position: str,
+    torque: str,
+    seconds: float = 10.0,
+    trials: int = 20,
+    seed: int = 0,
+    machine: MachineConfig | None = None,
+    values: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> SelfTest:
+    """Calibrate simulated machines whose numbers are known, but not to the calibration.
+
+    In each trial the numbers are drawn uniformly from their ranges (delays in whole periods, as `JointDrives` has
+    them; a whole inertia near that of the scenario). A machine with these numbers, in a process of its own, is
+    commanded by the scenario's DPS over LCM, and the log is calibrated.
+
+    Args:
+        scenario: The scenario, with the errors of its sensors (resolution of the encoders).
+        parameters: As in `calibrate`.
+        inertias: As in `calibrate`.
+        position: As in `calibrate`.
+        torque: As in `calibrate`.
+        seconds: The duration of a log.
+        trials: The number of truths.
+        seed: The seed of truths and disturbances.
+        machine: What else the machine does: noise, disturbances that no log contains.
+        values: Values of variables of the DPS at the start, such as the plan of `excitation`, by address.
+        **options: Further arguments of `calibrate`.
+
+    Raises:
+        CalibrationError: As in `calibrate`, and if the machine cannot be commanded.
+    """
+    if trials < 1:
+        raise CalibrationError(f"a self-test takes at least one trial, not {trials}")
+    generator, testbed, results = np.random.default_rng(seed), scenario.build(), []
+    context = testbed.default_context()
+    for number in range(trials):
+        truth = {parameter.address: _drawn(parameter, generator) for parameter in parameters}
+        for inertia in inertias:
+            start = [
+                testbed.read(context, f"{inertia.address}.{name}") for name in ("mass", "center_of_mass", "inertia")
+            ]
+            truth |= _drawn_body(inertia.address, log_cholesky(float(start[0]), start[1], start[2]), generator)
+        config = replace(machine or MachineConfig(), seed=int(generator.integers(2**31)))
+        config = replace(config, values={**config.values, **truth})
+        log = machine_log(scenario, seconds, machine=config, values=values)
+        calibration = calibrate(
+            scenario, log, parameters, inertias=inertias, position=position, torque=torque, **options
+        )
+        results.append(SelfTestTrial(truth, calibration))
+        _log.info("trial %d of %d is done", number + 1, trials)
+    return SelfTest(tuple(results))
+
+
+def machine_log(
+    scenario: Scenario,
+    seconds: float,
+    *,
+    machine: MachineConfig | None = None,
+    values: Mapping[str, Any] | None = None,
+) -> Log:
+    """Return the log of a scenario's DPS that commands a simulated machine of the same scenario, over LCM.
+
+    Machine and DPS run in lock-step, so that the log does not depend on the load of this computer. There, an answer
+    arrives within the period of its state; it is held back for a period, as it takes in the testbed.
+
+    Args:
+        scenario: The scenario; its deployment describes messages and guards.
+        seconds: The duration of the log.
+        machine: The differences of the machine from the scenario's world.
+        values: Values of variables of the DPS at the start, such as its plan, by address.
+
+    Raises:
+        CalibrationError: The DPS could not take over, or its guards stopped it.
+        ProtocolError: The scenario has no protocol.
+    """
+    if not seconds > 0.0:
+        raise CalibrationError(f"a log takes a positive time in s, not {seconds}")
+    protocol, config = protocol_of(scenario), machine or MachineConfig()
+    deployment = scenario.deployment().in_lock_step(protocol.sense[-1].signals[0], wait=_PATIENCE)
+    config = replace(config, act_latency=config.act_latency + deployment.period)
+    with tempfile.TemporaryDirectory() as folder, Hub(port=0) as hub:
+        path = Path(folder) / "machine.lcm"
+        with (
+            MachineProcess(scenario, hub.url, config, lock_step=True),
+            scenario.deploy(hub.url, values=values, deployment=deployment, record=path) as loop,
+        ):
+            deadline = time.monotonic() + _PATIENCE
+            while (preparation := loop.prepare("real")).reasons:
+                if time.monotonic() > deadline:
+                    raise CalibrationError(f"the DPS cannot take over: {'; '.join(preparation.reasons)}")
+                loop.bridge.poll(0.5)
+            loop.perform(preparation)
+            begin = loop.time
+            loop.cycle()  # The first actuator command begins the exchange.
+            loop.run(cycles=max(round(seconds / deployment.period) - 1, 0))
+            if latched := loop.guards.latched:
+                reasons = "; ".join(fault.reason for fault in latched)
+                raise CalibrationError(f"the guards stopped the DPS, so that there is no log: {reasons}")
+        # A half period more: the last command is stamped at the end of its cycle.
+        return read_log(path).signals.between(begin, begin + seconds + 0.5 * deployment.period)
+
+
+def _drawn(parameter: Parameter, generator: np.random.Generator) -> float:
+    value = float(parameter.from_unit(generator.uniform()))
+    return float(round(value)) if parameter.address.endswith(".delay") else value
+
+
+def _drawn_body(address: str, start: Array, generator: np.random.Generator) -> dict[str, float]:
+    """Return mass, centre of mass and moments of a body near that of the ten numbers ``start``, by address."""
+    size = np.array([1.0] * 4 + [float(np.exp(start[1:4]).mean())] * 6)
+    symbol = casadi.SX.sym("z", start.size)
+    body = casadi.Function("body", [symbol], list(inertia_of(symbol)))
+    numbers = body(start + _INERTIA_SPREAD * size * generator.normal(size=start.size))
+    flat = {name: np.asarray(value).ravel() for name, value in zip(_BODY, numbers, strict=True)}
+    return {
+        f"{address}.{name}" + (f"[{i}]" if name != "mass" else ""): float(value)
+        for name, values in flat.items()
+        for i, value in enumerate(values)
+    }
