@@ -1,9 +1,9 @@
 """Trunks of trees from the points of one scan: the positions of their axes, and their diameters.
 
 A trunk is an object that returns most of the rows of rays that pass its place within a slice of heights over the
-ground, is as wide as a trunk, opaque, and has a surface as smooth as that of a cylinder. It is fitted as a leaning cylinder:
-horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0) with z0 at
-breast height.
+ground, is as wide as a trunk, opaque, and has a surface as smooth as that of a cylinder. It is fitted as a leaning
+cylinder: horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0)
+with z0 at breast height.
 
 Errors are those of the ranges along the rays. A ray at the azimuth a, with the horizontal unit vectors e along it and n
 to the left of it, meets a circle with the centre c at the horizontal distance
