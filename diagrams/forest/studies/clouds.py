@@ -164,11 +164,11 @@ def _rings_of_slice(cloud: Cloud, height: float, arc: float, fewest: int, rng: n
     for place, near in zip(places, tree.query_ball_point(places, 0.6), strict=True):
         if len(near) < fewest:
             continue
-        others = places[rng.choice(near, (_TRIES, 2))]
-        A = 2.0 * (others - place)
+        partners = places[rng.choice(near, (_TRIES, 2))]
+        A = 2.0 * (partners - place)
         det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
         good = np.abs(det) > 1e-6
-        b = np.sum(others[good] ** 2 - place**2, axis=2)
+        b = np.sum(partners[good] ** 2 - place**2, axis=2)
         if not len(b):
             continue
         centers = np.linalg.solve(A[good], b[:, :, None])[:, :, 0]
