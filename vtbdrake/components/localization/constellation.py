@@ -226,7 +226,7 @@ class ConstellationMap:
         if len(local) < 2:
             return self._unknown()
         p_HoCo_H = local.positions.mean(axis=0)
-        here = self._seen(local, local.positions - p_HoCo_H)
+        here = self._described(local, local.positions - p_HoCo_H)
         relative = self._relative(here.places)
         variance = relative + float(np.mean(here.variances)) + self.least_deviation**2
         judged = [self._judged(here, pose) for pose in self._candidates(here, variance**0.5)]
@@ -277,7 +277,7 @@ class ConstellationMap:
         covariance = np.diag([*((self._high - self._low) ** 2 / 12.0 + 1.0), pi**2 / 3.0])
         return Fix(pose, covariance, False, 0.0, 0.0, 0.0, np.zeros((0, 2), dtype=np.intp))
 
-    def _seen(self, local: Landmarks, places: Array) -> _Local:
+    def _described(self, local: Landmarks, places: Array) -> _Local:
         shared = _shared_functions(places, self.correlation)
         diameter_variances = local.diameter_deviations**2 + _DIAMETER_FLOOR**2
         common = self._common(local.diameters, diameter_variances)
