@@ -4,42 +4,32 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_hex
 from pydrake.geometry import (
-    GeometryId,
-    IllustrationProperties,
     Meshcat,
     MeshcatParams,
-    MeshcatVisualizer,
-    Rgba,
-    Role,
-    SceneGraphInspector,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import Context
 
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.drawing import Drawing, Parts
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
     from numpy.typing import ArrayLike
 
     from vtbdrake.optimization import Motion
+    from vtbdrake.testbed import Scenario
 
 # Colours for all kinds of colour vision (Okabe and Ito).
 _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-
-# Of the primaries of sRGB, to the eye.
-_BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 
 # Keyframes lie on whole milliseconds; the browser interpolates between them.
 _RESOLUTION = 1000.0
@@ -86,7 +76,7 @@ class Scene:
 
 def make_meshcat() -> Meshcat:
     """Start a Meshcat server that listens on this machine only (Drake's default listens on all interfaces)."""
-    return Meshcat(MeshcatParams(host="localhost"))
+    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
 
 
 def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> Scene:
@@ -202,56 +192,59 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    # A context of a terrain with many shapes takes as long as building it: there is one per scenario.
-    built: list[tuple[Motion, VirtualTestbed, Context]] = []
+    stages = _Stages()
     for name, motion in motions.items():
-        match = next((entry for entry in built if entry[0].scenario == motion.scenario), None)
-        if match is None:
-            testbed = motion.scenario.build()
-            match = motion, testbed, testbed.default_context()
-            _draw(meshcat, *match[1:], f"{prefix}/surroundings/{len(built)}", moving=False)
-            built.append(match)
-        _, testbed, context = match
-        states = _states(motion, testbed, f"{prefix}/{name}")
+        new = motion.scenario not in stages
+        stage = stages[motion.scenario]
+        if new:
+            path = f"{prefix}/surroundings/{len(stages)}"
+            Drawing(meshcat, stage.testbed, stage.context, path, parts=Parts.ANCHORED)
+        states = _states(motion, stage.testbed, f"{prefix}/{name}")
         instants = np.linspace(0, len(states) - 1, count).round().astype(int)
         for k, sample in enumerate(dict.fromkeys(instants.tolist())):
-            _draw(
+            stage.set_state(states[sample])
+            Drawing(
                 meshcat,
-                testbed,
-                context,
+                stage.testbed,
+                stage.context,
                 f"{prefix}/{name}/{k}",
-                moving=True,
-                state=states[sample],
                 tint=tints.get(name),
                 opacity=opacities.get(name, 1.0),
+                parts=Parts.MOVING,
             )
     return Scene(meshcat, title=title, legend=tints)
 
 
-def _draw(
-    meshcat: Meshcat,
-    testbed: VirtualTestbed,
-    context: Context,
-    path: str,
-    *,
-    moving: bool,
-    state: np.ndarray | None = None,
-    tint: str | None = None,
-    opacity: float = 1.0,
-) -> None:
-    """Draw the moving or the anchored bodies of a plant, in the state [q; v] if one is given."""
-    plant, scene_graph = testbed.plant, testbed.scene_graph
-    assert plant is not None and scene_graph is not None
-    inspector = scene_graph.model_inspector()
-    plant_context = plant.GetMyMutableContextFromRoot(context)
-    if state is not None:
-        plant.SetPositionsAndVelocities(plant_context, state)
-    for body, geometry in _visible(plant):
-        if plant.IsAnchored(body) != moving:
-            part = f"{path}/{body.scoped_name()}/{geometry.get_value()}".replace("::", "/")
-            meshcat.SetObject(part, inspector.GetShape(geometry), _tinted(_color(inspector, geometry), tint, opacity))
-            X_WB = plant.EvalBodyPoseInWorld(plant_context, body)
-            meshcat.SetTransform(part, X_WB @ inspector.GetPoseInFrame(geometry))
+class _Stage:
+    """A testbed whose plant is put into recorded states."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.testbed = scenario.build()
+        self.context = self.testbed.default_context()
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Put the plant into the state [q; v]."""
+        plant = self.testbed.plant
+        assert plant is not None
+        plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(self.context), state)
+
+
+class _Stages:
+    """A stage per scenario: that of a terrain with many shapes takes long to build."""
+
+    def __init__(self) -> None:
+        self._stages: list[tuple[Scenario, _Stage]] = []
+
+    def __len__(self) -> int:
+        return len(self._stages)
+
+    def __contains__(self, scenario: Scenario) -> bool:
+        return any(built == scenario for built, _ in self._stages)
+
+    def __getitem__(self, scenario: Scenario) -> _Stage:
+        if scenario not in self:
+            self._stages.append((scenario, _Stage(scenario)))
+        return next(stage for built, stage in self._stages if built == scenario)
 
 
 def _looks(
@@ -294,34 +287,13 @@ def _states(motion: Motion, testbed: VirtualTestbed, path: str) -> np.ndarray:
     return states
 
 
-def _visible(plant: MultibodyPlant) -> Iterator[tuple[RigidBody, GeometryId]]:
-    for index in range(plant.num_bodies()):
-        body = plant.get_body(BodyIndex(index))
-        for geometry in plant.GetVisualGeometriesForBody(body):
-            yield body, geometry
-
-
-def _color(inspector: SceneGraphInspector, geometry: GeometryId) -> Rgba:
-    properties = inspector.GetIllustrationProperties(geometry)
-    color: Rgba = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
-    return color
-
-
-def _tinted(color: Rgba, tint: str | None, opacity: float) -> Rgba:
-    rgb = np.array([color.r(), color.g(), color.b()])
-    if tint is not None:
-        # The old colour's brightness stays, so that the parts of a robot can be distinguished.
-        rgb = 0.75 * np.array(to_rgb(tint)) + 0.25 * rgb @ _BRIGHTNESS
-    return Rgba(*rgb, color.a() * opacity)
-
-
 def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> None:
-    end = max(float(actor.motion.times[-1]) for actor in actors)
+    end, stages = max(float(actor.motion.times[-1]) for actor in actors), _Stages()
     meshcat.DeleteRecording()
     meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
     try:
         for actor in actors:
-            actor.play(meshcat, end, rate)
+            actor.play(meshcat, stages[actor.motion.scenario], end, rate)
     finally:
         meshcat.StopRecording()
     meshcat.PublishRecording()
@@ -338,37 +310,22 @@ class _Actor:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     surroundings: bool = True
 
-    def play(self, meshcat: Meshcat, end: float, rate: float) -> None:
-        testbed = self.motion.scenario.build(meshcat=meshcat, prefix=self.path)
-        plant = testbed.plant
-        states = _states(self.motion, testbed, self.path)
-        assert plant is not None
-        self._paint(testbed, plant)
-        context = testbed.default_context()
-        visualizer = next(s for s in testbed.diagram.GetSystems() if isinstance(s, MeshcatVisualizer))
-        visible = visualizer.GetMyContextFromRoot(context)
+    def play(self, meshcat: Meshcat, stage: _Stage, end: float, rate: float) -> None:
+        states = _states(self.motion, stage.testbed, self.path)
+        drawing = Drawing(
+            meshcat,
+            stage.testbed,
+            stage.context,
+            self.path,
+            tint=self.tint,
+            opacity=self.opacity,
+            parts=Parts.ALL if self.surroundings else Parts.MOVING,
+        )
         meshcat.SetTransform(self.path, RigidTransform(self.offset))
         for time, sample in _keyframes(self.motion.times, end, rate):
-            plant.SetPositions(plant.GetMyMutableContextFromRoot(context), states[sample, : plant.num_positions()])
+            stage.set_state(states[sample])
             # Meshcat rounds the time of a keyframe down; the quarter keeps it off the edge.
-            context.SetTime(time + 0.25 / _RESOLUTION)
-            visualizer.ForcedPublish(visible)
-
-    def _paint(self, testbed: VirtualTestbed, plant: MultibodyPlant) -> None:
-        # This testbed serves nothing but the recording: the default geometry of its SceneGraph may be changed.
-        scene_graph = testbed.scene_graph
-        assert scene_graph is not None
-        inspector, source = scene_graph.model_inspector(), plant.get_source_id()
-        for body, geometry in _visible(plant):
-            if plant.IsAnchored(body):
-                if not self.surroundings:
-                    scene_graph.RemoveRole(source, geometry, Role.kIllustration)
-            elif self.tint is not None or self.opacity < 1.0:
-                properties = IllustrationProperties(inspector.GetIllustrationProperties(geometry))
-                color = _tinted(_color(inspector, geometry), self.tint, self.opacity)
-                properties.UpdateProperty("phong", "diffuse", color)
-                scene_graph.RemoveRole(source, geometry, Role.kIllustration)
-                scene_graph.AssignRole(source, geometry, properties)
+            drawing.pose(stage.context, time_in_recording=time + 0.25 / _RESOLUTION)
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:

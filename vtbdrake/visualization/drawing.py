@@ -1,0 +1,145 @@
+"""The geometry of a testbed in Meshcat, in the poses of any of its contexts."""
+
+from __future__ import annotations
+
+from enum import Flag
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from pydrake.geometry import CalcObb, FrameId, GeometryId, Meshcat, QueryObject, Rgba, Role, SceneGraphInspector
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+from vtbdrake.testbed import VirtualTestbed
+
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
+# Of the primaries of sRGB, to the eye.
+_BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
+
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+# From where a robot is looked at, and how far away in terms of the diagonal of its box.
+_VIEW_DIRECTION = np.array([0.64, -0.68, 0.36])
+_VIEW_DISTANCE = 1.3
+
+
+class Parts(Flag):
+    """The parts of a scene that are drawn."""
+
+    MOVING = 1
+    ANCHORED = 2
+    ALL = MOVING | ANCHORED
+
+
+class Drawing:
+    """What a testbed looks like, below a path in Meshcat.
+
+    The objects are sent once; afterwards `pose` sends the poses of the moving frames, for any context of the testbed:
+    that of the simulation, or that of a fork. So several drawings of a testbed show its futures side by side.
+
+    Args:
+        meshcat: The server that shows it; only the thread that made it may use it.
+        testbed: A testbed with a SceneGraph.
+        context: A root context of the testbed, whose poses are shown first.
+        path: Where it is drawn; what is there is deleted.
+        tint: Colour of the moving frames, any matplotlib colour; their brightness stays. Their own colours if left out.
+        opacity: Opacity of the moving frames, in (0, 1].
+        parts: Whether moving frames, anchored geometry or both are drawn.
+
+    Raises:
+        ValueError: The testbed has no SceneGraph.
+    """
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        testbed: VirtualTestbed,
+        context: Context,
+        path: str,
+        *,
+        tint: ColorType | None = None,
+        opacity: float = 1.0,
+        parts: Parts = Parts.ALL,
+    ) -> None:
+        if testbed.scene_graph is None:
+            raise ValueError(f"{testbed!r} has no SceneGraph, so that there is nothing to draw")
+        self.path = path
+        self._meshcat, self._scene_graph = meshcat, testbed.scene_graph
+        query = self._query(context)
+        inspector = query.inspector()
+        self._frames: list[tuple[FrameId, str]] = []
+        meshcat.Delete(path)
+        for frame in inspector.GetAllFrameIds():
+            moves = frame != inspector.world_frame_id() and not _is_anchored(testbed.plant, frame)
+            geometries = inspector.GetGeometries(frame, Role.kIllustration)
+            if not geometries or not parts & (Parts.MOVING if moves else Parts.ANCHORED):
+                continue
+            place = f"{path}/{inspector.GetName(frame)}".replace("::", "/")
+            for geometry in geometries:
+                color = _color(inspector, geometry)
+                part = f"{place}/{inspector.GetName(geometry)}-{geometry.get_value()}".replace("::", "/")
+                meshcat.SetObject(part, inspector.GetShape(geometry), _tinted(color, tint, opacity) if moves else color)
+                meshcat.SetTransform(part, inspector.GetPoseInFrame(geometry))
+            if moves:
+                self._frames.append((frame, place))
+            else:
+                meshcat.SetTransform(place, query.GetPoseInWorld(frame))
+        self.pose(context)
+
+    def pose(self, context: Context, *, time_in_recording: float | None = None) -> None:
+        """Show the poses of a root context of the testbed; of a recording, at a time in seconds."""
+        query = self._query(context)
+        for frame, place in self._frames:
+            self._meshcat.SetTransform(place, query.GetPoseInWorld(frame), time_in_recording)
+
+    def _query(self, context: Context) -> QueryObject:
+        return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(context))
+
+    def fit_camera(self, context: Context) -> None:
+        """Move the camera so that the moving frames fill the view, seen from the front at the right, and above."""
+        query = self._query(context)
+        inspector = query.inspector()
+        corners = []
+        for frame, _ in self._frames:
+            for geometry in inspector.GetGeometries(frame, Role.kIllustration):
+                box = CalcObb(inspector.GetShape(geometry))
+                if box is not None:
+                    X_WB = query.GetPoseInWorld(frame) @ inspector.GetPoseInFrame(geometry) @ box.pose()
+                    corners.append(X_WB @ (_CORNERS * box.half_width()).T)
+        if not corners:
+            return
+        points = np.hstack(corners)
+        lower, upper = points.min(axis=1), points.max(axis=1)
+        center, size = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
+        self._meshcat.SetCameraPose(center + _VIEW_DISTANCE * size * _VIEW_DIRECTION, center)
+
+    def show(self, visible: bool = True) -> None:
+        """Show or hide it."""
+        self._meshcat.SetProperty(self.path, "visible", visible)
+
+    def delete(self) -> None:
+        """Remove it from the scene."""
+        self._meshcat.Delete(self.path)
+
+
+def _is_anchored(plant: MultibodyPlant | None, frame: FrameId) -> bool:
+    body = plant.GetBodyFromFrameId(frame) if plant is not None else None
+    return plant is not None and body is not None and plant.IsAnchored(body)
+
+
+def _color(inspector: SceneGraphInspector, geometry: GeometryId) -> Rgba:
+    """Return the colour in which a geometry is illustrated."""
+    properties = inspector.GetIllustrationProperties(geometry)
+    color: Rgba = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
+    return color
+
+
+def _tinted(color: Rgba, tint: ColorType | None, opacity: float) -> Rgba:
+    """Return a colour in another tint, of the same brightness, so that the parts of a robot can be distinguished."""
+    rgb = np.array([color.r(), color.g(), color.b()])
+    if tint is not None:
+        rgb = 0.75 * np.array(to_rgb(tint)) + 0.25 * rgb @ _BRIGHTNESS
+    return Rgba(*rgb, color.a() * opacity)
