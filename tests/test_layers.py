@@ -66,15 +66,17 @@ BELOW["state"].add("drake_version")
 BELOW["child_process"].add("drake_version")
 BELOW["project"] = {"state", "testbed", "components", "station", "failures"}
 BELOW["visualization"] = set(BELOW)
+BELOW["web"] = set(BELOW)
 BELOW["testing"] = set(BELOW)
 BELOW["cli"] = set(BELOW)
 BELOW["__main__"] = {"cli"}
-TOP = {"visualization", "testing", "cli"}
+TOP = {"visualization", "web", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
-# `visualization`, a scenario is deployed by `deployment`, and what was calibrated is drawn by `calibration`.
+# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, and a testbed is
+# shown by `web`.
 MAY_DELEGATE: dict[str, set[str]] = {
-    "testbed": {"calibration", "deployment", "visualization"},
+    "testbed": {"calibration", "deployment", "visualization", "web"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
 }
 

@@ -36,6 +36,7 @@ _COMMANDS = {
     "study": "study:study",
     "sweep": "problem:sweep",
     "variables": "testbed:variables",
+    "view": "view:view",
     "watch": "live:watch",
 }
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import ceil, inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
     from vtbdrake.testbed.signal import Interface
     from vtbdrake.testbed.switch import Switches
+    from vtbdrake.web import View
 
 
 @dataclass(frozen=True)
@@ -303,6 +304,22 @@ class VirtualTestbed(AddressedDiagram):
         for selectors, positions in ((self._sense, senses), (self._act, acts)):
             for name, position in positions.items():
                 selectors[name].set(context, position)
+
+    def view(self, context: Context | None = None, **options: Any) -> View:
+        """Run a copy of this testbed in the background, with a web page where it is watched and steered.
+
+        Args:
+            context: The state to start from; s0 if left out.
+            options: Further keyword arguments of `vtbdrake.web.view`.
+
+        Raises:
+            ValueError: The testbed was built without a scenario, or as `vtbdrake.web.view` raises it.
+        """
+        from vtbdrake.web import view
+
+        if self.scenario is None:
+            raise ValueError("this testbed was built without a scenario, so that no copy of it can be built")
+        return view(self.scenario, start=None if context is None else self.snapshot(context), **options)
 
     # -- s(t) as a whole
 

@@ -1,0 +1,203 @@
+"""Tests of the page in a real browser: what is in the picture, what the controls do."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
+from vtbdrake.web import View, view
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
+PATIENCE = 120_000  # ms
+GREEN, BLUE = np.array([0, 158, 115]), np.array([0, 114, 178])  # tints of the ghosts
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, "--disable-component-update"])
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def running() -> Iterator[View]:
+    with view(CartPoleScenario(), values=START) as opened:
+        yield opened
+
+
+@pytest.fixture
+def page(browser: Browser, running: View) -> Iterator[Page]:
+    opened = browser.new_page(viewport={"width": 1000, "height": 650})
+    opened.set_default_timeout(PATIENCE)
+    failures: list[str] = []
+    opened.on("pageerror", lambda error: failures.append(str(error)))
+    opened.goto(running.url)
+    opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+    yield opened
+    opened.close()
+    assert not failures
+
+
+def picture(page: Page) -> np.ndarray:
+    """The scene, between panel and bar, when all that has been sent is drawn; shape (height, width, 3)."""
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    clip = {"x": 345, "y": 110, "width": 650, "height": 480}
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).astype(int)
+
+
+def share(image: np.ndarray, color: np.ndarray) -> float:
+    """The share of pixels with the hue of a colour."""
+    chroma = image - image.mean(axis=2, keepdims=True)
+    wanted = (color - color.mean()) / np.linalg.norm(color - color.mean())
+    length = np.linalg.norm(chroma, axis=2)
+    return float(np.mean((length > 40) & (chroma @ wanted > 0.95 * length)))
+
+
+def drawn(page: Page, until: str) -> None:
+    page.wait_for_function(until)
+
+
+def settle(page: Page) -> None:
+    """Wait for a few frames of the session from now on."""
+    frames = int(page.evaluate("vtb.frames"))
+    drawn(page, f"vtb.frames >= {frames + 4}")
+
+
+def watch(page: Page, address: str) -> None:
+    page.fill("#vtb-panel input[type=search]", address)
+    page.click(f"#vtb-matches li >> text='{address}'")
+    drawn(page, f"vtb.watched.get('{address}').values.length > 0")
+
+
+def drag(page: Page, to: float) -> None:
+    """Press the slider of the watched variable and move it, without a release."""
+    box = page.locator(".vtb-watched input[type=range]").bounding_box()
+    assert box is not None
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 0.5 * box["width"], y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + to * box["width"], y, steps=4)
+
+
+def test_time_runs_and_the_robot_moves(page: Page, running: View) -> None:
+    assert page.url.endswith("/")  # The token is not in the address any more.
+    assert page.title() == "CartPoleScenario"
+    settle(page)
+    before = picture(page)
+    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 100  # not a black canvas
+    page.keyboard.press(".")
+    drawn(page, "vtb.clock.textContent === '0.008 s'")
+    page.keyboard.press("Space")
+    drawn(page, "parseFloat(vtb.clock.textContent) > 0.3 && vtb.rate.textContent.endsWith('×')")
+    page.keyboard.press("Space")
+    drawn(page, "vtb.rate.textContent === 'paused'")
+    settle(page)
+    assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.002  # the pole
+    steps = round(running.session.snapshot().time / running.session.config.step)
+    assert angle(running.session) == angle_by_hand(steps)
+    page.keyboard.press("r")
+    drawn(page, "vtb.clock.textContent === '0.000 s'")
+    settle(page)
+    assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) < 0.0005
+
+
+def test_dragged_slider_previews_and_its_release_commits(page: Page, running: View) -> None:
+    page.click("#vtb-step")
+    watch(page, ANGLE)
+    settle(page)
+    assert share(picture(page), GREEN) < 1e-4
+    drag(page, 0.7)
+    page.wait_for_selector("[data-kind=preview]")
+    drawn(page, "vtb.messages.textContent.includes('preview until 2.01 s')")
+    settle(page)
+    assert share(picture(page), GREEN) > 0.002
+    page.keyboard.press("Escape")
+    page.wait_for_selector("[data-kind=preview]", state="detached")
+    page.mouse.up()
+    settle(page)
+    assert share(picture(page), GREEN) < 1e-4
+    assert angle(running.session) == angle_by_hand(1)  # Esc does nothing.
+    drag(page, 0.7)
+    drawn(page, f"vtb.watched.get('{ANGLE}').draft === 'open'")
+    page.mouse.up()
+    drawn(page, f"Math.abs(vtb.watched.get('{ANGLE}').values[0] - 2.0) > 0.2")
+    value = float(page.evaluate(f"vtb.watched.get('{ANGLE}').values[0]"))
+    assert angle(running.session) == value
+
+
+def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: View) -> None:
+    watch(page, MASS)
+    page.check("#vtb-compare")
+    page.fill(".vtb-watched input[type=text]", "0.9")
+    page.keyboard.press("Enter")
+    drawn(page, f"vtb.watched.get('{MASS}').values[0] === 0.9")
+    page.click("#vtb-play")
+    drawn(page, "parseFloat(vtb.clock.textContent) > 0.8 && vtb.differences.rows.length > 2")
+    page.click("#vtb-play")
+    settle(page)
+    assert MASS in page.inner_text("#vtb-differences")
+    assert share(picture(page), BLUE) > 0.002
+    assert float(running.session.snapshot().values[MASS]) == 0.9
+
+
+def test_scrubbed_history_goes_back(page: Page, running: View) -> None:
+    page.click("#vtb-play")
+    drawn(page, "Number(vtb.history.max) > 0.6")
+    page.click("#vtb-play")
+    box = page.locator("#vtb-history").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + 0.4 * box["width"], box["y"] + box["height"] / 2)
+    drawn(page, "parseFloat(vtb.clock.textContent) < 0.6 * Number(vtb.history.max)")
+    settle(page)
+    steps = round(running.session.snapshot().time / running.session.config.step)
+    assert angle(running.session) == angle_by_hand(steps)
+
+
+def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:
+    page.select_option("#vtb-sense-joint_position", "real")
+    drawn(page, "vtb.messages.textContent.includes('nothing feeds real.sense.joint_position')")
+    drawn(page, "document.querySelector('#vtb-sense-joint_position').value === 'sim'")
+    second = browser.new_page()
+    second.goto(running.url)
+    second.wait_for_selector("#vtb-take")
+    second.click("#vtb-take")
+    page.wait_for_selector("#vtb-take")
+    second.keyboard.press(".")
+    drawn(page, "vtb.clock.textContent === '0.008 s'")
+    second.close()
+    page.wait_for_selector("#vtb-take", state="detached")
+
+
+def test_page_of_another_origin_cannot_use_the_server(page: Page, running: View, browser: Browser) -> None:
+    hostile = browser.new_page()
+    hostile.goto("data:text/html,<title>hostile</title>")
+    url = page.url.replace("http", "ws", 1)
+    closed = f"""(path) => new Promise((done) => {{
+        const socket = new WebSocket("{url}" + path);
+        socket.onopen = () => done("open");
+        socket.onerror = () => done("refused");
+    }})"""
+    assert [hostile.evaluate(closed, path) for path in ("", "session")] == ["refused", "refused"]
+    assert page.evaluate(closed, "session") == "open"
+    hostile.close()
+
+
+def test_closed_session_is_told(page: Page, running: View) -> None:
+    running.close()
+    drawn(page, "document.body.dataset.session === 'ended'")
+    assert "the session has ended" in page.inner_text("#vtb-messages")

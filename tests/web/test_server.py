@@ -1,0 +1,201 @@
+"""Tests of the server: who may use it, what its sockets answer, and what it keeps from Meshcat."""
+
+from __future__ import annotations
+
+import json
+import random
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgpack
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from vtbdrake.web import View, view
+from vtbdrake.web.relay import Newest
+from vtbdrake.web.server import PortError
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+
+ANGLE = "sim.sys.cart_pole.pole_pin.position"
+PATIENCE = 60.0
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[View]:
+    with view(CartPoleScenario()) as opened:
+        yield opened
+
+
+class NoRedirect(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+def ask(url: str, headers: dict[str, str] | None = None) -> tuple[int, str, Any]:
+    """Status, body and headers of an answer."""
+    opener = urllib.request.build_opener(NoRedirect)
+    try:
+        with opener.open(urllib.request.Request(url, headers=headers or {}), timeout=PATIENCE) as answer:
+            return answer.status, answer.read().decode(), answer.headers
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode(), error.headers
+
+
+def base(running: View) -> str:
+    parts = urlsplit(running.url)
+    return f"{parts.scheme}://{parts.netloc}/"
+
+
+def cookie(running: View) -> dict[str, str]:
+    status, _, headers = ask(running.url)
+    assert status == 303 and headers["location"] == "./"
+    name, attributes = headers["set-cookie"].split(";", 1)
+    assert "HttpOnly" in attributes and "samesite=strict" in attributes.lower()
+    return {"Cookie": name}
+
+
+def page(running: View, path: str = "session", headers: dict[str, str] | None = None) -> ClientConnection:
+    url = base(running).replace("http", "ws", 1) + path
+    return connect(url, additional_headers=cookie(running) | (headers or {}), max_size=None, open_timeout=PATIENCE)
+
+
+def receive(socket: ClientConnection, kind: str) -> dict[str, Any]:
+    while True:
+        message: dict[str, Any] = json.loads(socket.recv(PATIENCE))
+        if message["type"] == kind:
+            return message
+
+
+def command(socket: ClientConnection, do: str, **fields: Any) -> str:
+    """The error that a command brings; empty if it is carried out."""
+    socket.send(json.dumps({"id": 1, "do": do, **fields}))
+    return str(receive(socket, "answer")["error"])
+
+
+def test_only_who_knows_the_token_gets_the_page(running: View) -> None:
+    url, token = base(running), cookie(running)
+    status, text, headers = ask(url, token)
+    assert status == 200 and "viewer" in text and 'src="page/view.js"' in text
+    assert headers["referrer-policy"] == "no-referrer"
+    assert ask(f"{url}page/view.js", token)[0] == 200
+    for path in ("", "page/view.js", "?token=wrong", "cas-v1/anything"):
+        status, text, _ = ask(url + path)
+        assert status == 403 and "the token is missing or wrong" in text
+    assert ask(url, {"Cookie": "vtbdrake-1=" + token["Cookie"].split("=")[1]})[0] == 403
+
+
+def test_foreign_host_and_foreign_origin_are_refused(running: View) -> None:
+    url, token = base(running), cookie(running)
+    status, text, _ = ask(url, token | {"Host": "evil.example"})  # a name that was bound to 127.0.0.1 later
+    assert status == 403 and "not reached as 'evil.example'" in text
+    status, text, _ = ask(url, token | {"Origin": "http://evil.example"})
+    assert status == 403 and "pages of http://evil.example" in text
+    assert ask(url, token | {"Origin": url.rstrip("/")})[0] == 200
+    for path in ("", "session"):
+        with pytest.raises(InvalidStatus) as refused:
+            page(running, path, {"Origin": "http://evil.example"})
+        assert refused.value.response.status_code == 403
+    with pytest.raises(InvalidStatus), connect(url.replace("http", "ws", 1) + "session"):
+        pass
+
+
+def test_port_in_use_is_an_error(running: View) -> None:
+    with pytest.raises(PortError, match=r"port \d+ cannot be used .*: give another one"):
+        view(CartPoleScenario(), port=urlsplit(running.url).port or 0)
+
+
+def test_page_watches_and_steers(running: View) -> None:
+    with page(running) as socket:
+        hello = receive(socket, "hello")
+        assert hello["variables"][ANGLE] == {
+            "kind": "x", "shape": [], "unit": "rad", "bounds": [[None], [None]], "settable": True
+        }  # fmt: skip
+        assert command(socket, "watch", addresses=[ANGLE]) == ""
+        assert command(socket, "write", values={ANGLE: 0.5}) == ""
+        while (frame := receive(socket, "frame"))["values"] != {ANGLE: 0.5}:
+            pass
+        assert frame["steers"] and not frame["playing"]
+        assert command(socket, "step", steps=3) == ""
+        assert running.session.snapshot().time == 3 * running.session.config.step
+        assert "no variable" in command(socket, "write", values={"nothing": 1.0})
+        assert "there is no command 'explode'" in command(socket, "explode")
+        assert command(socket, "seek") == "'time'"
+        socket.send("[1")
+        assert receive(socket, "answer")["error"]
+        assert command(socket, "reset") == ""
+
+
+def test_one_page_steers_and_the_others_watch(running: View) -> None:
+    with page(running) as first:
+        receive(first, "frame")
+        with page(running) as second:
+            assert command(first, "pause") == ""
+            assert command(second, "pause") == "another page steers this session: take over first"
+            assert command(second, "watch", addresses=[ANGLE]) == ""
+            assert command(second, "take over") == ""
+            assert command(second, "pause") == ""
+            assert "another page steers" in command(first, "pause")
+        # The one that has steered is gone.
+        while not receive(first, "frame")["steers"]:
+            pass
+        assert command(first, "pause") == ""
+
+
+def test_meshcat_is_shown_and_gets_nothing_from_the_browser(running: View) -> None:
+    with page(running, "") as socket:
+        scene = {}
+        while "/drake/now/cart_pole/pole" not in scene:
+            message = msgpack.unpackb(socket.recv(PATIENCE))
+            scene[message.get("path")] = message["type"]
+        socket.send(msgpack.packb({"type": "button", "name": "Stop Simulation"}))
+        running.session.advance()
+        while msgpack.unpackb(socket.recv(PATIENCE)).get("path") != "/drake/now/cart_pole/pole":
+            pass
+
+
+def test_closed_view_closes_its_pages() -> None:
+    opened = view(CartPoleScenario())
+    socket = page(opened)
+    opened.close()
+    with pytest.raises(ConnectionClosed):
+        while True:
+            socket.recv(PATIENCE)
+    with pytest.raises(urllib.error.URLError):
+        ask(base(opened))
+
+
+# -- transforms that wait
+
+
+def scene_after(messages: list[dict[str, Any]]) -> dict[str, Any]:
+    """The last transform of each path, and the objects, as a browser keeps them."""
+    scene: dict[str, Any] = {}
+    for message in messages:
+        if message["type"] == "delete":
+            scene = {path: value for path, value in scene.items() if not path.startswith(message["path"])}
+        else:
+            scene.setdefault(message["path"], {})[message["type"]] = message["value"]
+    return scene
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize("seed", range(20))
+def test_slow_browser_ends_with_the_same_scene(seed: int) -> None:
+    rng, queue, sent, received = random.Random(seed), Newest(), [], []
+    for number in range(300):
+        kind = rng.choices(["set_transform", "set_object", "delete"], [20, 2, 1])[0]
+        message = {"type": kind, "path": f"/drake/{rng.choice('ab')}/{rng.choice('xyz')}", "value": number}
+        if kind == "delete":
+            message["path"] = message["path"][:8]
+        sent.append(message)
+        queue.put(msgpack.packb(message))
+        if rng.random() < 0.1:
+            received.append(msgpack.unpackb(queue.get_nowait()))
+    while queue:
+        received.append(msgpack.unpackb(queue.get_nowait()))
+    assert scene_after(received) == scene_after(sent)
+    assert len(received) + queue.replaced == 300 and queue.replaced > 50

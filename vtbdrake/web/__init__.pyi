@@ -1,0 +1,9 @@
+"""The public names of the live page."""
+
+from vtbdrake.web.fork import Fork as Fork
+from vtbdrake.web.session import Frame as Frame
+from vtbdrake.web.session import Session as Session
+from vtbdrake.web.session import SessionConfig as SessionConfig
+from vtbdrake.web.session import SessionError as SessionError
+from vtbdrake.web.viewer import View as View
+from vtbdrake.web.viewer import view as view

@@ -1,0 +1,77 @@
+"""Who may use a server on this machine: the token of its address, the Host and the Origin of each request."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Collection
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from starlette.responses import PlainTextResponse, RedirectResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+
+
+class Access:
+    """An ASGI application that passes on the requests of those who know the token.
+
+    The token comes once, in the address that is printed, and is exchanged for a cookie that scripts cannot read.
+    Browsers send cookies of this machine to all its ports, so the cookie is named after the port. A page of another
+    origin can make a browser send requests, but neither choose their Host nor hide its Origin.
+
+    Args:
+        app: The application.
+        port: The port of the server.
+        hosts: Host names of proxies in front of it, beside those of the loopback interface.
+
+    Attributes:
+        token: The token.
+    """
+
+    def __init__(self, app: ASGIApp, *, port: int, hosts: Collection[str] = ()) -> None:
+        self.token = secrets.token_urlsafe(16)
+        self._app = app
+        self._cookie = f"vtbdrake-{port}"
+        self._hosts = {f"{name}:{port}" for name in _LOOPBACK} | set(hosts)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        query = parse_qs(scope["query_string"].decode("latin-1"))
+        reason = self._refusal(headers, query)
+        if reason and scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008, "reason": reason})  # becomes a 403
+        elif reason:
+            await PlainTextResponse(f"{reason}\n", status_code=403)(scope, receive, send)
+        elif scope["type"] == "http" and "token" in query and scope["path"] in ("", "/"):
+            response = RedirectResponse("./", status_code=303)
+            response.set_cookie(self._cookie, self.token, httponly=True, samesite="strict")
+            await response(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    def _refusal(self, headers: dict[str, str], query: dict[str, list[str]]) -> str:
+        """Return why a request is refused; empty if it is not."""
+        host = headers.get("host", "")
+        if host not in self._hosts:
+            return f"this server is not reached as {host!r}: open the address that it has printed"
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return f"pages of {origin} may not use this server"
+        tokens = [*query.get("token", []), self._cookies(headers).get(self._cookie, "")]
+        if not any(secrets.compare_digest(token.encode(), self.token.encode()) for token in tokens):
+            return "the token is missing or wrong: open the address that the server has printed, with its token"
+        return ""
+
+    @staticmethod
+    def _cookies(headers: dict[str, str]) -> dict[str, Any]:
+        try:
+            cookies = SimpleCookie(headers.get("cookie", ""))
+        except CookieError:
+            return {}
+        return {name: morsel.value for name, morsel in cookies.items()}

@@ -1,0 +1,497 @@
+// The controls of a session, beside Meshcat's viewer, whose page loads this module.
+
+const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
+const WINDOW = 20; // s of simulated time in a plot
+const MATCHES = 60; // addresses that the search lists
+const ENTRIES = 12; // entries of an array that get a slider
+const PREVIEW_PERIOD = 100; // ms between two drafts
+
+// -- elements
+
+function element(tag, properties = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name in made) made[name] = value;
+    else made.setAttribute(name, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+function load(tag, properties) {
+  return new Promise((resolve, reject) => {
+    document.head.append(element(tag, { ...properties, onload: resolve, onerror: reject }));
+  });
+}
+
+const number = (value) => (value === null || value === undefined ? "none" : Number(value).toPrecision(6) * 1 + "");
+
+// -- the connection
+
+class Session {
+  #socket;
+  #number = 0;
+  #waiting = new Map();
+
+  constructor(handlers) {
+    this.#socket = new WebSocket(new URL("session", location.href).href.replace(/^http/, "ws"));
+    this.#socket.onmessage = ({ data }) => {
+      const message = JSON.parse(data);
+      if (message.type !== "answer") return handlers[message.type](message);
+      const { resolve, reject } = this.#waiting.get(message.id) ?? {};
+      this.#waiting.delete(message.id);
+      if (message.error) reject?.(new Error(message.error));
+      else resolve?.(message.result);
+    };
+    this.#socket.onclose = () => {
+      for (const { reject } of this.#waiting.values()) reject(new Error("the session has ended"));
+      this.#waiting.clear();
+      handlers.closed();
+    };
+  }
+
+  // Sends a command; the promise is fulfilled when it has been carried out.
+  ask(command, fields = {}) {
+    const id = ++this.#number;
+    return new Promise((resolve, reject) => {
+      this.#waiting.set(id, { resolve, reject });
+      this.#socket.send(JSON.stringify({ id, do: command, ...fields }));
+    });
+  }
+}
+
+// -- a watched variable
+
+class Watched {
+  constructor(page, address, variable) {
+    Object.assign(this, { page, address, variable, values: [] });
+    this.draft = "none"; // "open" while a slider is dragged, "cancelled" until it is released
+
+    const size = variable.shape.reduce((product, n) => product * n, 1);
+    this.size = Math.min(size, ENTRIES);
+    this.entries = Array.from({ length: this.size }, (_, index) => this.#entry(index));
+    this.root = element(
+      "section",
+      { className: "vtb-watched" },
+      element(
+        "header",
+        {},
+        element("b", {}, address),
+        element("span", {}, variable.unit === "1" ? "" : variable.unit),
+        element("button", { className: "plain", title: "plot", onclick: () => this.togglePlot() }, "plot"),
+        element("button", { className: "plain", title: "remove", onclick: () => page.unwatch(this) }, "×"),
+      ),
+      ...this.entries.map((entry) => entry.row),
+      size > ENTRIES ? element("small", {}, `and ${size - ENTRIES} more entries`) : "",
+    );
+    this.root.dataset.address = address;
+  }
+
+  #entry(index) {
+    const settable = this.variable.settable;
+    const [lower, upper] = this.variable.bounds.map((bounds) => bounds[index]);
+    const text = element("input", {
+      type: "text",
+      readOnly: !settable,
+      "aria-label": `${this.address}[${index}]`,
+      onchange: () => this.#commit(index, Number(text.value)),
+      onfocus: () => (this.typing = true),
+      onblur: () => (this.typing = false),
+    });
+    if (!settable) return { text, row: element("div", { className: "vtb-entry fixed" }, text) };
+    const slider = element("input", {
+      type: "range",
+      step: "any",
+      "aria-label": `${this.address}[${index}]`,
+      onpointerdown: () => (this.draft = "none"),
+      oninput: () => this.#preview(index, Number(slider.value)),
+      onchange: () => this.#commit(index, Number(slider.value)),
+    });
+    const row = element("div", { className: "vtb-entry" }, slider, text);
+    return { text, slider, row, lower, upper, ranged: false };
+  }
+
+  #with(index, value) {
+    const values = this.values.map((old, i) => (i === index ? value : old));
+    return this.variable.shape.length ? this.page.shaped(values, this.variable.shape) : values[0];
+  }
+
+  // A drag is a draft: a fork of now runs ahead with it.
+  #preview(index, value) {
+    if (this.draft === "cancelled") return;
+    this.draft = "open";
+    this.entries[index].row.classList.add("draft");
+    this.entries[index].text.value = number(value);
+    this.page.preview(this, { [this.address]: this.#with(index, value) });
+  }
+
+  // The release commits, unless the draft was cancelled.
+  #commit(index, value) {
+    const cancelled = this.draft === "cancelled";
+    this.close("none");
+    if (cancelled) return;
+    if (!Number.isFinite(value)) return this.page.say(`${this.address} takes a number`, "bad");
+    this.page.commit({ [this.address]: this.#with(index, value) });
+  }
+
+  close(draft) {
+    this.draft = draft;
+    for (const { row } of this.entries) row.classList.remove("draft");
+  }
+
+  show(time, value) {
+    this.values = Array.isArray(value) ? value : [value];
+    this.entries.forEach((entry, index) => {
+      const now = this.values[index];
+      if (this.draft === "open" || this.typing) return;
+      entry.text.value = number(now);
+      if (!entry.slider) return;
+      if (!entry.ranged || now < Number(entry.slider.min) || now > Number(entry.slider.max)) {
+        const reach = Math.max(2 * Math.abs(now), 1);
+        entry.slider.min = entry.lower ?? now - reach;
+        entry.slider.max = entry.upper ?? now + reach;
+        entry.ranged = true;
+      }
+      entry.slider.value = now;
+    });
+    this.#extend(time);
+  }
+
+  togglePlot() {
+    if (this.plot) {
+      this.plot.destroy();
+      this.plot = null;
+      return;
+    }
+    this.data = [[], ...Array.from({ length: this.size }, () => [])];
+    const colors = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
+    this.plot = new uPlot(
+      {
+        width: this.root.clientWidth - 18,
+        height: 130,
+        legend: { show: false },
+        scales: { x: { time: false }, y: { range: (_, least, most) => (least < most ? [least, most] : [least - 1, most + 1]) } },
+        axes: [{ size: 24, space: 60 }, { size: 52 }],
+        series: [{}, ...this.entries.map((_, i) => ({ stroke: colors[i % colors.length], width: 1.5 }))],
+      },
+      this.data,
+      this.root,
+    );
+  }
+
+  #extend(time) {
+    if (!this.plot) return;
+    let [times] = this.data;
+    while (times.length && times.at(-1) >= time) this.data.forEach((series) => series.pop());
+    times.push(time);
+    this.values.slice(0, this.size).forEach((value, i) => this.data[i + 1].push(value));
+    while (times.length && times[0] < time - WINDOW) this.data.forEach((series) => series.shift());
+    this.plot.setData(this.data);
+  }
+}
+
+// -- the page
+
+class Page {
+  constructor() {
+    this.watched = new Map();
+    this.variables = {};
+    this.frames = 0;
+    this.#build();
+    this.session = new Session({
+      hello: (message) => this.#hello(message),
+      frame: (frame) => this.#frame(frame),
+      closed: () => {
+        document.body.dataset.session = "ended";
+        this.say("the session has ended", "bad", "closed");
+      },
+    });
+    document.addEventListener("keydown", (event) => this.#key(event));
+  }
+
+  #build() {
+    const button = (id, label, title, onclick) => element("button", { id, title, onclick }, label);
+    this.title = element("h1");
+    this.messages = element("div", { id: "vtb-messages", role: "status" });
+    this.search = element("input", { type: "search", placeholder: "find an address", oninput: () => this.#find() });
+    this.matches = element("ul", { id: "vtb-matches" });
+    this.sections = element("div");
+    this.switches = element("div", { id: "vtb-switches" });
+    this.differences = element("table", { id: "vtb-differences" });
+    this.compare = element("input", { type: "checkbox", id: "vtb-compare" });
+    this.follow = element("select", { id: "vtb-follow", onfocus: () => this.#listBodies() }, element("option", { value: "" }, "nothing"));
+    document.body.append(
+      this.messages,
+      element(
+        "aside",
+        { id: "vtb-panel" },
+        this.title,
+        element("h2", {}, "Variables"),
+        this.search,
+        this.matches,
+        this.sections,
+        element("p", {}, element("label", {}, this.compare, " show the course without the change, too")),
+        this.differences,
+        element("h2", {}, "Switches"),
+        this.switches,
+        element("h2", {}, "Camera"),
+        element("label", {}, "follows ", this.follow),
+      ),
+      element(
+        "footer",
+        { id: "vtb-bar" },
+        button("vtb-fold", "☰", "show or hide the panel", () => this.#fold()),
+        (this.playButton = button("vtb-play", "play", "play or pause (space)", () => this.toggle())),
+        button("vtb-step", "step", "one step (.)", () => this.ask("step")),
+        button("vtb-reset", "reset", "begin again (r)", () => this.ask("reset")),
+        (this.speed = element(
+          "select",
+          { id: "vtb-speed", title: "speed (+ and -)", onchange: () => this.ask("speed", { speed: Number(this.speed.value) }) },
+          ...SPEEDS.map((speed) => element("option", { value: speed }, speed < 1 ? `1/${1 / speed} ×` : `${speed} ×`)),
+        )),
+        (this.clock = element("output", { id: "vtb-time", title: "simulated time" })),
+        (this.rate = element("output", { id: "vtb-rate", title: "simulated seconds per second" })),
+        (this.history = element("input", { id: "vtb-history", type: "range", step: "any", title: "go back", oninput: () => this.#scrub() })),
+      ),
+    );
+    this.speed.value = 1;
+    dispatchEvent(new Event("resize"));
+  }
+
+  #hello({ scenario, variables }) {
+    this.variables = variables;
+    this.title.textContent = scenario.split(":").at(-1);
+    this.title.title = scenario;
+    document.title = this.title.textContent;
+    document.body.dataset.session = "open";
+  }
+
+  ask(command, fields) {
+    return this.session.ask(command, fields).catch((error) => this.say(error.message, "bad"));
+  }
+
+  // Shows a message for a while; one of a kind replaces the older one of that kind and stays until it is taken back.
+  say(text, className = "", kind = "") {
+    let shown = kind && this.messages.querySelector(`[data-kind="${kind}"]`);
+    if (!shown) {
+      shown = element("p");
+      this.messages.prepend(shown);
+    }
+    shown.className = className;
+    if (shown.textContent !== text) shown.textContent = text;
+    if (kind) shown.dataset.kind = kind;
+    else setTimeout(() => shown.remove(), 8000);
+  }
+
+  takeBack(kind) {
+    this.messages.querySelector(`[data-kind="${kind}"]`)?.remove();
+  }
+
+  // -- variables
+
+  #find() {
+    const words = this.search.value.toLowerCase().split(/\s+/).filter(Boolean);
+    const addresses = words.length ? Object.keys(this.variables).filter((a) => words.every((word) => a.toLowerCase().includes(word))) : [];
+    this.matches.replaceChildren(
+      ...addresses.slice(0, MATCHES).map((address) =>
+        element(
+          "li",
+          { tabIndex: 0, onclick: () => this.watch(address), onkeydown: (event) => event.key === "Enter" && this.watch(address) },
+          address,
+          element("span", {}, this.variables[address].unit === "1" ? "" : this.variables[address].unit),
+        ),
+      ),
+    );
+  }
+
+  watch(address) {
+    if (this.watched.has(address)) return;
+    const watched = new Watched(this, address, this.variables[address]);
+    this.watched.set(address, watched);
+    this.sections.prepend(watched.root);
+    this.#askToWatch();
+  }
+
+  unwatch(watched) {
+    watched.root.remove();
+    this.watched.delete(watched.address);
+    this.#askToWatch();
+  }
+
+  #askToWatch() {
+    this.ask("watch", { addresses: [...this.watched.keys()] });
+  }
+
+  shaped(values, [first, ...rest]) {
+    if (!rest.length) return values;
+    const size = rest.reduce((product, n) => product * n, 1);
+    return Array.from({ length: first }, (_, i) => this.shaped(values.slice(i * size, (i + 1) * size), rest));
+  }
+
+  preview(watched, values) {
+    this.draft = { watched, values };
+    this.timer ??= setTimeout(() => {
+      this.timer = null;
+      if (this.draft) this.ask("preview", { values: this.draft.values });
+    }, PREVIEW_PERIOD);
+  }
+
+  commit(values) {
+    this.draft = null;
+    this.ask("write", { values, compare: this.compare.checked });
+  }
+
+  cancel() {
+    this.draft?.watched.close("cancelled");
+    this.draft = null;
+    this.ask("cancel_preview");
+    this.ask("cancel_comparison");
+  }
+
+  // -- time
+
+  toggle() {
+    return this.ask(this.playing ? "pause" : "play");
+  }
+
+  #changeSpeed(by) {
+    const index = SPEEDS.indexOf(Number(this.speed.value)) + by;
+    if (SPEEDS[index]) this.ask("speed", { speed: SPEEDS[index] });
+  }
+
+  #scrub() {
+    this.scrubbing = performance.now();
+    this.seekTimer ??= setTimeout(() => {
+      this.seekTimer = null;
+      this.ask("seek", { time: Number(this.history.value) });
+    }, PREVIEW_PERIOD);
+  }
+
+  #key(event) {
+    if (event.target.matches("input[type=text], input[type=search], select")) {
+      if (event.key === "Escape") event.target.blur();
+      return;
+    }
+    const actions = {
+      " ": () => this.toggle(),
+      ".": () => this.ask("step"),
+      r: () => this.ask("reset"),
+      "+": () => this.#changeSpeed(1),
+      "-": () => this.#changeSpeed(-1),
+      Escape: () => this.cancel(),
+    };
+    if (event.ctrlKey || event.metaKey || event.altKey || !actions[event.key]) return;
+    event.preventDefault();
+    actions[event.key]();
+  }
+
+  // -- what comes from the session
+
+  #frame(frame) {
+    this.playing = frame.playing;
+    this.playButton.textContent = frame.playing ? "pause" : "play";
+    this.clock.textContent = `${frame.time.toFixed(3)} s`;
+    this.rate.textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : "paused";
+    if (document.activeElement !== this.speed) this.speed.value = frame.speed;
+    [this.history.min, this.history.max] = frame.history;
+    if (!(performance.now() - this.scrubbing < 500)) this.history.value = frame.time;
+    for (const [address, value] of Object.entries(frame.values)) this.watched.get(address)?.show(frame.time, value);
+    this.#showSwitches(frame.positions);
+    this.#showState(frame);
+    this.frames += 1;
+    document.body.dataset.frame = frame.number;
+    document.body.dataset.frames = this.frames;
+  }
+
+  #showState({ steers, failure, warnings, preview, comparison }) {
+    if (steers) this.takeBack("steering");
+    else if (!this.messages.querySelector('[data-kind="steering"]')) {
+      this.say("another page steers: this one watches ", "", "steering");
+      const take = element("button", { id: "vtb-take", onclick: () => this.ask("take over") }, "steer here");
+      this.messages.querySelector('[data-kind="steering"]').append(take);
+    }
+    if (failure) this.say(`the simulation has failed: ${failure}`, "bad", "failure");
+    else this.takeBack("failure");
+    if (warnings.length) this.say(warnings.join("; "), "bad", "warnings");
+    else this.takeBack("warnings");
+    if (!preview) this.takeBack("preview");
+    else if (preview.refused) this.say(`preview: ${preview.refused}, at ${preview.time.toFixed(2)} s`, "bad", "preview");
+    else this.say(`preview until ${preview.time.toFixed(2)} s`, "draft", "preview");
+    const rows = comparison?.differences.slice(0, 12) ?? [];
+    if (this.differences.rows.length !== (comparison ? rows.length + 1 : 0)) {
+      const head = element("tr", {}, element("td", { colSpan: 2 }, rows.length ? "differs first:" : "no difference yet"));
+      const cells = rows.map(([address, time]) => element("tr", {}, element("td", {}, address), element("td", {}, `${time.toFixed(3)} s`)));
+      this.differences.replaceChildren(...(comparison ? [head, ...cells] : []));
+    }
+  }
+
+  #showSwitches(positions) {
+    for (const [side, signals] of Object.entries(positions)) {
+      for (const [signal, position] of Object.entries(signals)) {
+        const id = `vtb-${side}-${signal}`;
+        let chosen = document.getElementById(id);
+        if (!chosen) {
+          const places = side === "sense" ? ["sim", "real"] : ["sim", "real", "twin"];
+          chosen = element("select", { id, onchange: () => this.#throw(chosen, side, signal) }, ...places.map((p) => element("option", {}, p)));
+          this.switches.append(element("div", { className: "vtb-switch" }, element("label", { htmlFor: id }, `T_${side}.${signal}`), chosen));
+        }
+        if (document.activeElement !== chosen) chosen.value = position;
+      }
+    }
+  }
+
+  #throw(chosen, side, signal) {
+    this.ask("switch", { [side]: { [signal]: chosen.value } });
+    chosen.blur();
+  }
+
+  // -- the scene
+
+  #fold() {
+    document.body.classList.toggle("vtb-folded");
+    dispatchEvent(new Event("resize"));
+  }
+
+  #listBodies() {
+    const scene = viewer.scene_tree.find(["drake", "now"]).children;
+    const names = ["", ...Object.keys(scene)];
+    if (names.length === this.follow.options.length) return;
+    this.follow.replaceChildren(...names.map((name) => element("option", { value: name }, name || "nothing")));
+  }
+
+  // Called in each animation frame: what it follows keeps its place in the picture.
+  followBody() {
+    const name = this.follow.value;
+    if (name) {
+      const object = deepest(viewer.scene_tree.find(["drake", "now", name])).object;
+      const place = object.matrixWorld.elements.slice(12, 15);
+      if (this.followed === name) {
+        const [x, y, z] = place.map((value, i) => value - this.place[i]);
+        for (const point of [viewer.camera.position, viewer.controls.target]) {
+          // The camera hangs in a frame that is turned by -90 degrees about x.
+          point.x += x;
+          point.y += y;
+          point.z += z;
+        }
+      }
+      this.place = place;
+    }
+    this.followed = name;
+    requestAnimationFrame(() => this.followBody());
+  }
+}
+
+// Frames of models are nested: the first one that has an own transform is the body.
+function deepest(node) {
+  const names = Object.keys(node.children).filter((name) => !name.startsWith("<"));
+  return names.length === 1 && !node.object.position.lengthSq() ? deepest(node.children[names[0]]) : node;
+}
+
+await Promise.all([
+  load("link", { rel: "stylesheet", href: "page/view.css" }),
+  load("link", { rel: "stylesheet", href: "page/vendor/uPlot.min.css" }),
+  load("script", { src: "page/vendor/uPlot.iife.min.js" }),
+]);
+window.vtb = new Page();
+vtb.followBody();

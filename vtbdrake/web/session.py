@@ -1,0 +1,626 @@
+"""A testbed that is simulated in a thread of its own, watched and steered from others."""
+
+from __future__ import annotations
+
+import gc
+import queue
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+from math import floor, inf, isfinite
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from vtbdrake.argument_checks import as_number
+from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.settings import check_settings, setting
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.drawing import Drawing, Parts
+from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.web.fork import CommandLimits, Differences, Fork
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+    from pydrake.systems.framework import Context
+
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import Scenario
+
+_Result = TypeVar("_Result")
+
+# Colours of the ghosts: a preview, a preview that fails, the course without the intervention.
+_PREVIEW, _REFUSED, _WITHOUT = "#009e73", "#d00000", "#0072b2"
+_GHOST_OPACITY = 0.45
+
+# Of the wall time between two frames, what a simulation and a preview may take at most.
+_SHARE = 0.8
+
+# Wall time between frames while nothing moves.
+_IDLE_PERIOD = 0.2
+
+
+class SessionError(ValueError):
+    """A command to a session cannot be carried out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionConfig:
+    """How a session runs."""
+
+    step: float = setting(
+        0.0078125,
+        "Simulated time between two instants at which the simulation may be watched or changed.",
+        unit="s",
+        gt=0.0,
+        le=1.0,
+    )
+    frame_rate: float = setting(30.0, "Frames per second of wall time.", unit="Hz", gt=0.0, le=120.0)
+    history_period: float = setting(0.2, "Wall time between two states that are kept, to go back to.", unit="s", gt=0.0)
+    history_size: int = setting(600, "Number of states that are kept.", ge=2, le=100_000)
+    preview_horizon: float = setting(2.0, "How far a preview looks ahead.", unit="s", gt=0.0, le=60.0)
+
+    def __post_init__(self) -> None:
+        check_settings(self, error=SessionError)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a session shows at an instant.
+
+    Attributes:
+        number: Counts the frames.
+        time: Simulated time, in seconds.
+        playing: Whether time runs.
+        speed: Simulated seconds per second that are asked for.
+        rate: Those that are reached.
+        positions: Positions of the switches, by side and signal.
+        values: Values of the watched variables and ports, by address.
+        history: First and last time of the states that are kept.
+        warnings: What a machine's limits would refuse.
+        failure: Why the simulation has ended; empty while it can go on.
+        preview: What the preview has found: ``time``, ``end``, ``refused``; None if there is none.
+        comparison: Time and first differences of the course without the last intervention; None if there is none.
+    """
+
+    number: int
+    time: float
+    playing: bool
+    speed: float
+    rate: float
+    positions: Mapping[str, Mapping[str, str]]
+    values: Mapping[str, Any]
+    history: tuple[float, float]
+    warnings: tuple[str, ...]
+    failure: str
+    preview: Mapping[str, Any] | None
+    comparison: Mapping[str, Any] | None
+
+
+@dataclass
+class _Preview:
+    """A fork that runs ahead, and its ghost."""
+
+    fork: Fork
+    end: float
+    ghost: Drawing | None
+    refused: str = ""
+
+    def status(self) -> dict[str, Any]:
+        return {"time": self.fork.time, "end": self.end, "refused": self.refused or self.fork.failure}
+
+
+@dataclass
+class _Comparison:
+    """The course of the simulation without an intervention, and its ghost."""
+
+    fork: Fork
+    differences: Differences
+    ghost: Drawing | None
+
+    def status(self) -> dict[str, Any]:
+        differences = [(difference.address, difference.time) for difference in self.differences.first]
+        return {"failure": self.fork.failure, "differences": differences}
+
+
+@dataclass
+class _Pace:
+    """Relates simulated to wall time since the pace was set last."""
+
+    speed: float = 1.0
+    simulated: float = 0.0
+    wall: float = 0.0
+    rate: float = 0.0
+    _marks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=32))
+
+    def start(self, simulated: float, wall: float) -> None:
+        self.simulated, self.wall, self.rate = simulated, wall, 0.0
+        self._marks.clear()
+
+    def target(self, wall: float) -> float:
+        """Return the simulated time that is due."""
+        return inf if self.speed == inf else self.simulated + self.speed * (wall - self.wall)
+
+    def note(self, simulated: float, wall: float) -> None:
+        """Measure the rate over the last frames; what cannot be caught up is let go."""
+        self._marks.append((simulated, wall))
+        (first, begin), (last, end) = self._marks[0], self._marks[-1]
+        if end > begin:
+            self.rate = (last - first) / (end - begin)
+        if self.target(wall) - simulated > 0.25 * self.speed:
+            self.simulated, self.wall = simulated, wall
+
+
+class Session:
+    """Simulates a testbed in a thread of its own, where it can be watched and steered.
+
+    Everything that touches the testbed or its Meshcat happens in that thread. Other threads send commands; each method
+    waits for its command, and raises what it raises.
+
+    The simulation advances from one instant of a grid to the next, whatever the speed, so that its course does not
+    depend on when it is watched.
+
+    Args:
+        scenario: The scenario whose testbed is simulated.
+        start: A snapshot to start from; s0 if left out.
+        values: Variables that are set first, by address.
+        config: How it runs.
+
+    Attributes:
+        latest: The last frame.
+        variables: What can be watched and set: by address, ``kind``, ``shape``, ``unit``, ``bounds``, ``settable``.
+        meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
+
+    Raises:
+        ValueError: The testbed cannot be built, or a value cannot be set.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        start: Snapshot | None = None,
+        values: Mapping[str, Any] | None = None,
+        config: SessionConfig | None = None,
+    ) -> None:
+        self.scenario = scenario
+        self.config = config or SessionConfig()
+        self.latest: Frame | None = None
+        self.variables: Mapping[str, Mapping[str, Any]] = {}
+        self.meshcat_url = ""
+        self._start, self._values = start, dict(values or {})
+        self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
+        self._watched: dict[object, tuple[str, ...]] = {}
+        self._frame_ready = threading.Condition()
+        self._closed = False
+        ready: Future[None] = Future()
+        self._thread = threading.Thread(target=self._run, args=(ready,), name="vtbdrake session", daemon=True)
+        self._thread.start()
+        ready.result()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the simulation and its Meshcat."""
+        self._commands.put(None)
+        self._thread.join()
+
+    # -- commands
+
+    def play(self) -> None:
+        """Let time run.
+
+        Raises:
+            SessionError: The simulation has failed: go back first.
+        """
+        self._do(self._play)
+
+    def pause(self) -> None:
+        """Let time stand still."""
+        self._do(self._pause)
+
+    def advance(self, steps: int = 1) -> None:
+        """Pause, and simulate a number of steps."""
+        if not isinstance(steps, int) or not 1 <= steps <= 10_000:
+            raise SessionError(f"a session advances 1 to 10,000 steps, not {steps!r}")
+        self._do(lambda: self._advance_steps(steps))
+
+    def reset(self) -> None:
+        """Begin again; the speed and what is watched stay."""
+        self._do(self._reset)
+
+    def set_speed(self, speed: float) -> None:
+        """Set the simulated seconds per second; infinity: as fast as possible."""
+        speed = as_number("the speed", speed)
+        if not speed > 0.0:
+            raise SessionError(f"the speed is a positive number of simulated seconds per second, not {speed}")
+        self._do(lambda: self._set_speed(speed))
+
+    def write(self, values: Mapping[str, Any], *, compare: bool = False) -> None:
+        """Set variables now.
+
+        Args:
+            values: By address.
+            compare: Let the course without this intervention go on as a ghost, see `Frame.comparison`.
+
+        Raises:
+            ValueError: There is no such variable, or it does not take the value; nothing has been set.
+        """
+        self._do(lambda: self._write(dict(values), compare))
+
+    def switch(self, mode: str | None = None, *, sense: Any = None, act: Any = None) -> None:
+        """Throw switches, as `VirtualTestbed.switch` does."""
+        self._do(lambda: self._testbed.switch(self._context, mode, sense=sense, act=act))
+
+    def seek(self, when: float) -> None:
+        """Pause, and go back to the last state that was kept at or before a time.
+
+        What came later is forgotten at the next step of the simulation.
+        """
+        self._do(lambda: self._seek(as_number("the time", when)))
+
+    def preview(self, values: Mapping[str, Any]) -> None:
+        """Let a fork of now run ahead with other values, as a ghost; a preview that is under way begins anew."""
+        self._do(lambda: self._begin_preview(dict(values)))
+
+    def cancel_preview(self) -> None:
+        """End the preview."""
+        self._do(self._end_preview)
+
+    def cancel_comparison(self) -> None:
+        """End the course without the last intervention."""
+        self._do(self._end_comparison)
+
+    def watch(self, watcher: object, addresses: Collection[str]) -> None:
+        """Read variables and ports in each frame, for one of several watchers; an empty list ends it.
+
+        Raises:
+            AddressError: There is no such variable or port.
+        """
+        self._do(lambda: self._watch(watcher, tuple(addresses)))
+
+    def snapshot(self) -> Snapshot:
+        """Return s(t) of the present."""
+        return self._do(lambda: self._testbed.snapshot(self._context))
+
+    def wait_for_frame(self, after: int, timeout: float) -> Frame | None:
+        """Return the first frame with a number above ``after``, or None if it does not come in time."""
+        with self._frame_ready:
+            self._frame_ready.wait_for(lambda: self._closed or (self.latest and self.latest.number > after), timeout)
+            return self.latest if self.latest is not None and self.latest.number > after else None
+
+    def _do(self, action: Callable[[], _Result]) -> _Result:
+        if self._closed:
+            raise SessionError("the session has ended")
+        future: Future[_Result] = Future()
+        self._commands.put((action, future))
+        while True:
+            with suppress(TimeoutError):
+                return future.result(0.5)
+            if not self._thread.is_alive():
+                raise SessionError("the session has ended")
+
+    # -- in the thread of the session
+
+    def _run(self, ready: Future[None]) -> None:
+        try:
+            self._build()
+        except FAILURES as error:  # It is raised where the session is made.
+            self._closed = True
+            self._drop()
+            ready.set_exception(_failure(error))
+            return
+        ready.set_result(None)
+        try:
+            while not self._closed:
+                self._work()
+        finally:
+            with self._frame_ready:
+                self._closed = True
+                self._frame_ready.notify_all()
+            self._drop()
+
+    def _build(self) -> None:
+        self._testbed: VirtualTestbed = self.scenario.build()
+        self._limits = CommandLimits(self._testbed)
+        self._pace, self._playing, self._failure = _Pace(), False, ""
+        self._preview: _Preview | None = None
+        self._comparison: _Comparison | None = None
+        self._readers: dict[str, Callable[..., Any]] = {}
+        self._history: deque[tuple[float, Snapshot]] = deque(maxlen=self.config.history_size)
+        self._meshcat: Meshcat = make_meshcat()
+        self.meshcat_url = self._meshcat.web_url()
+        self._begin()
+        self._drawing = None
+        if self._testbed.scene_graph is not None:
+            self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
+            self._drawing.fit_camera(self._context)
+        self.variables = {
+            variable.address: {
+                "kind": variable.kind,
+                "shape": list(variable.shape),
+                "unit": variable.unit,
+                "bounds": [_plain(np.broadcast_to(bound, variable.shape)) for bound in variable.bounds],
+                "settable": not variable.derived,
+            }
+            for variable in self._testbed.variables().values()
+        }
+        self._next_frame = 0.0
+        self._show(time.monotonic())
+
+    def _begin(self) -> None:
+        self._context = self._testbed.default_context()
+        if self._start is not None:
+            self._testbed.restore(self._context, self._start)
+        self._testbed.write(self._context, self._values)
+        self._simulator = self._testbed.simulator(self._context, restored=self._start is not None)
+        if self._start is None:
+            self._simulator.Initialize()
+        self._failure = ""
+        self._history.clear()
+        self._kept_at = -inf
+
+    def _drop(self) -> None:
+        """Give up the Meshcat, which must end in the thread that made it, and all that refers to it."""
+        for name in ("_preview", "_comparison", "_drawing", "_simulator", "_context", "_meshcat"):
+            self.__dict__.pop(name, None)
+        gc.collect()
+
+    def _work(self) -> None:
+        """Carry out commands until the next frame is due, simulate, and show it."""
+        self._carry_out_commands()
+        if self._closed:
+            return
+        begin = time.monotonic()
+        deadline = begin + _SHARE / self.config.frame_rate
+        if self._playing:
+            self._simulate(deadline)
+        if self._preview is not None:
+            self._run_preview(max(deadline, time.monotonic() + 0.25 / self.config.frame_rate))
+        now = time.monotonic()
+        if now >= self._next_frame:
+            self._show(now)
+
+    def _carry_out_commands(self) -> None:
+        """Carry out what other threads have asked for; wait for it while there is nothing else to do."""
+        wait = self._idle_time()
+        while True:
+            try:
+                command = self._commands.get(timeout=wait) if wait > 0.0 else self._commands.get_nowait()
+            except queue.Empty:
+                return
+            wait = 0.0
+            if command is None:
+                self._closed = True
+                return
+            action, future = command
+            try:
+                future.set_result(action())
+            except FAILURES as error:  # It is raised in the thread that has asked.
+                future.set_exception(_failure(error))
+
+    def _idle_time(self) -> float:
+        """Return the wall time, in seconds, until there is something to do."""
+        if self._previewing:
+            return 0.0
+        now = time.monotonic()
+        wait = self._next_frame - now
+        if self._playing:
+            left = self._context.get_time() + self.config.step - self._pace.target(now)
+            wait = min(wait, left / self._pace.speed if isfinite(left) else 0.0)
+        return wait
+
+    @property
+    def _previewing(self) -> bool:
+        preview = self._preview
+        return preview is not None and not preview.status()["refused"] and preview.fork.time < preview.end
+
+    def _simulate(self, deadline: float) -> None:
+        """Advance to the simulated time that is due, until the deadline in wall time."""
+        while self._playing and (now := time.monotonic()) < deadline:
+            if self._pace.target(now) < self._context.get_time() + self.config.step:
+                return
+            self._step()
+
+    def _step(self) -> None:
+        """Advance to the next instant of the grid."""
+        step = self.config.step
+        after = step * (floor(self._context.get_time() / step + 1e-6) + 1)
+        self._forget_future()
+        try:
+            self._simulator.AdvanceTo(after)
+        except FAILURES as error:
+            self._failure, self._playing = one_line(error), False
+            return
+        if (comparison := self._comparison) is not None:
+            comparison.fork.advance_to(after)
+            if not comparison.fork.failure:
+                comparison.differences.compare(self._context, comparison.fork.context)
+
+    def _forget_future(self) -> None:
+        while self._history and self._history[-1][0] > self._context.get_time():
+            self._history.pop()
+
+    def _keep(self, now: float) -> None:
+        if now - self._kept_at >= self.config.history_period:
+            when = self._context.get_time()
+            if not self._history or when > self._history[-1][0]:
+                self._history.append((when, self._testbed.snapshot(self._context)))
+            self._kept_at = now
+
+    def _run_preview(self, deadline: float) -> None:
+        preview = self._preview
+        assert preview is not None
+        while self._previewing and time.monotonic() < deadline:
+            preview.fork.advance_to(min(preview.fork.time + self.config.step, preview.end))
+            preview.refused = preview.fork.failure or next(iter(self._limits.violations(preview.fork.context)), "")
+        if preview.refused and preview.ghost is not None and preview.ghost.path != "ghosts/refused":
+            preview.ghost.delete()
+            preview.ghost = self._ghost(preview.fork.context, "refused", _REFUSED)
+
+    def _ghost(self, context: Context, name: str, tint: str) -> Drawing | None:
+        if self._drawing is None:
+            return None
+        return Drawing(
+            self._meshcat,
+            self._testbed,
+            context,
+            f"ghosts/{name}",
+            tint=tint,
+            opacity=_GHOST_OPACITY,
+            parts=Parts.MOVING,
+        )
+
+    def _show(self, now: float) -> None:
+        """Draw, and publish a frame."""
+        moves = self._playing or self._preview is not None
+        self._next_frame = now + (1.0 / self.config.frame_rate if moves else _IDLE_PERIOD)
+        values: dict[str, Any] = {}
+        warnings: list[str] = []
+        try:
+            if self._playing:
+                self._pace.note(self._context.get_time(), now)
+            if not self._failure:
+                self._keep(now)
+                self._draw()
+                values = {address: _plain(reader(self._context)) for address, reader in self._readers.items()}
+                warnings = self._limits.violations(self._context)
+        except FAILURES as error:  # What draws or is watched cannot be computed in this state.
+            self._failure, self._playing = one_line(error), False
+        when, history = self._context.get_time(), self._history
+        frame = Frame(
+            number=1 if self.latest is None else self.latest.number + 1,
+            time=when,
+            playing=self._playing,
+            speed=self._pace.speed,
+            rate=self._pace.rate if self._playing else 0.0,
+            positions=self._testbed.positions(self._context),
+            values=values,
+            history=(history[0][0], history[-1][0]) if history else (when, when),
+            warnings=tuple(warnings),
+            failure=self._failure,
+            preview=None if self._preview is None else self._preview.status(),
+            comparison=None if self._comparison is None else self._comparison.status(),
+        )
+        with self._frame_ready:
+            self.latest = frame
+            self._frame_ready.notify_all()
+
+    def _draw(self) -> None:
+        if self._drawing is not None:
+            self._drawing.pose(self._context)
+        for part in (self._preview, self._comparison):
+            if part is not None and part.ghost is not None and not part.fork.failure:
+                try:
+                    part.ghost.pose(part.fork.context)
+                except FAILURES as error:  # Its state is not finite.
+                    part.fork.failure = one_line(error)
+
+    # -- what the commands do
+
+    def _play(self) -> None:
+        if self._failure:
+            raise SessionError(f"the simulation has failed ({self._failure}): go back, or reset")
+        self._playing = True
+        self._pace.start(self._context.get_time(), time.monotonic())
+
+    def _pause(self) -> None:
+        self._playing = False
+
+    def _advance_steps(self, steps: int) -> None:
+        if self._failure:
+            raise SessionError(f"the simulation has failed ({self._failure}): go back, or reset")
+        self._playing = False
+        for _ in range(steps):
+            self._step()
+        self._next_frame = 0.0
+
+    def _reset(self) -> None:
+        self._end_preview()
+        self._end_comparison()
+        self._begin()
+        self._pace.start(self._context.get_time(), time.monotonic())
+        self._next_frame = 0.0
+
+    def _set_speed(self, speed: float) -> None:
+        self._pace.speed = speed
+        self._pace.start(self._context.get_time(), time.monotonic())
+
+    def _write(self, values: dict[str, Any], compare: bool) -> None:
+        before = self._testbed.fork(self._simulator) if compare else None
+        self._testbed.write(self._context, values)
+        self._end_preview()
+        if before is not None:
+            self._end_comparison()
+            fork = Fork(self._testbed, before)
+            self._comparison = _Comparison(
+                fork, Differences(self._testbed), self._ghost(fork.context, "without", _WITHOUT)
+            )
+        self._next_frame = 0.0
+
+    def _seek(self, when: float) -> None:
+        if not isfinite(when):
+            raise SessionError(f"a session goes back to a time in seconds, not to {when}")
+        if not self._history:
+            raise SessionError("no state has been kept yet")
+        self._playing = False
+        self._end_preview()
+        self._end_comparison()
+        earlier = [entry for entry in self._history if entry[0] <= when + 1e-9]
+        _, snapshot = earlier[-1] if earlier else self._history[0]
+        self._context = self._testbed.default_context()
+        self._testbed.restore(self._context, snapshot)
+        self._simulator = self._testbed.simulator(self._context, restored=True)
+        self._failure = ""
+        self._next_frame = 0.0
+
+    def _begin_preview(self, values: dict[str, Any]) -> None:
+        fork = Fork(self._testbed, self._testbed.snapshot(self._context), values)
+        ghost = self._preview.ghost if self._preview is not None and not self._preview.refused else None
+        if ghost is None:
+            self._end_preview()
+            ghost = self._ghost(fork.context, "preview", _PREVIEW)
+        self._preview = _Preview(fork, fork.time + self.config.preview_horizon, ghost)
+
+    def _end_preview(self) -> None:
+        if self._preview is not None and self._preview.ghost is not None:
+            self._preview.ghost.delete()
+        self._preview = None
+
+    def _end_comparison(self) -> None:
+        if self._comparison is not None and self._comparison.ghost is not None:
+            self._comparison.ghost.delete()
+        self._comparison = None
+
+    def _watch(self, watcher: object, addresses: tuple[str, ...]) -> None:
+        readers = {address: self._testbed.reader(address) for address in addresses}
+        self._watched.pop(watcher, None)
+        if addresses:
+            self._watched[watcher] = addresses
+        wanted_addresses = {address for group in self._watched.values() for address in group}
+        self._readers = {a: reader for a, reader in (self._readers | readers).items() if a in wanted_addresses}
+        self._next_frame = 0.0
+
+
+def _failure(error: BaseException) -> Exception:
+    """Return what another thread raises for an error of this one, without the objects of this thread."""
+    traceback.clear_frames(error.__traceback__)
+    return error if isinstance(error, Exception) else SessionError(one_line(error))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of a variable or a port as plain data, for JSON; of an abstract one its text."""
+    if isinstance(value, float | int | bool):
+        return float(value) if isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return [float(entry) if isfinite(entry) else None for entry in value.ravel()]
+    return type(value).__name__

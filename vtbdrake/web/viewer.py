@@ -1,0 +1,77 @@
+"""A session with its page."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+from vtbdrake.lazy import extra_module
+from vtbdrake.web.session import Session, SessionConfig
+
+if TYPE_CHECKING:
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import Scenario
+    from vtbdrake.web.server import Server
+
+
+class View:
+    """A testbed that runs in the background, and its page, where it is watched and steered.
+
+    Attributes:
+        session: The running testbed: what the page can do, it can do, too.
+        url: Address of the page, with its token.
+    """
+
+    def __init__(self, session: Session, server: Server) -> None:
+        self.session, self._server = session, server
+        self.url = server.url
+
+    def __repr__(self) -> str:
+        return f"<View of {self.session.scenario.name()} at {self.url}>"
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the page and the testbed."""
+        self._server.close()
+        self.session.close()
+
+
+def view(
+    scenario: Scenario,
+    *,
+    start: Snapshot | None = None,
+    values: Mapping[str, Any] | None = None,
+    config: SessionConfig | None = None,
+    port: int = 0,
+    hosts: Collection[str] = (),
+) -> View:
+    """Run a testbed in the background, paused, with a page where it is watched and steered.
+
+    Args:
+        scenario: The scenario.
+        start: A snapshot to start from; s0 if left out.
+        values: Variables that are set first, by address.
+        config: How it runs.
+        port: The port of the page on the loopback interface; 0 for any that is free.
+        hosts: Host names (with port) under which proxies offer the page.
+
+    Raises:
+        ValueError: The testbed cannot be built, or a value cannot be set.
+        PortError: The port is taken.
+        ModuleNotFoundError: The extra ``web`` is not installed.
+    """
+    for name in ("msgpack", "starlette", "uvicorn", "websockets"):
+        extra_module(name, purpose="the live page", extra="web")
+    from vtbdrake.web.server import Server
+
+    session = Session(scenario, start=start, values=values, config=config)
+    try:
+        return View(session, Server(session, port=port, hosts=hosts))
+    except BaseException:
+        session.close()
+        raise
