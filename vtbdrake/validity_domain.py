@@ -318,7 +318,7 @@ class DomainWatch:
         self._domain = domain
         self._first: Departure | None = None
         self._in_a_row = 0
-        self._told = False
+        self._said = False
         self.windows = self.outside = 0
 
     def add(self, time: float, x: Array) -> Departure | None:
@@ -328,12 +328,12 @@ class DomainWatch:
             self._in_a_row = 0
             return None
         self.outside += 1
-        if self._in_a_row == 0 and not self._told:
+        if self._in_a_row == 0 and not self._said:
             self._first = self._domain.departure_at(time, x)
         self._in_a_row += 1
-        if self._told or self._in_a_row < self._domain.patience:
+        if self._said or self._in_a_row < self._domain.patience:
             return None
-        self._told = True
+        self._said = True
         return self._first
 
 
