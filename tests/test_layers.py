@@ -73,8 +73,8 @@ BELOW["__main__"] = {"cli"}
 TOP = {"visualization", "web", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
-# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, and a testbed is
-# shown by `web`.
+# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, and a testbed
+# is shown by `web`.
 MAY_DELEGATE: dict[str, set[str]] = {
     "testbed": {"calibration", "deployment", "visualization", "web"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
