@@ -147,12 +147,13 @@ def test_columns_with_a_defect_are_never_accepted(
     assert any(text in each for each in (*result.remarks, *result.reasons)), (result.remarks, result.reasons)
 
 
-def test_sensor_that_freezes_is_refused_or_not_accepted() -> None:
+def test_sensor_that_freezes_is_not_accepted() -> None:
     def frozen(q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.where(np.arange(len(q))[:, np.newaxis] % 900 < 600, q, q[0]), u
 
-    with pytest.raises(CalibrationError, match="the model runs away from the recordings within a step"):
-        calibrated(with_columns(pendulum_log(), frozen))
+    result = calibrated(with_columns(pendulum_log(), frozen))
+    assert not any(each.verdict == Verdict.ACCEPTED for each in result.parameters.values()), result
+    assert any("of the torques is not explained" in reason for reason in result.reasons), result
 
 
 def test_recording_without_any_motion_is_refused() -> None:

@@ -350,7 +350,11 @@ class Segments:
             innovation, gain = solved[..., : 1 + nz], solved[..., 1 + nz :]
             transposed = np.swapaxes(gain, 2, 3)
             X = X + transposed @ innovation
-            P = P - transposed @ gain
+            # Joseph's form: P stays positive, also where positions are all but exact.
+            K_gain = np.swapaxes(np.linalg.solve(np.swapaxes(L, 2, 3), gain), 2, 3)
+            update = np.broadcast_to(np.eye(3 * n), P.shape).copy()
+            update[..., :n] -= K_gain
+            P = update @ P @ np.swapaxes(update, 2, 3) + K_gain @ R @ np.swapaxes(K_gain, 2, 3)
             white[k], by_z[k] = innovation[..., 0], innovation[..., 1:]
             log_determinant += 2.0 * np.log(np.einsum("kwii->kwi", L)).sum(axis=(1, 2))
             states[k + 1] = trajectory[k + 1] + X[..., : 2 * n, 0]

@@ -20,6 +20,7 @@ FAILED = 1
 # Each command is imported when it is used: `run` on a robot does not load the optimizers of `study`.
 _COMMANDS = {
     "boundary": "problem:boundary",
+    "calibrate": "calibrate:calibrate",
     "campaign": "campaign:campaign",
     "diagram": "testbed:diagram",
     "doctor": "doctor:doctor",

@@ -1,0 +1,211 @@
+"""``vtbdrake calibrate``: fit numbers of a testbed to recordings, or test on simulated machines how well that works."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vtbdrake.cli import FailedError
+from vtbdrake.cli.options import (
+    Setting,
+    option,
+    output,
+    parse_scaled_range,
+    parse_setting,
+    scenario_argument,
+    settings,
+)
+from vtbdrake.cli.output import finite
+from vtbdrake.machine import MachineConfig
+from vtbdrake.testbed import Scenario
+
+if TYPE_CHECKING:
+    from vtbdrake.calibration import Calibration, SelfTest
+    from vtbdrake.optimization import Parameter
+    from vtbdrake.recording import Log
+
+
+def _parse_unit(text: str) -> tuple[str, str]:
+    name, equals, unit = (part.strip() for part in text.partition("="))
+    if not (name and equals and unit):
+        raise click.BadParameter(f"expected NAME=UNIT, not {text!r}")
+    return name, unit
+
+
+@click.command()
+@scenario_argument
+@click.argument("logs", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@option(
+    "--vary ADDRESS=LOWER:UPPER",
+    "A number of the plant or of its drives, and its range. May be repeated.",
+    name="parameters",
+    parse=parse_scaled_range,
+    multiple=True,
+)
+@option("--inertia ADDRESS", "A body whose ten inertial parameters are fitted. May be repeated.", multiple=True)
+@option("--position SIGNAL", "The sensor signal of the joint positions.", required=True)
+@option("--torque SIGNAL", "The actuator signal of the joint torques.", required=True)
+@option("--measured-torque", "The torques were measured in the drives, they are no commands.", is_flag=True)
+@option("--period S", "Compare positions only about every S seconds.", type=float)
+@option("--position-columns COLUMNS", "Of a table: the columns of the positions, COLUMN[,COLUMN...].", default="")
+@option("--torque-columns COLUMNS", "Of a table: the columns of the torques.", default="")
+@option("--time COLUMN", "Of a table: the column of the times.", default="time")
+@option(
+    "--unit NAME=UNIT",
+    "Of a table: the unit of a signal or of the times, if it is none of SI. May be repeated.",
+    name="units",
+    parse=_parse_unit,
+    multiple=True,
+)
+@option("--save FILE", "Write the calibrated scenario: .yaml.", parse=output(".yaml"))
+@option("--json", "Print a JSON object instead of a table.", name="as_json", is_flag=True)
+@option("--self-test", "Calibrate simulated machines whose numbers are hidden, instead of LOGS.", is_flag=True)
+@option(
+    "--set ADDRESS=VALUE",
+    "Of the self-test: set a variable of the DPS at the start, such as its plan. May be repeated.",
+    name="values",
+    parse=parse_setting,
+    multiple=True,
+)
+@option("--trials N", "Of the self-test: the number of machines.", type=click.IntRange(min=1), default=10)
+@option("--seconds S", "Of the self-test: the duration of each log.", type=click.FloatRange(0.1), default=10.0)
+@option(
+    "--disturbance TORQUE",
+    "Of the self-test: standard deviation of a torque that no log contains, in N m.",
+    type=click.FloatRange(0.0),
+    default=0.0,
+)
+@option("--seed N", "Of the self-test: the seed of truths and disturbances.", type=click.IntRange(min=0), default=0)
+def calibrate(
+    scenario: Scenario,
+    logs: tuple[Path, ...],
+    parameters: tuple[Parameter, ...],
+    inertia: tuple[str, ...],
+    position: str,
+    torque: str,
+    measured_torque: bool,
+    period: float | None,
+    save: Path | None,
+    as_json: bool,
+    self_test: bool,
+    values: tuple[Setting, ...],
+    trials: int,
+    seconds: float,
+    disturbance: float,
+    seed: int,
+    **table: Any,
+) -> None:
+    """Fit numbers of a testbed to recordings, each with an interval and a verdict.
+
+    LOGS are logs of control loops (.lcm), or tables (.csv, .npz, .parquet, .mcap) whose columns the options name. The
+    exit code is 1 unless every number is accepted.
+
+    With --self-test, machines with random numbers in the ranges are simulated in processes of their own, commanded by
+    the scenario's DPS over LCM, and calibrated: it shows, before any hardware is touched, what a log will tell.
+
+    \b
+    Examples:
+      vtbdrake calibrate vtbdrake_diagrams.double_pendulum:DoublePendulumScenario swing.csv \\
+        --position joint_position --position-columns q1,q2 --torque torque --torque-columns tau1,tau2 \\
+        --vary sim.sys.pendulum.lower.mass=0.1:2 --vary sim.act.drives.coulomb[0]=0:1 --save pendulum.yaml
+      vtbdrake calibrate vtbdrake_diagrams.manipulator:ManipulatorScenario --self-test --position joint_position \\
+        --torque joint_torque --vary sim.sys.arm.tool.mass=0.2:2
+    """
+    if bool(logs) == self_test:
+        raise click.UsageError("give either LOGS or --self-test")
+    if values and not self_test:
+        raise click.UsageError("--set is for the DPS of a --self-test: the DPS takes no part in the fit of LOGS")
+    if self_test and save is not None:
+        raise click.UsageError("a self-test has nothing to --save: it calibrates machines that do not exist")
+    from vtbdrake.calibration import Inertia
+    from vtbdrake.calibration import calibrate as fit
+    from vtbdrake.calibration import self_test as test
+
+    model: dict[str, Any] = {
+        "inertias": [Inertia(address) for address in inertia],
+        "position": position,
+        "torque": torque,
+        "measured_torque": measured_torque,
+        "period": period,
+    }
+    if self_test:
+        machine = MachineConfig(disturbance={torque: disturbance} if disturbance else {})
+        trial: dict[str, Any] = {"seconds": seconds, "trials": trials, "seed": seed, "values": settings(values)}
+        tested = test(scenario, parameters, machine=machine, **trial, **model)
+        click.echo(json.dumps(_tested(tested), indent=2) if as_json else tested)
+        return
+    result = fit(scenario, [_read(path, position, torque, **table) for path in logs], parameters, **model)
+    click.echo(json.dumps(_fitted(result), indent=2) if as_json else result)
+    if save is not None:
+        result.scenario.save(save)
+    if not result.accepted:
+        refused = [each.address for each in result.parameters.values() if each.verdict != "accepted"]
+        raise FailedError(f"not accepted: {', '.join(refused)}")
+
+
+def _read(
+    path: Path,
+    position: str,
+    torque: str,
+    *,
+    position_columns: str,
+    torque_columns: str,
+    time: str,
+    units: Sequence[tuple[str, str]],
+) -> Log:
+    if path.suffix == ".lcm":
+        from vtbdrake.recording import read_log
+
+        return read_log(path).signals
+    if not (position_columns and torque_columns):
+        raise click.UsageError(f"{path} is a table: name its columns by --position-columns and --torque-columns")
+    from vtbdrake.recording import read_table
+
+    return read_table(
+        path,
+        sense={position: position_columns.split(",")},
+        act={torque: torque_columns.split(",")},
+        time=time,
+        units=settings(units),
+    )
+
+
+def _fitted(result: Calibration) -> dict[str, Any]:
+    numbers = [
+        {
+            "address": each.address,
+            "start": finite(each.start),
+            "value": finite(each.value),
+            "deviation": finite(each.deviation),
+            "interval": [finite(each.lower), finite(each.upper)],
+            "verdict": str(each.verdict),
+        }
+        for each in result.parameters.values()
+    ]
+    return {
+        "parameters": numbers,
+        "fit": finite(result.fit),
+        "holdout": finite(result.holdout),
+        "correlation": finite(result.correlation),
+        "reasons": list(result.reasons),
+        "combinations": list(result.combinations),
+        "remarks": list(result.remarks),
+    }
+
+
+def _tested(result: SelfTest) -> dict[str, Any]:
+    numbers = [
+        {
+            "address": address,
+            "truths": [trial.truth[address] for trial in result.trials],
+            "errors": result.errors(address).tolist(),
+            "covered": int(result.covered(address).sum()),
+            "intervals": int(result.covered(address).size),
+        }
+        for address in result.addresses
+    ]
+    return {"parameters": numbers, "trials": len(result.trials), "coverage": finite(result.coverage)}
