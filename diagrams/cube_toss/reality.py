@@ -143,7 +143,7 @@ def calibrated(
     return calibrate_by_rollouts(scenario, windows, parameters, loss, points=_POINTS, **options)
 
 
-def errors(tosses: Sequence[Log], scenario: Scenario, *, executor: str = "serial") -> Array:
+def errors(tosses: Sequence[Log], scenario: Scenario, *, executor: str = "auto") -> Array:
     """Return errors (tosses, 3) of whole tosses that are predicted from their first samples.
 
     These are the means over time of the position error in percent of the edge, and of the rotation error in degrees,
@@ -205,7 +205,7 @@ def main(folder: Path, names: tuple[str, ...], figure: Path | None, starts: int,
             continue
         scenarios: dict[str, Scenario] = {f"{name}, friction 0.18": scenario}
         if not as_is:
-            results[name] = calibrated(fitted, scenario, restitution, starts=starts, executor="serial")
+            results[name] = calibrated(fitted, scenario, restitution, starts=starts)
             scenarios[f"{name}, calibrated"] = results[name].scenario
         for label, each in scenarios.items():
             curves[label] = errors(rest, each)

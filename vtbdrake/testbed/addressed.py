@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cached_property
@@ -29,6 +30,12 @@ from vtbdrake.testbed.switch import BOARD, COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
+
+
+# Held while testbeds and contexts are made, and simulations begin. Drake gives some warnings once, under a lock in C++,
+# and pydrake passes them to Python: of two threads that come to such a place at once, one would hold that lock and wait
+# for the interpreter, and the other would hold the interpreter and wait for that lock, for ever.
+MAKING = threading.RLock()
 
 
 class _CenicSimulator(Simulator):
@@ -119,7 +126,8 @@ class AddressedDiagram:
 
     def default_context(self) -> Context:
         """Return a new context: s0 from defaults."""
-        context = self.diagram.CreateDefaultContext()
+        with MAKING:
+            context = self.diagram.CreateDefaultContext()
         if self.simulator_config.use_error_control:
             # By the accuracy, Drake finds the times of events that depend on the state, such as a foot that lands.
             context.SetAccuracy(self.simulator_config.accuracy)
