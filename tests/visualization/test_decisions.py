@@ -110,8 +110,11 @@ def test_poses_are_those_of_the_motion_at_equal_intervals(swung_up, meshcat):
     motion = reasoner.motion(decision, 1)
     show_poses(meshcat, {"swing": motion}, count=5)
     transforms = {m["path"]: m["matrix"] for m in messages(meshcat.StaticHtml()) if m["type"] == "set_transform"}
-    arm = sorted(path for path in transforms if path.startswith("/drake/poses/swing/") and "arm" in path)
-    shown = {path.split("/")[4]: np.reshape(transforms[path], (4, 4)).T for path in arm}
+    shown: dict[str, np.ndarray] = {}
+    for path in sorted(path for path in transforms if path.startswith("/drake/poses/swing/")):
+        # The arm's frame comes before its first geometry.
+        if "arm" in path:
+            shown.setdefault(path.split("/")[4], np.reshape(transforms[path], (4, 4)).T)
     angles = {int(k): np.arctan2(X[0, 2], X[0, 0]) for k, X in shown.items()}
     expected = motion.states[np.linspace(0, len(motion.times) - 1, 5).round().astype(int), 0]
     np.testing.assert_allclose(np.cos([angles[k] for k in range(5)]), np.cos(expected), atol=1e-6)

@@ -159,11 +159,11 @@ def test_meshcat_is_shown_and_gets_nothing_from_the_browser(running: View) -> No
 
 def test_closed_view_closes_its_pages() -> None:
     opened = view(CartPoleScenario())
-    socket = page(opened)
-    opened.close()
-    with pytest.raises(ConnectionClosed):
-        while True:
-            socket.recv(PATIENCE)
+    with page(opened) as socket:
+        opened.close()
+        with pytest.raises(ConnectionClosed):
+            while True:
+                socket.recv(PATIENCE)
     with pytest.raises(urllib.error.URLError):
         ask(base(opened))
 

@@ -70,7 +70,7 @@ def test_course_is_that_of_a_simulation_by_hand(session: Session) -> None:
     session.play()
     frame(session, lambda shown: shown.time > 1.0)
     session.pause()
-    steps = round(session.latest.time / STEP)
+    steps = round(session.snapshot().time / STEP)
     assert angle(session) == angle_by_hand(steps)
     session.reset()
     session.advance(40)
@@ -94,7 +94,7 @@ def test_preview_is_the_future_and_changes_nothing(session: Session) -> None:
     session.cancel_preview()
     session.advance(24)
     assert angle(session) == angle_by_hand(40)
-    assert session.latest.preview is None
+    assert frame(session, lambda shown: shown.time == 40 * STEP).preview is None
 
 
 def test_preview_that_breaks_a_limit_or_fails_is_refused(session: Session) -> None:
@@ -135,7 +135,7 @@ def test_going_back_and_on_is_another_branch(session: Session) -> None:
     session.write({MASS: 0.4})
     session.advance(20)
     assert angle(session) == angle_by_hand(steps + 20, {steps: {MASS: 0.4}})
-    assert session.latest.history[1] <= session.latest.time
+    assert frame(session, lambda shown: shown.time == (steps + 20) * STEP).history[1] <= (steps + 20) * STEP
 
 
 def test_failed_simulation_stands_still_until_it_is_reset(session: Session) -> None:
