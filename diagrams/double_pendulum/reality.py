@@ -54,6 +54,33 @@ def recordings(folder: Path) -> list[Log]:
     ]
 
 
+def stand_in(count: int = 8, seconds: float = 5.0) -> list[Log]:
+    """Return recordings of a simulated pendulum whose numbers are near those of the real one, where that is missing."""
+    truth = {
+        f"{PENDULUM}.lower.mass": 0.65,
+        f"{DRIVES}.coulomb": [0.2, 0.15],
+        f"{DRIVES}.viscous": [0.03, 0.005],
+    }
+    logs = []
+    for seed in range(count):
+        random = np.random.default_rng(seed)
+        times = 0.002 * np.arange(round(seconds / 0.002))
+        waves = [np.sin(np.outer(times, random.uniform(1.0, 8.0, 2)) + random.uniform(0.0, 6.0, 2)) for _ in range(3)]
+        torques = 0.6 * np.sum(waves, axis=0) * (1.0 - np.exp(-times / 0.1))[:, np.newaxis]
+        driven = vtb.read_table({"time": times, "u": torques}, sense={}, act={TORQUE: "u"})
+        testbed = DrivenScenario(scenario=DoublePendulumScenario(), log=driven).build()
+        context = testbed.default_context()
+        testbed.write(context, truth)
+        simulator, positions = testbed.simulator(context), []
+        for time in times:
+            simulator.AdvanceTo(time)
+            positions.append([float(testbed.read(context, f"{PENDULUM}.{joint}.position")) for joint in JOINTS])
+        measured = np.array(positions) + 2e-4 * random.normal(size=(len(times), 2))
+        table = {"time": times, "q": measured, "u": torques}
+        logs.append(vtb.read_table(table, sense={POSITION: "q"}, act={TORQUE: "u"}))
+    return logs
+
+
 def calibrated(logs: Sequence[Log]) -> Calibration:
     """Return the calibration of all that the motion in a plane depends on, but for the upper link's mass.
 
