@@ -168,6 +168,25 @@ def test_scrubbed_history_goes_back(page: Page, running: View) -> None:
     assert angle(running.session) == angle_by_hand(steps)
 
 
+def test_camera_follows_a_body(page: Page) -> None:
+    offset = """() => {
+        const { object } = viewer.scene_tree.find(["drake", "now", "cart_pole", "cart"]);
+        const place = object.matrixWorld.elements.slice(12, 15);
+        return [place, viewer.camera.position.toArray().map((x, i) => x - place[i])];
+    }"""
+    page.select_option("#vtb-follow", "now/cart_pole/cart")
+    drawn(page, "vtb.followed === 'now/cart_pole/cart'")
+    place, before = page.evaluate(offset)
+    page.click("#vtb-play")
+    drawn(page, "parseFloat(vtb.clock.textContent) > 0.4")
+    page.click("#vtb-play")
+    settle(page)
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    moved, after = page.evaluate(offset)
+    assert abs(moved[0] - place[0]) > 0.005
+    np.testing.assert_allclose(after, before, atol=1e-6)
+
+
 def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:
     page.select_option("#vtb-sense-joint_position", "real")
     drawn(page, "vtb.messages.textContent.includes('nothing feeds real.sense.joint_position')")

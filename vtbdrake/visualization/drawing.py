@@ -89,6 +89,11 @@ class Drawing:
                 meshcat.SetTransform(place, query.GetPoseInWorld(frame))
         self.pose(context)
 
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Return the paths of the moving frames."""
+        return tuple(place for _, place in self._frames)
+
     def pose(self, context: Context, *, time_in_recording: float | None = None) -> None:
         """Show the poses of a root context of the testbed; of a recording, at a time in seconds."""
         query = self._query(context)

@@ -179,7 +179,7 @@ class Page:
             "type": "hello",
             "scenario": self._session.scenario.name(),
             "variables": dict(self._session.variables),
-            "step": self._session.config.step,
+            "bodies": list(self._session.bodies),
         }
         await self._send(hello)
         tasks = [asyncio.create_task(self._send_frames(server)), asyncio.create_task(self._answer(server))]

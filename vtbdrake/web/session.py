@@ -174,6 +174,7 @@ class Session:
     Attributes:
         latest: The last frame.
         variables: What can be watched and set: by address, ``kind``, ``shape``, ``unit``, ``bounds``, ``settable``.
+        bodies: Paths in Meshcat of what moves.
         meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
 
     Raises:
@@ -192,6 +193,7 @@ class Session:
         self.config = config or SessionConfig()
         self.latest: Frame | None = None
         self.variables: Mapping[str, Mapping[str, Any]] = {}
+        self.bodies: tuple[str, ...] = ()
         self.meshcat_url = ""
         self._start, self._values = start, dict(values or {})
         self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -344,6 +346,7 @@ class Session:
         if self._testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
             self._drawing.fit_camera(self._context)
+            self.bodies = self._drawing.places
         self.variables = {
             variable.address: {
                 "kind": variable.kind,

@@ -25,7 +25,7 @@ function load(tag, properties) {
   });
 }
 
-const number = (value) => (value === null || value === undefined ? "none" : Number(value).toPrecision(6) * 1 + "");
+const number = (value) => (value === null || value === undefined ? "none" : Number(value).toPrecision(5) * 1 + "");
 
 // -- the connection
 
@@ -220,7 +220,7 @@ class Page {
     this.switches = element("div", { id: "vtb-switches" });
     this.differences = element("table", { id: "vtb-differences" });
     this.compare = element("input", { type: "checkbox", id: "vtb-compare" });
-    this.follow = element("select", { id: "vtb-follow", onfocus: () => this.#listBodies() }, element("option", { value: "" }, "nothing"));
+    this.follow = element("select", { id: "vtb-follow", onchange: () => this.follow.blur() }, element("option", { value: "" }, "nothing"));
     document.body.append(
       this.messages,
       element(
@@ -259,8 +259,9 @@ class Page {
     dispatchEvent(new Event("resize"));
   }
 
-  #hello({ scenario, variables }) {
+  #hello({ scenario, variables, bodies }) {
     this.variables = variables;
+    this.follow.append(...bodies.map((path) => element("option", { value: path }, path.replace(/^now\//, ""))));
     this.title.textContent = scenario.split(":").at(-1);
     this.title.title = scenario;
     document.title = this.title.textContent;
@@ -453,23 +454,15 @@ class Page {
     dispatchEvent(new Event("resize"));
   }
 
-  #listBodies() {
-    const scene = viewer.scene_tree.find(["drake", "now"]).children;
-    const names = ["", ...Object.keys(scene)];
-    if (names.length === this.follow.options.length) return;
-    this.follow.replaceChildren(...names.map((name) => element("option", { value: name }, name || "nothing")));
-  }
-
   // Called in each animation frame: what it follows keeps its place in the picture.
   followBody() {
     const name = this.follow.value;
     if (name) {
-      const object = deepest(viewer.scene_tree.find(["drake", "now", name])).object;
+      const { object } = viewer.scene_tree.find(["drake", ...name.split("/")]);
       const place = object.matrixWorld.elements.slice(12, 15);
       if (this.followed === name) {
         const [x, y, z] = place.map((value, i) => value - this.place[i]);
         for (const point of [viewer.camera.position, viewer.controls.target]) {
-          // The camera hangs in a frame that is turned by -90 degrees about x.
           point.x += x;
           point.y += y;
           point.z += z;
@@ -480,12 +473,6 @@ class Page {
     this.followed = name;
     requestAnimationFrame(() => this.followBody());
   }
-}
-
-// Frames of models are nested: the first one that has an own transform is the body.
-function deepest(node) {
-  const names = Object.keys(node.children).filter((name) => !name.startsWith("<"));
-  return names.length === 1 && !node.object.position.lengthSq() ? deepest(node.children[names[0]]) : node;
 }
 
 await Promise.all([
