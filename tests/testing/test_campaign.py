@@ -108,6 +108,9 @@ def test_a_campaign_counts_what_its_rollouts_do(tmp_path: Path) -> None:
         cell = cells[name, "small angle"]
         assert (cell["pass"], cell["fail"], cell["rate"]) == (passed, 8 - passed, passed / 8)
         assert cell["verdict"] == ("met" if passed == 8 else "missed")
+        sizes = [np.abs(angle).max() for angle in angles.values()]
+        assert (cell["least"], cell["largest"]) == (min(sizes), max(sizes))
+        assert cell["mean"] == pytest.approx(np.mean(sizes))
         low = sum(abs(angle[-1]) <= 0.3 for angle in angles.values())
         shown = beta.ppf(0.05, low, 9 - low) if low else 0.0
         refuted = low < 8 and beta.ppf(0.95, low + 1, 8 - low) < 0.2

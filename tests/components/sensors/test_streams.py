@@ -200,6 +200,11 @@ def test_impossible_streams_are_refused(stream: float) -> None:
         joint_encoders(World(), stream=stream)
 
 
+@pytest.mark.parametrize("stream", [0, 2**64 - 1])
+def test_first_and_last_stream_are_streams(stream: int) -> None:
+    joint_encoders(World(), stream=stream)
+
+
 def test_exact_sensors_need_no_name() -> None:
     world = World()
     sensor = world.builder.AddSystem(JointEncoders(world.plant, world.joints, period=PERIOD))
