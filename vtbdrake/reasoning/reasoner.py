@@ -169,7 +169,8 @@ class Reasoner:
         self.executor = _make_executor(search, self.problem, budget)
         if search.pruning is not None or budget.seconds is not None:
             self._check_executor()
-        self._alone = threading.Lock()
+        # Of a Ctrl-C between two lines it may be left behind: the same thread takes it again.
+        self._alone = threading.RLock()
         self._warm = False
         self._has_warned = False
         self._closed = False

@@ -207,7 +207,7 @@ class _Worker:
     def __init__(self) -> None:
         self._runners = Runners(Testbeds())
         self._tasks: LruDict[str, RolloutTask] = LruDict(MAX_TASKS)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def run(self, pickled: PickledTask, point: bytes, start: bytes) -> RolloutResult:
         with self._lock:

@@ -19,7 +19,7 @@ from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testbed.addressed import MAKING
+from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.interrupt import Interruptible
 from vtbdrake.testbed.step_watch import NoProgressError
@@ -254,7 +254,7 @@ class RolloutRunner:
         apply_simulator_config(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
         self._player.put(self._context, window, start)
-        with _failures_as_outcomes, MAKING:
+        with _failures_as_outcomes, making():
             self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
@@ -270,7 +270,7 @@ class RolloutRunner:
             before = self._variables.read(self._context, list(parameters))
             # Initialization events are part of a default s0; in a restored s0 they have happened already.
             params = InitializeParams(suppress_initialization_events=restored)
-            with MAKING:
+            with making():
                 self._initialized = self._simulator.Initialize(params)
                 self._refuse_nonfinite_derivatives()
         for address, value in before.items():

@@ -16,7 +16,7 @@ from vtbdrake.rollout.runner import RolloutRunner, values_key
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import FAILED, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
-from vtbdrake.testbed.addressed import MAKING
+from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.interrupt import Interruptible
 
 FIELD = "scenario."
@@ -58,7 +58,7 @@ class Testbeds:
         self.max_testbeds = max_testbeds
         self._permanent = permanent
         self._built: LruDict[Hashable, VirtualTestbed] = LruDict(max_testbeds)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def get(self, scenario: Scenario) -> VirtualTestbed:
         """Return the testbed of ``scenario``; build it if it is not there, when other threads have built theirs."""
@@ -67,7 +67,7 @@ class Testbeds:
             return self._permanent
         if (testbed := self._used(key)) is not None:
             return testbed
-        with MAKING:
+        with making():
             if (testbed := self._used(key)) is not None:
                 return testbed
             testbed = scenario.build()

@@ -32,10 +32,18 @@ if TYPE_CHECKING:
     from vtbdrake.testbed.scenario import Scenario
 
 
-# Held while testbeds and contexts are made, and simulations begin. Drake gives some warnings once, under a lock in C++,
-# and pydrake passes them to Python: of two threads that come to such a place at once, one would hold that lock and wait
-# for the interpreter, and the other would hold the interpreter and wait for that lock, for ever.
-MAKING = threading.RLock()
+_MAKING, _NOTHING = threading.RLock(), nullcontext()
+
+
+def making() -> AbstractContextManager[object]:
+    """Return what a thread holds while it makes testbeds and contexts, and begins simulations: one at a time.
+
+    Drake gives some warnings once, under a lock in C++, and pydrake passes them to Python: of two threads that come to
+    such a place at once, one would hold that lock and wait for the interpreter, and the other would hold the
+    interpreter and wait for that lock, for ever. The main thread waits for the others while they simulate; it holds
+    nothing, as a Ctrl-C could leave that behind.
+    """
+    return _NOTHING if threading.current_thread() is threading.main_thread() else _MAKING
 
 
 class _CenicSimulator(Simulator):
@@ -126,7 +134,7 @@ class AddressedDiagram:
 
     def default_context(self) -> Context:
         """Return a new context: s0 from defaults."""
-        with MAKING:
+        with making():
             context = self.diagram.CreateDefaultContext()
         if self.simulator_config.use_error_control:
             # By the accuracy, Drake finds the times of events that depend on the state, such as a foot that lands.
