@@ -99,7 +99,7 @@ def calibrate(
     seed: int,
     **table: Any,
 ) -> None:
-    """Fit numbers of a testbed to recordings, each with an interval and a verdict.
+    """Fit numbers of a testbed to recordings, with verdicts.
 
     LOGS are logs of control loops (.lcm), or tables (.csv, .npz, .parquet, .mcap) whose columns the options name. The
     exit code is 1 unless every number is accepted.
@@ -108,7 +108,7 @@ def calibrate(
     the scenario's DPS over LCM, and calibrated: it shows, before any hardware is touched, what a log will tell.
 
     \b
-    Examples:
+    Example:
       vtbdrake calibrate vtbdrake_diagrams.double_pendulum:DoublePendulumScenario swing.csv \\
         --position joint_position --position-columns q1,q2 --torque torque --torque-columns tau1,tau2 \\
         --vary sim.sys.pendulum.lower.mass=0.1:2 --vary sim.act.drives.coulomb[0]=0:1 --save pendulum.yaml
