@@ -74,7 +74,7 @@ class Load:
 
 
 class Outcome(NamedTuple):
-    """What happened after the load was picked up.
+    """The events after a load was picked up.
 
     Attributes:
         refit: The new model.

@@ -42,7 +42,7 @@ LARGEST_DELAY = 50
 """The largest latency of commands to the drives, in periods."""
 
 KNOWN_TOOL = {"sim.sys.arm.tool.mass": "dps.tool.mass", "sim.sys.arm.tool.center_of_mass": "dps.tool.center"}
-"""What the DPS knows about its tool, by the variable of the simulated world."""
+"""The DPS's variables about its tool, by the variable of the simulated world."""
 
 
 def _plant() -> MultibodyPlantConfig:

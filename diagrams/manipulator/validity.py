@@ -1,4 +1,4 @@
-"""How often the arm is said to leave the validity domain of its model: in the same motions, and in others.
+"""Count how often the arm is said to leave the validity domain of its model: in the same motions, and in others.
 
 ``python -m vtbdrake_diagrams.manipulator.validity`` prints the table of docs/calibration.md.
 """
@@ -20,7 +20,7 @@ from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
 FEATURES = ("dps.env.joint_position", "dps.env.joint_velocity", "dps.joint_torque")
-"""What a state of the arm is, for the validity domain of its model."""
+"""The features of a state of the arm, for the validity domain of its model."""
 
 WINDOW, HORIZON = 0.1, 8.0  # s
 QUANTILES = (0.95, 1.0)

@@ -160,7 +160,7 @@ def surveyed(drive: Drive, scenario: ParkScenario, config: SurveyConfig) -> Surv
 
 @dataclass(frozen=True, eq=False)
 class Localized:
-    """What the car claimed along a drive, cycle by cycle.
+    """The claims of the car along a drive, cycle by cycle.
 
     Attributes:
         times: The times of the drive in s, (n,).
@@ -176,7 +176,7 @@ class Localized:
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
-        """Whether there is a pose, (n,)."""
+        """Return whether there is a pose, (n,)."""
         return np.isfinite(self.poses[:, 0])
 
     def at(self, times: Array) -> Localized:
@@ -221,7 +221,7 @@ def localized(
 
 @dataclass(frozen=True)
 class Judgement:
-    """How far claims are from something that did not make them.
+    """The distances of claims from something that did not make them.
 
     Attributes:
         count: The number of claims that were compared.
@@ -321,7 +321,7 @@ def shares(claims: Localized, drive: Drive, whole: Localized, mapped: Landmarks,
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What the first part of a drive gives.
+    """The calibration and the map that the first part of a drive gives.
 
     Attributes:
         scenario: The scenario with the calibrated car.

@@ -121,10 +121,6 @@ class Drawing:
         center, size = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
         self._meshcat.SetCameraPose(center + _VIEW_DISTANCE * size * _VIEW_DIRECTION, center)
 
-    def show(self, visible: bool = True) -> None:
-        """Show or hide it."""
-        self._meshcat.SetProperty(self.path, "visible", visible)
-
     def delete(self) -> None:
         """Remove it from the scene."""
         self._meshcat.Delete(self.path)
