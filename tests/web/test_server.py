@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vtbdrake.web import View, view
+from vtbdrake.web.host import PortError
 from vtbdrake.web.relay import Newest
-from vtbdrake.web.server import PortError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 ANGLE = "sim.sys.cart_pole.pole_pin.position"

@@ -1,65 +1,12 @@
 // The controls of a session, beside Meshcat's viewer, whose page loads this module.
 
+import { Connection, element, load, number } from "./common.js";
+
 const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
 const WINDOW = 20; // s of simulated time in a plot
 const MATCHES = 60; // addresses that the search lists
 const ENTRIES = 12; // entries of an array that get a slider
 const PREVIEW_PERIOD = 100; // ms between two drafts
-
-// -- elements
-
-function element(tag, properties = {}, ...children) {
-  const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(properties)) {
-    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else if (name in made) made[name] = value;
-    else made.setAttribute(name, value);
-  }
-  made.append(...children);
-  return made;
-}
-
-function load(tag, properties) {
-  return new Promise((resolve, reject) => {
-    document.head.append(element(tag, { ...properties, onload: resolve, onerror: reject }));
-  });
-}
-
-const number = (value) => (value === null || value === undefined ? "none" : Number(value).toPrecision(5) * 1 + "");
-
-// -- the connection
-
-class Session {
-  #socket;
-  #number = 0;
-  #waiting = new Map();
-
-  constructor(handlers) {
-    this.#socket = new WebSocket(new URL("session", location.href).href.replace(/^http/, "ws"));
-    this.#socket.onmessage = ({ data }) => {
-      const message = JSON.parse(data);
-      if (message.type !== "answer") return handlers[message.type](message);
-      const { resolve, reject } = this.#waiting.get(message.id) ?? {};
-      this.#waiting.delete(message.id);
-      if (message.error) reject?.(new Error(message.error));
-      else resolve?.(message.result);
-    };
-    this.#socket.onclose = () => {
-      for (const { reject } of this.#waiting.values()) reject(new Error("the session has ended"));
-      this.#waiting.clear();
-      handlers.closed();
-    };
-  }
-
-  // Sends a command; the promise is fulfilled when it has been carried out.
-  ask(command, fields = {}) {
-    const id = ++this.#number;
-    return new Promise((resolve, reject) => {
-      this.#waiting.set(id, { resolve, reject });
-      this.#socket.send(JSON.stringify({ id, do: command, ...fields }));
-    });
-  }
-}
 
 // -- a watched variable
 
@@ -199,7 +146,7 @@ class Page {
     this.variables = {};
     this.frames = 0;
     this.#build();
-    this.session = new Session({
+    this.session = new Connection({
       hello: (message) => this.#hello(message),
       frame: (frame) => this.#frame(frame),
       closed: () => {

@@ -1,0 +1,190 @@
+"""A web server on this machine alone: Meshcat's page with a module of ours, and a socket for that module."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import uvicorn
+import websockets
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vtbdrake.failures import one_line
+from vtbdrake.web.access import Access
+from vtbdrake.web.relay import relay
+
+_PAGE = Path(__file__).with_name("page")
+# How the connection to a browser, or to Meshcat, ends.
+CLOSED = (WebSocketDisconnect, websockets.ConnectionClosed, OSError, RuntimeError)
+_HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+
+
+class PortError(OSError):
+    """The port is taken."""
+
+
+class Host:
+    """Serves a page on the loopback interface, from a thread of its own.
+
+    Args:
+        meshcat_url: The address of the Meshcat that the page shows.
+        script: The module in the folder ``page`` that Meshcat's page loads.
+        serve: Serves the socket of one page, from its acceptance on.
+        port: The port; 0 for any that is free.
+        hosts: Host names (with port) under which proxies offer it.
+
+    Attributes:
+        url: The address of the page, with its token.
+
+    Raises:
+        PortError: The port is taken.
+    """
+
+    def __init__(
+        self,
+        meshcat_url: str,
+        *,
+        script: str,
+        serve: Callable[[WebSocket], Awaitable[None]],
+        port: int = 0,
+        hosts: Collection[str] = (),
+    ) -> None:
+        self._meshcat_url, self._serve = meshcat_url, serve
+        # Behind the last script of Meshcat's page, whose viewer it uses.
+        self._script = f'<script type="module" src="page/{script}"></script>\n'
+        self._socket = _listen(port)
+        self.port = int(self._socket.getsockname()[1])
+        app = Starlette(
+            routes=[
+                WebSocketRoute("/session", self._serve_socket),
+                WebSocketRoute("/", self._relay_meshcat),
+                Mount("/page", StaticFiles(directory=_PAGE)),
+                Route("/", self._index),
+                Route("/{path:path}", self._asset),
+            ]
+        )
+        access = Access(app, port=self.port, hosts=hosts)
+        self.url = f"http://127.0.0.1:{self.port}/?token={access.token}"
+        config = uvicorn.Config(
+            access, log_level="warning", lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=1
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="vtbdrake web", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the server and all its connections."""
+        self._server.should_exit = True
+        self._thread.join()
+        self._socket.close()
+
+    async def _serve_socket(self, browser: WebSocket) -> None:
+        await browser.accept()
+        with suppress(*CLOSED):
+            await self._serve(browser)
+
+    async def _index(self, _: Request) -> Response:
+        status, body, kind = await run_in_threadpool(_fetch, f"{self._meshcat_url}/")
+        head, end, tail = body.decode().rpartition("</body>")
+        return Response(f"{head}{self._script}{end}{tail}", status_code=status, media_type=kind, headers=_HEADERS)
+
+    async def _asset(self, request: Request) -> Response:
+        path = quote(request.path_params["path"])
+        status, body, kind = await run_in_threadpool(_fetch, f"{self._meshcat_url}/{path}")
+        return Response(body, status_code=status, media_type=kind)
+
+    async def _relay_meshcat(self, browser: WebSocket) -> None:
+        """Pass Meshcat's messages on; what the browser sends to Meshcat is dropped."""
+        url = self._meshcat_url.replace("http", "ws", 1)
+        await browser.accept()
+        try:
+            async with websockets.connect(url, max_size=None, compression=None) as meshcat:
+                drop = asyncio.create_task(_drop_all(browser))
+                try:
+                    await relay(meshcat.recv, browser.send_bytes)
+                finally:
+                    drop.cancel()
+        except CLOSED:
+            pass
+        with suppress(*CLOSED):
+            await browser.close()
+
+
+async def send(browser: WebSocket, message: Mapping[str, Any]) -> None:
+    """Send a message to a page."""
+    await browser.send_text(json.dumps(message, allow_nan=False))
+
+
+async def answer_commands(browser: WebSocket, carry_out: Callable[[Mapping[str, Any]], Awaitable[Any]]) -> None:
+    """Carry out the commands of a page, one after another, and answer each with its result or its error."""
+    while True:
+        text = await browser.receive_text()
+        number, error, result = None, "", None
+        try:
+            message = json.loads(text)
+            number = message.get("id")
+            result = await carry_out(message)
+        except (ValueError, LookupError, TypeError, AttributeError) as failure:
+            error = one_line(failure)
+        await send(browser, {"type": "answer", "id": number, "error": error, "result": result})
+
+
+async def first_of(*tasks: Coroutine[Any, Any, None]) -> None:
+    """Run what serves a page, until one of them ends or fails."""
+    running = [asyncio.create_task(task) for task in tasks]
+    try:
+        done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+
+def _listen(port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(("127.0.0.1", port))
+    except (OSError, OverflowError) as error:
+        listener.close()
+        raise PortError(
+            f"port {port} cannot be used ({one_line(error)}): give another one, or 0 for any that is free"
+        ) from None
+    listener.listen()
+    return listener
+
+
+def _fetch(url: str) -> tuple[int, bytes, str]:
+    """Return status, body and media type of a resource of Meshcat."""
+    try:
+        with urllib.request.urlopen(url, timeout=10.0) as answer:
+            return answer.status, answer.read(), answer.headers.get_content_type()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read(), "text/plain"
+    except OSError as error:
+        return 502, f"Meshcat does not answer: {one_line(error)}".encode(), "text/plain"
+
+
+async def _drop_all(browser: WebSocket) -> None:
+    with suppress(*CLOSED):
+        while True:
+            await browser.receive()
