@@ -71,7 +71,7 @@ def arm(*, actuated: tuple[int, ...] = (1, 0)) -> MultibodyPlant:
 def test_weight_is_carried_at_the_last_accepted_position() -> None:
     q, v = np.array([0.3, -0.8]), np.array([0.5, -0.25])
     brake = Brake("joint_state", gain=2.0, entries=slice(3, 1, -1))  # In the order of the actuators.
-    carry = CarryWeight(arm(), "joint_state", entries=slice(0, 2), brake=brake, longest=0.2)
+    carry = CarryWeight(arm(), "joint_state", entries=slice(0, 2), brake=brake)
     assert chain(carry, TORQUE, interface=INTERFACE)[0] is carry
     elbow = 9.81 * MASSES[1] * LENGTHS[1] * np.cos(q.sum())
     shoulder = elbow + 9.81 * sum(MASSES) * LENGTHS[0] * np.cos(q[0])
@@ -81,6 +81,8 @@ def test_weight_is_carried_at_the_last_accepted_position() -> None:
     stale = carry.command(np.zeros(2), {}, {"joint_state": Sample(state, 0.2)}, 1e-3)
     np.testing.assert_allclose(stale, [elbow, shoulder])
     assert carry.command(np.zeros(2), {}, {"joint_state": Sample(state, 0.21)}, 1e-3) is NO_COMMAND
+    patient = CarryWeight(arm(), "joint_state", entries=slice(0, 2), longest=0.5)
+    assert patient.command(np.zeros(2), {}, {"joint_state": Sample(state, 0.21)}, 1e-3) is not NO_COMMAND
     assert carry.command(np.zeros(2), {}, {}, 1e-3) is NO_COMMAND
 
 

@@ -33,11 +33,48 @@ def test_good_diagram_passes_every_check_that_concerns_it(kind):
     assert skipped <= NOT_CONCERNED
 
 
+# What the message of each check must name: the place, or the remedy.
+MESSAGES = {
+    "check_builds": "the DPS has no input port position",
+    "check_no_algebraic_loop": "sample a sensor in the loop",
+    "check_builds_alike_twice": "sim.sense.encoder.position, sim.sense.encoder/discrete/0: take them from fields",
+    "check_yaml_round_trip": "no file can hold",
+    "check_pickle_round_trip": "cannot be sent to other processes",
+    "check_mental_copy_continues": "dps/discrete/1",
+    "check_signals_have_units": "speed is 'deg/s'",
+    "check_signals_have_limits": "give lower= and upper=",
+    "check_parameters_have_bounds": "dps.gain has no bounds",
+    "check_variables_do_not_overlap": "sim.sense.encoder.again and sim.sense.encoder.position",
+    "check_values_fit_their_signals": "-1.0 to 1.0 m/s",
+    "check_simulates": "fails after 0.06 s: RuntimeError: the disc is broken",
+    "check_state_is_in_the_context": "self.last of sim.sense.encoder (Logging) changes while it is simulated: declare",
+    "check_runs_repeat": "it differs in sim.sense.encoder, from t = 0 s on",
+    "check_threads_agree": "in another thread, it ends otherwise",
+    "check_processes_agree": "in another process",
+    "check_reset_equals_a_new_build": "sim.sys.slide/discrete/0",
+    "check_fork_is_the_future": "simulated from a copy at 0.15 s",
+    "check_snapshot_resumes": "simulated from a snapshot at 0.15 s",
+    "check_dropped_testbed_is_freed": "1 DiscreteTimeIntegrator",
+    "check_runs_keep_no_memory": "leaves 30 objects of Python behind",
+    "check_sim_and_real_alike": "position measures [0.03984], of which [0.0398] arrives",
+    "check_dps_cannot_tell_the_switch": "[0.1] instead of [0.2]",
+    "check_dps_alone_commands_the_same": "[0.8] instead of [0.801]",
+    "check_deployment_is_safe": "give continuity={'velocity'",
+    "check_loop_commands_its_machine": "the fallbacks command: the machine must not be commanded",
+    "check_silence_ends_in_the_fallback": "nothing arrives on SPEED any more",
+    "check_nan_ends_in_the_fallback": "the numbers on POSITION are NaN",
+    "check_repeated_samples_end_in_the_fallback": "one message is repeated on SPEED",
+    "check_late_samples_end_in_the_fallback": "give the guards max_delay={signal: seconds}",
+    "check_derivatives_are_right": "sim.sys.square: the derivative of y[0] by x[0] is 0 by AutoDiff",
+}
+
+
 @pytest.mark.parametrize("name", zoo.BAD)
 def test_bad_diagram_fails_its_check_alone(name):
     results = statuses(zoo.BAD[name]())
     failures = {result.name: result.message for result in results.values() if result.status == "failed"}
     assert failures.keys() == {name}, failures
+    assert MESSAGES[name] in failures[name]
     for result in results.values():
         if result.status == "skipped" and result.name not in NOT_CONCERNED and name not in EVERYTHING_NEEDS:
             assert name in result.message, result

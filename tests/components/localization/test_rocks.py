@@ -96,6 +96,14 @@ def test_small_rocks_are_found_on_even_ground():
     assert len(set(np.flatnonzero(clear)) - set(truth)) <= 1
 
 
+def test_three_points_are_the_least():
+    rock = [16.0, 0.25, 0.0, 0.15, 0.15, 0.6, 0.0]
+    points, hit = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.array([rock])).scan(EYE)
+    assert np.sum((hit == 0) & (points[:, 2] > 0.06)) == 3
+    assert len(detect_rocks(points, RockDetectorConfig(), p_HoLo_H=EYE)) == 1
+    assert len(detect_rocks(points, RockDetectorConfig(least_points=4), p_HoLo_H=EYE)) == 0
+
+
 def test_a_rock_that_is_hidden_in_part_is_left_out():
     far, near = [10.0, 0.2, 0.0, 0.6, 0.6, 0.8, 0.0], [6.0, 0.5, 0.0, 0.3, 0.3, 1.0, 0.0]
     scene = Scene(np.zeros((0, 2)), np.zeros(0), ellipsoids=np.array([far, near]))

@@ -105,6 +105,14 @@ def test_a_batch_that_failed_moves_nothing(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_batch_that_failed_in_part_moves_towards_the_rest(name):
+    solver = make_solver(name, [X], start=(7.0,))
+    first, *others = solver.ask()
+    solver.tell([Evaluation(first, (np.nan,)), *(evaluation(point, lambda p: p[0]) for point in others)])
+    assert solver.ask()[0][0] < 7.0
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_solvers_descend_a_valley(name):
     costs = [-solve(name, SPHERE, budget=budget, seed=1)[1].values[0] for budget in (20, 60, 180, 400)]
     assert costs == sorted(costs, reverse=True)
