@@ -20,8 +20,11 @@ by chance that the domain is left.
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -210,9 +213,9 @@ class ValidityDomain:
             **options,
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the domain as plain data, for a file."""
-        return {
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a JSON file that `load` reads; `Scenario.save` writes it beside that of a calibrated scenario."""
+        data = {
             "sizes": self.sizes,
             "features": self.features.tolist(),
             "recordings": self.recordings.tolist(),
@@ -222,20 +225,23 @@ class ValidityDomain:
             "quantile": self.quantile,
             "patience": self.patience,
         }
+        Path(path).write_text(json.dumps(data))
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the domain of which `to_dict` made plain data.
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Return the domain that `save` wrote.
 
         Raises:
-            ValidityDomainError: The data are of something else.
+            ValidityDomainError: There is no such file, or it has something else.
         """
         try:
-            rest = dict(data)
+            rest = json.loads(Path(path).read_text())
             residuals = [np.nan if value is None else value for value in rest.pop("residuals")]
             return cls(rest.pop("sizes"), rest.pop("features"), rest.pop("recordings"), np.array(residuals), **rest)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValidityDomainError(f"these are no data of a validity domain: {error}") from error
+        except OSError as error:
+            raise ValidityDomainError(f"cannot read the validity domain {path}: {error.strerror}") from error
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValidityDomainError(f"{path} is no file of a validity domain: {error}") from error
 
     @property
     def addresses(self) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from vtbdrake.recording import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.validity_domain import DomainWatch
+from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 
 pytestmark = pytest.mark.one_python
 
@@ -140,12 +140,14 @@ def test_residuals_are_those_of_the_nearest_windows() -> None:
     assert np.isnan(swinging(generator).residual(np.zeros(6)))
 
 
-def test_domain_goes_through_a_file() -> None:
+def test_domain_goes_through_a_file(tmp_path: Path) -> None:
     domain = swinging(np.random.default_rng(8), neighbours=3, quantile=0.95, patience=4)
-    for copied in (
-        ValidityDomain.from_dict(json.loads(json.dumps(domain.to_dict()))),
-        pickle.loads(pickle.dumps(domain)),
-    ):
+    scenario = DoublePendulumScenario()
+    scenario.save(tmp_path / "pendulum.yaml", domain=domain)
+    name = "vtbdrake_diagrams.double_pendulum:DoublePendulumScenario"
+    again = vtb.load_scenario(f"{name}@{tmp_path / 'pendulum.yaml'}")
+    assert again.pedigree == scenario.pedigree
+    for copied in (ValidityDomain.load(tmp_path / again.pedigree.domain), pickle.loads(pickle.dumps(domain))):
         x = np.arange(6.0)
         assert (copied.factor(x), copied.radius, copied.patience) == (domain.factor(x), domain.radius, 4)
         assert copied.sizes == domain.sizes
@@ -167,7 +169,8 @@ def test_one_recording_is_cut_into_parts() -> None:
         (lambda m: ValidityDomain.of([m, m], ["q"], quantile=1.1), "the quantile at most 1"),
         (lambda m: ValidityDomain.of([m, m], ["q"], residuals=[m]), "2 recordings, but 1"),
         (lambda m: ValidityDomain.of([Motion(m.times, {"q": m.times * np.nan})], ["q"]), "not finite"),
-        (lambda m: ValidityDomain.from_dict({"sizes": {}}), "no data of a validity domain"),
+        (lambda m: ValidityDomain.load("missing.json"), "cannot read the validity domain missing.json: No such file"),
+        (lambda m: ValidityDomain.load(__file__), "test_domain.py is no file of a validity domain"),
         (
             lambda m: ValidityDomain.of([m, m], ["q"]).departure(Motion(m.times, {"q": m.times})),
             r"sizes \{'q': 1\} do not fit",

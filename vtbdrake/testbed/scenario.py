@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from vtbdrake.deployment import Deployment, Runtime
+    from vtbdrake.validity_domain import ValidityDomain
 
 # With 1.51.1, and not with 1.58, poses and contact results after a fixed step of CENIC are those before the step.
 _DRAKE = version("drake")
@@ -335,11 +336,11 @@ class Scenario(ABC):
 
         return samples(self.pedigree.posterior, count, seed=seed)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a YAML file that `load_scenario` reads."""
+    def save(self, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:
+        """Write a YAML file that `load_scenario` reads, and the model's validity domain beside it."""
         from vtbdrake.testbed.scenario_file import save_scenario
 
-        save_scenario(self, path)
+        save_scenario(self, path, domain=domain)
 
 
 def check_is_scenario(value: Any) -> None:

@@ -12,7 +12,7 @@ from dataclasses import fields, is_dataclass
 from inspect import isabstract
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
@@ -20,6 +20,9 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from vtbdrake.settings import field_types
 from vtbdrake.testbed.pedigree import Pedigree
 from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name
+
+if TYPE_CHECKING:
+    from vtbdrake.validity_domain import ValidityDomain
 
 S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
@@ -68,13 +71,22 @@ def file_and_key(source: str) -> tuple[str, str]:
     return file, key
 
 
-def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
+def save_scenario(scenario: Scenario, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:
     """Write a YAML file that `load_scenario` reads.
+
+    Args:
+        scenario: The scenario.
+        path: The file.
+        domain: The validity domain of its model: it gets a file beside, NAME.domain.json, which the pedigree names.
 
     Raises:
         ScenarioError: A field is of a type that no file can hold.
     """
     resolve_types(type(scenario))
+    if domain is not None:
+        file = Path(path).with_suffix(".domain.json")
+        domain.save(file)
+        scenario.pedigree.domain = file.name
     try:
         text = yaml_dump_typed(scenario, child_name=scenario.name())
     except Exception:
