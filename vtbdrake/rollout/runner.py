@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -23,6 +23,9 @@ from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.interrupt import Interruptible
 from vtbdrake.testbed.step_watch import NoProgressError
+
+# Message of a rollout that somebody has ended.
+BY_HAND = "ended by hand"
 
 
 class SimulationError(Exception):
@@ -144,6 +147,64 @@ class RolloutRunner:
                     raise
                 end, message = FAILED, f"{QUALITY_FAILED}{failure}"
             return samples.result(dict(parameters), end, message, started)
+
+    def drive(self, step: float) -> Generator[float, bool | None, RolloutResult]:
+        """Run one rollout from s0 whose variables somebody sets while it runs.
+
+        It pauses at t0 and then at every multiple of ``step`` after it, and yields the time since t0: there, variables
+        may be set in `context`. It ends as `run` does, or where it is sent True.
+
+        Args:
+            step: Time between two pauses, in seconds.
+
+        Yields:
+            The time of each pause, in seconds from t0. A sample at that time was taken before; that at t0, after it.
+
+        Returns:
+            The result, with no parameters.
+
+        Raises:
+            QualityError: f raises, is negative or NaN, and the task does not catch that.
+        """
+        started = time.perf_counter()
+        self._set_start(None)
+        samples, end, message = _Samples(self, Cutoff().to_beat), HORIZON, ""
+        try:
+            self._reset({})
+            for t, sampled, paused, instant in self._with_pauses(step):
+                if t == 0.0 and (yield t):
+                    end, message = TERMINATED, BY_HAND
+                status = self._advance(t, instant)
+                terminated = _terminated(status)
+                reached = self._context.get_time() - self._t0 if terminated else t
+                if (sampled or terminated) and samples.add(reached) and not self.task.run_on:
+                    break
+                if terminated:
+                    end, message = TERMINATED, status.FormatMessage()
+                if end == TERMINATED:
+                    break
+                if paused and t > 0.0 and t < self._times[-1] and (yield t):
+                    end, message = TERMINATED, BY_HAND
+                    break
+            samples.refuse_overflow()
+        except SimulationError as failure:
+            end, message = FAILED, str(failure)
+        return samples.result({}, end, message, started)
+
+    def _with_pauses(self, step: float) -> Iterator[tuple[float, bool, bool, float]]:
+        """Yield the sample times and the multiples of ``step``.
+
+        Each comes with whether it is a sample, whether it is a multiple, and the simulator's time.
+        """
+        close = 1e-9 * step
+        multiples = step * np.arange(np.floor((self._times[-1] + close) / step) + 1.0)
+        times = np.sort(np.concatenate([self._times, multiples]))
+        times = times[np.diff(times, prepend=-np.inf) > close]
+        marks = np.zeros((2, len(times)), bool)
+        for mark, marked in zip(marks, (self._times, multiples), strict=True):
+            mark[np.searchsorted(times, marked + close) - 1] = True
+        instants = self.task.instants(self._t0, self._timings, times=times)
+        return zip(times.tolist(), *marks.tolist(), instants.tolist(), strict=True)
 
     def simulate(self, parameters: Mapping[str, Any], *, start: Start | None = None) -> Iterator[float]:
         """Simulate from s0, and yield every sample time when the simulation has reached it.

@@ -247,7 +247,9 @@ class RolloutTask:
         rest = self.horizon - times[-1]
         return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
 
-    def instants(self, t0: float, timings: Sequence[tuple[float, float]]) -> np.ndarray:
+    def instants(
+        self, t0: float, timings: Sequence[tuple[float, float]], *, times: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the simulator's time at each sample: t0 + t, or that of the first event that coincides up to rounding.
 
         Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
@@ -257,8 +259,9 @@ class RolloutTask:
         Args:
             t0: Time at which rollouts begin, in seconds.
             timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
+            times: Other times from t0 instead of the samples', in seconds; the first is 0.
         """
-        times = t0 + self.sample_times()
+        times = t0 + (self.sample_times() if times is None else times)
         # Two ways to compute an instant may differ by some roundings.
         close = 8.0 * np.spacing(np.maximum(np.abs(times), 1.0))
         first = np.full(times.shape, np.inf)

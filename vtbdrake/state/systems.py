@@ -6,7 +6,7 @@ import itertools
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -270,6 +270,7 @@ def collect(
     plant_prefix: Callable[[str, str], str] | None = None,
     skip: Callable[[str], bool] = lambda path: False,
     extra: Iterable[Variable] = (),
+    by_demand: Mapping[str, Callable[[], Variable]] | None = None,
 ) -> Variables:
     """Return the variables of every system of ``diagram``.
 
@@ -279,6 +280,7 @@ def collect(
             of that instance. By default the path of the plant.
         skip: Predicate of a path that selects the leaf systems to leave out.
         extra: Further variables of the diagram.
+        by_demand: Functions that make further variables, which are not listed, by address.
 
     Raises:
         ValueError: The system is no Diagram.
@@ -289,7 +291,7 @@ def collect(
     systems = [(path, system) for path, system in leaves(diagram) if not skip(path)]
     scene_graphs = [system for _, system in systems if is_scene_graph(system)]
     listed: list[Variable] = list(extra)
-    by_demand: dict[str, Callable[[], Variable]] = {}
+    unlisted = dict(by_demand or {})
     for path, system in systems:
         if is_plant(system):
             # Imported here: heavy, and already imported where there is a plant.
@@ -301,10 +303,10 @@ def collect(
             for scene_graph in scene_graphs:
                 if source is not None and scene_graph.model_inspector().SourceIsRegistered(source):
                     listed.extend(friction_variables(system, scene_graph, prefix=prefix))
-            by_demand |= pose_entries_by_demand(system, prefix=prefix)
+            unlisted |= pose_entries_by_demand(system, prefix=prefix)
         elif not is_scene_graph(system):
             listed.extend(leaf_variables(path, system))
-    return Variables(listed, derived_by_demand=by_demand)
+    return Variables(listed, by_demand=unlisted)
 
 
 def _prefix_of(plant_prefix: Callable[[str, str], str], path: str) -> Prefix:

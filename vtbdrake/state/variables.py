@@ -152,12 +152,12 @@ def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 class Variables(Mapping[str, Variable]):
     """The variables of one Diagram, in the order of its systems; ``address[3]`` is one entry of an array.
 
-    ``derived_by_demand`` maps addresses that are not listed to functions that make a derived variable, for example the
-    height of a body.
+    ``by_demand`` maps addresses that are not listed to functions that make the variable, for example the height of a
+    body.
     """
 
     def __init__(
-        self, variables: Iterable[Variable], *, derived_by_demand: Mapping[str, Callable[[], Variable]] | None = None
+        self, variables: Iterable[Variable], *, by_demand: Mapping[str, Callable[[], Variable]] | None = None
     ) -> None:
         self._listed: dict[str, Variable] = {}
         for variable in variables:
@@ -167,7 +167,7 @@ class Variables(Mapping[str, Variable]):
                     "joints that it comes from"
                 )
             self._listed[variable.address] = variable
-        self._by_demand = dict(derived_by_demand or {})
+        self._by_demand = dict(by_demand or {})
 
     def __getitem__(self, address: str) -> Variable:
         check_address(address)

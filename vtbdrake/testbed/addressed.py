@@ -91,6 +91,7 @@ class AddressedDiagram:
         simulator_config: SimulatorConfig,
         scenario: Scenario | None,
         extra: Iterable[Variable] = (),
+        by_demand: Mapping[str, Callable[[], Variable]] | None = None,
         plant_roles: Mapping[str, str] | None = None,
     ) -> None:
         """Collect the variables of ``diagram``; ``plant_roles`` maps model instances to ``sys`` or ``env``."""
@@ -105,6 +106,7 @@ class AddressedDiagram:
             plant_prefix=lambda path, instance: f"sim.{roles[instance]}" if path == "plant" else path,
             skip=lambda path: path == BOARD or path.startswith((T_SENSE, T_ACT)),
             extra=[clock, *extra],
+            by_demand=by_demand,
         )
         self._defaults = self._defaults_of(scenario)
         self._sampling = _sampling_part(diagram)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -199,12 +200,16 @@ class CommandBoard:
         """Yield the commands as variables ``u.<signal>``, with the units and bounds of ``signals``."""
         by_name = {signal.name: signal for signal in signals}
         for index, name in enumerate(self.ports):
-            signal = by_name[name]
-            size = signal.vector(0.0).size
-            shape = () if size == 1 else (size,)
-            bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
-            element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
-            yield from leaf_variables(f"{COMMAND}{name}", self.system, declared=[element])
+            yield self.variable(f"{COMMAND}{name}", index, by_name[name])
+
+    def variable(self, address: str, index: int, signal: Signal) -> Variable:
+        """Return the constant ``index`` of the board as a variable with the unit and bounds of a signal."""
+        size = signal.vector(0.0).size
+        shape = () if size == 1 else (size,)
+        bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
+        element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
+        (variable,) = leaf_variables(address, self.system, declared=[element])
+        return variable
 
 
 class Switches:
@@ -250,6 +255,7 @@ class Switches:
         active = [float(act_position != Position.SIM)] * len(act)
         self.commands = CommandBoard(builder, u, switches=ports, constants=constants, active=active)
         self._board = self.commands.system
+        self._act_signals = interface.act
         self.sense = {
             s.name: Selector(self._board, n, SENSE_POSITIONS, i, None) for i, (n, s) in enumerate(sense.items())
         }
@@ -278,6 +284,20 @@ class Switches:
             else:
                 self.real_act[signal.name] = self._gate(name, signal, command)
         self.active = self._board.GetOutputPort("active")
+
+    def idle_variables(self) -> dict[str, Callable[[], Variable]]:
+        """Return functions that make the variables ``T_act.<signal>.idle``, by address.
+
+        Each is the command that the simulated actuator of a vector signal gets while T_act is on real.
+        """
+        u = len(self.commands.ports)
+        signals = [signal for signal in self._act_signals if signal.is_vector]
+        return {
+            f"{T_ACT}{signal.name}.idle": partial(
+                self.commands.variable, f"{T_ACT}{signal.name}.idle", u + 2 * i, signal
+            )
+            for i, signal in enumerate(signals)
+        }
 
     def _idle(self, name: str, signal: Signal) -> OutputPort:
         if signal.is_vector:

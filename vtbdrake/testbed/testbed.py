@@ -218,6 +218,7 @@ class VirtualTestbed(AddressedDiagram):
             simulator_config=parts.simulator_config,
             scenario=scenario,
             extra=[*(selector.variable() for selector in selectors), *commands],
+            by_demand=switches.idle_variables(),
             plant_roles=parts.plant_roles(),
         )
         self.dps = dps
