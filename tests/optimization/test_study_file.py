@@ -12,6 +12,7 @@ import pytest
 from tests.folders import open_folder, that_cannot_be_written
 from tests.optimization.studies import DAMPING, pendulum_problem
 from vtbdrake.optimization import Study, StudyError
+from vtbdrake.optimization.study_file import Mark, StudyFile
 
 
 def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
@@ -194,3 +195,46 @@ def test_the_log_of_a_long_run_stays_short_and_is_empty_after_it(tmp_path):
         study.run(rollouts=300, executor="serial", progress=False, callbacks=[look])
         assert path.with_name("a.db-wal").stat().st_size == 0
     assert 0 < longest < 300 * 4096
+
+
+# -- what is new, for those who watch
+
+
+def test_who_watches_knows_what_the_file_has(tmp_path):
+    path, problem = tmp_path / "study.db", pendulum_problem()
+    problem.study(path, solver="bayesian", seed=3).close()
+    watcher, trials, mark, returned = StudyFile(path), [], Mark(), 0
+    version = watcher.version()
+    # Batches of four: most runs end within one, whose trials the next run records again; a larger budget is a new
+    # solver, whose trials follow all others.
+    for rollouts in (3, 5, 9, 10, 17, 26, 27):
+        with problem.study(path) as study:
+            study.run(rollouts=rollouts, executor="serial", progress=False)
+            assert watcher.version() != version
+            version = watcher.version()
+            kept, new, mark = watcher.trials_since(mark)
+            trials = trials[:kept] + new
+            returned += len(new)
+            assert sorted(t.batch for t in trials) == sorted(t.batch for t in study.trials)
+            values = [(t.point, t.values, t.batch, t.method) for t in trials]
+            assert all((t.point, t.values, t.batch, t.method) in values for t in study.trials)
+            assert len(trials) == len(study.trials)
+    assert returned < 2 * len(trials)
+    assert watcher.version() == version and watcher.trials_since(mark)[1] == trials[mark.count :]
+    kept, outcomes, after = watcher.outcomes_since(Mark())
+    assert {key: outcome for key, outcome, _ in outcomes} == watcher.outcomes() and kept == 0
+    assert watcher.outcomes_since(after) == (27, [], after)
+
+
+def test_who_watches_reads_again_what_was_forgotten(tmp_path):
+    path, problem = tmp_path / "study.db", pendulum_problem()
+    with problem.study(path, solver="sobol") as study:
+        study.run(rollouts=8, executor="serial", progress=False)
+    watcher = StudyFile(path)
+    _, old, mark = watcher.trials_since(Mark())
+    conditions = [{}, {DAMPING: 0.2}]
+    with pendulum_problem(conditions=conditions).study(path, more_conditions=True) as study:
+        assert watcher.trials_since(mark) == (0, [], Mark())
+        study.run(rollouts=16, executor="serial", progress=False)
+        kept, new, _ = watcher.trials_since(mark)
+        assert kept == 0 and [t.values for t in new] == [t.values for t in study.trials] != [t.values for t in old]

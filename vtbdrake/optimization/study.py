@@ -28,6 +28,7 @@ from vtbdrake.optimization.identity import (
 from vtbdrake.optimization.parameter import Dimension, checked_point, point_text
 from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers import Solver, make_solver
+from vtbdrake.optimization.statement import statement
 from vtbdrake.optimization.study_file import StudyError, StudyFile
 from vtbdrake.optimization.study_run import StudyRun, check_budget
 from vtbdrake.optimization.sweep import borrowed
@@ -109,6 +110,7 @@ class Study:
             "versions": versions(),
             "revision": revision(problem.scenario),
             "units": list(problem.units),
+            "statement": statement(problem),
         }
         # An unknown solver, or one that cannot solve the problem, is refused before there is a file.
         made = _solver(problem, meta, rollouts=None)

@@ -14,6 +14,7 @@ import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import isnan, nan
 from pathlib import Path
@@ -51,6 +52,15 @@ _ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units
 
 class StudyError(ValueError):
     """A file is no study, is damaged, belongs to another version or problem, or cannot be used."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How far a table was read: its last row, by number and checksum, and how many rows there are up to that one."""
+
+    row: int = 0
+    checksum: int = 0
+    count: int = 0
 
 
 class StudyFile:
@@ -250,14 +260,7 @@ class StudyFile:
 
     def outcomes(self) -> dict[RolloutKey, Outcome]:
         """Return all finished rollouts by (point, number of the condition)."""
-        return {
-            (decode(point), condition): Outcome(
-                _float(h), _float(value), tuple(json.loads(measures)), _float(t_star), end, message, _float(wall_time)
-            )
-            for point, condition, h, value, measures, t_star, end, message, wall_time, *_ in self._rows(
-                "rollouts", "ORDER BY rowid"
-            )
-        }
+        return dict(_outcomes(self._rows("rollouts", "ORDER BY rowid")))
 
     def finished(self) -> dict[RolloutKey, datetime]:
         """Return when each rollout was finished, in UTC."""
@@ -346,6 +349,55 @@ class StudyFile:
     def trials(self) -> list[Trial]:
         """Return all trials in the order of the study."""
         return self._trials(self._rows("trials", "ORDER BY batch, position"), first=0)
+
+    # -- what is new, for those who watch
+
+    def version(self) -> tuple[int, int]:
+        """Return two numbers that differ after any change of the file, by this process or another."""
+        return self._number("PRAGMA data_version"), self._db.total_changes
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether a process runs the study; of a study in memory, whether its last run has not ended."""
+        if self.path is not None:
+            return _is_claimed(self.path)
+        sessions = self.sessions()
+        return bool(sessions) and sessions[-1]["ended"] is None
+
+    def trials_since(self, mark: Mark) -> tuple[int, list[Trial], Mark]:
+        """Return what has changed since a mark: how many trials stay, the trials behind them, and the next mark.
+
+        Trials are in the order in which they were recorded. Those of a batch that an interrupted run has left are
+        returned each time, as they will be recorded again.
+        """
+        mark, rows, numbers = self._rows_since("trials", mark)
+        first, told = self._get("first_position", 0), self._get("told", 0)
+        final = [row["position"] < first or row["batch"] < told for row in rows]
+        settled = final.index(False) if False in final else len(final)
+        after = _mark(numbers[settled - 1], rows[settled - 1], mark.count + settled) if settled else mark
+        return mark.count, self._trials(rows, first=mark.count), after
+
+    def outcomes_since(self, mark: Mark) -> tuple[int, list[tuple[RolloutKey, Outcome, datetime]], Mark]:
+        """Return what has changed since a mark: how many rollouts stay, those behind them, and the next mark."""
+        mark, rows, numbers = self._rows_since("rollouts", mark)
+        after = _mark(numbers[-1], rows[-1], mark.count + len(rows)) if rows else mark
+        times = [datetime.fromisoformat(row["finished"]) for row in rows]
+        keyed = ((*pair, time) for pair, time in zip(_outcomes(rows), times, strict=True))
+        return mark.count, list(keyed), after
+
+    def _rows_since(self, table: str, mark: Mark) -> tuple[Mark, list[sqlite3.Row], list[int]]:
+        """Return rows behind a mark with their numbers; if rows before it are gone, all, with the mark of none."""
+        read = self._number(f"SELECT count(*) FROM {table} WHERE rowid <= ?", (mark.row,))
+        # SQLite gives the numbers of rows that are gone to new ones.
+        checksum = self._number(f"SELECT coalesce(max(checksum), 0) FROM {table} WHERE rowid = ?", (mark.row,))
+        if (checksum, read) != (mark.checksum, mark.count):
+            mark = Mark()
+        # Rows that are added meanwhile come next time.
+        last = self._number(f"SELECT coalesce(max(rowid), 0) FROM {table}")
+        which = "WHERE rowid > ? AND rowid <= ? ORDER BY rowid", (mark.row, last)
+        with self._lock, _explained(self.path):
+            numbers = [number for (number,) in self._db.execute(f"SELECT rowid FROM {table} {which[0]}", which[1])]
+        return mark, self._rows(table, *which), numbers
 
     def earlier_trials(self) -> list[Trial]:
         """Return the trials of earlier solvers, which were made for another budget or another code."""
@@ -442,6 +494,20 @@ class StudyFile:
         for point, key, value, _ in self._rows("attributes", "ORDER BY rowid"):
             by_point.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return by_point
+
+
+def _mark(number: int, row: sqlite3.Row, count: int) -> Mark:
+    return Mark(number, row["checksum"], count)
+
+
+def _outcomes(rows: Iterable[sqlite3.Row]) -> Iterator[tuple[RolloutKey, Outcome]]:
+    for point, condition, h, value, measures, t_star, end, message, wall_time, *_ in rows:
+        yield (
+            (decode(point), condition),
+            Outcome(
+                _float(h), _float(value), tuple(json.loads(measures)), _float(t_star), end, message, _float(wall_time)
+            ),
+        )
 
 
 def _checksum(table: str, row: Sequence[Any]) -> int:

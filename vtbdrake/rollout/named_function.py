@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -47,3 +48,10 @@ def named_function(text: str) -> Callable[..., Any]:
     if not callable(function):
         raise ValueError(f"{module_name} has no function {name!r}")
     return function
+
+
+def is_named(text: str, function: Callable[..., Any]) -> bool:
+    """Return whether other processes find a function under the name ``module:function``."""
+    module_name, _, name = text.partition(":")
+    module = sys.modules.get(module_name) if module_name != "__main__" and FUNCTION.fullmatch(text) else None
+    return getattr(module, name, None) is function

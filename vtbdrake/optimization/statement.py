@@ -1,0 +1,136 @@
+"""The statement of a problem as plain data: what a study file keeps, so that its problem can be stated again."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from math import isinf
+from pathlib import Path
+from typing import Any
+
+from vtbdrake.optimization.identity import dimensions
+from vtbdrake.optimization.problem import Problem
+from vtbdrake.optimization.risk import RISKS, CVaR, Quantile, Risk
+from vtbdrake.rollout import Constraint, Quality, RecordedMotion
+from vtbdrake.rollout.named_function import is_named, named_function
+from vtbdrake.testbed import ScenarioError
+from vtbdrake.testbed.scenario_file import load_scenario, save_scenario
+
+# Packages that are imported because a file names them: they are installed beside this module.
+_OWN = ("vtbdrake", "vtbdrake_diagrams", "builtins", "math", "numpy")
+_LEVELS: Mapping[str, Callable[[float], Risk]] = {"Quantile": Quantile, "CVaR": CVaR}
+_LEVEL = re.compile(r"(\w+)\(level=([^)]*)\)")
+
+
+class StatementError(ValueError):
+    """A problem cannot be stated again from what its study file tells."""
+
+
+def statement(problem: Problem) -> dict[str, Any]:
+    """Return what `restated` needs beside the identity of a problem: the scenario as YAML, its functions by name.
+
+    ``scenario`` is empty if no file can hold it. A function that no module has under its name (a lambda, one of a
+    script or a notebook) is None.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scenario.yaml"
+        try:
+            save_scenario(problem.scenario, file)
+            scenario = file.read_text("utf-8")
+        except (ScenarioError, TypeError, ValueError):
+            scenario = ""
+    return {"scenario": scenario, "functions": [_name(m.f) for m in (*problem.objectives, *problem.constraints)]}
+
+
+def _name(function: Callable[..., Any]) -> str | None:
+    name = f"{getattr(function, '__module__', '')}:{getattr(function, '__qualname__', '')}"
+    return name if is_named(name, function) else None
+
+
+def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Problem:
+    """Return the problem of a study, stated again from the record of its file.
+
+    Importing a module runs its code. So no module is imported because a file names it, except those of vtbdrake.
+
+    Args:
+        record: `Study.record`.
+        trusted: Modules that may be imported, or packages of them; those that are imported already need not be named.
+
+    Raises:
+        StatementError: The file does not tell enough, a module is not trusted, or the problem cannot be stated with
+            today's code.
+    """
+    stated, described = record.get("statement"), record["problem"]
+    if stated is None:
+        raise StatementError("the file was written by an earlier vtbdrake and does not tell how to build its testbed")
+    if not stated["scenario"]:
+        raise StatementError("the file does not tell how to build its testbed: no YAML can hold its scenario")
+    if described["start"] != "defaults":
+        raise StatementError("its rollouts begin from a snapshot, which the file does not hold")
+    if None in stated["functions"]:
+        measures = [*described["qualities"], *described["constraints"]]
+        unnamed = [m["name"] for m, name in zip(measures, stated["functions"], strict=True) if name is None]
+        raise StatementError(f"the function {unnamed[0]} is one of a script, a notebook or a lambda")
+    scenario_name = described["scenario"]["scenario"]
+    _refuse_strangers([scenario_name, *stated["functions"]], trusted)
+    try:
+        return _stated(described, scenario_name, stated)
+    except (ValueError, KeyError, TypeError) as error:
+        raise StatementError(f"its problem cannot be stated with today's code: {error}") from error
+
+
+def _refuse_strangers(names: Sequence[str], trusted: Sequence[str]) -> None:
+    for name in names:
+        module = name.partition(":")[0]
+        known = module in sys.modules and module != "__main__"
+        if not known and not any(module == t or module.startswith(f"{t}.") for t in (*_OWN, *trusted)):
+            raise StatementError(
+                f"the file names {name}, and importing its module runs its code: name the module, if you trust it"
+            )
+
+
+def _stated(described: Mapping[str, Any], scenario_name: str, stated: Mapping[str, Any]) -> Problem:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scenario.yaml"
+        file.write_text(stated["scenario"], "utf-8")
+        scenario = load_scenario(f"{scenario_name}@{file}")
+    functions = iter([named_function(name) for name in stated["functions"]])
+    qualities = [
+        Quality(next(functions), q["of"], reading=q["reading"], minimize=q["minimize"], upper=float(q["upper"]))
+        for q in described["qualities"]
+    ]
+    constraints = [
+        Constraint(
+            next(functions),
+            c["of"],
+            reading=c["reading"],
+            at_most=float(c["at_most"]),
+            at_least=float(c["at_least"]),
+        )
+        for c in described["constraints"]
+    ]
+    threshold = float(described["threshold"])
+    return Problem(
+        scenario=scenario,
+        parameters=dimensions(described),
+        quality=qualities,
+        horizon=described["horizon"],
+        threshold=None if isinf(threshold) else threshold,
+        sample_period=described["sample_period"],
+        conditions=described["conditions"],
+        risk=_risk(described["risk"]),
+        constraints=constraints,
+        motion=RecordedMotion(described["memory"]) if "memory" in described else None,
+    )
+
+
+def _risk(text: str) -> Risk:
+    for risk in RISKS.values():
+        if text == f"{type(risk).__name__}()":
+            return risk
+    level = _LEVEL.fullmatch(text)
+    if level is None or level[1] not in _LEVELS:
+        raise StatementError(f"its risk {text} is none of vtbdrake's")
+    return _LEVELS[level[1]](float(level[2]))
