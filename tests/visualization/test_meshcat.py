@@ -1,17 +1,21 @@
 """Tests that read back what Meshcat writes: keyframes, their times, their poses and their paths."""
 
 import xml.etree.ElementTree as ElementTree
+from base64 import b64decode
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from pydrake.geometry import Meshcat
 
 from tests.testbeds import AcrobotScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Motion
 from vtbdrake.visualization import make_meshcat, show_motion, show_motions
+from vtbdrake.visualization.camera import Camera, fitting_camera
 
 UPPER = "Acrobot/upper_link"
 
@@ -137,9 +141,73 @@ def test_page_is_written_whole_with_its_legend(meshcat: Meshcat, tmp_path: Path)
 
 def test_notebook_cell_shows_the_page_itself(meshcat: Meshcat) -> None:
     scene = show_motion(meshcat, motion())
-    frame = ElementTree.fromstring(scene._repr_html_())
+    bundle = scene._repr_mimebundle_()
+    frame = ElementTree.fromstring(bundle["text/html"])
     assert frame.tag == "iframe"
     assert any(m["type"] == "set_animation" for m in messages(frame.attrib["srcdoc"]))
+    assert Image.open(BytesIO(b64decode(bundle["image/png"]))).size == (640, 400)
+
+
+def test_pages_of_a_folder_share_the_viewer(meshcat: Meshcat, tmp_path: Path) -> None:
+    for name, end in (("a.html", 1.0), ("b.html", 0.5)):
+        show_motion(meshcat, motion(end)).save(tmp_path / name, shared=True)
+    (script,) = tmp_path.glob("*.js")
+    for name in ("a.html", "b.html"):
+        page = (tmp_path / name).read_text(encoding="utf-8")
+        assert f'src="{script.name}"' in page and len(page) < 0.1 * script.stat().st_size
+        assert any(m["type"] == "set_animation" for m in messages(page))
+
+
+def still(end: float = 2.0, *, spacing: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """The picture of two motions in red and blue, shape (height, width, 3)."""
+    scene = show_motions(
+        make_meshcat(), {"a": motion(end), "b": motion(end)}, spacing=spacing, colors={"a": "red", "b": "blue"}
+    )
+    assert scene.still is not None
+    return scene.still.render().astype(int)
+
+
+def coloured(image: np.ndarray, channel: int) -> np.ndarray:
+    """Rows and columns of the pixels in which a channel is the strongest by far."""
+    rest = np.delete(image, channel, axis=2).max(axis=2)
+    return np.argwhere(image[..., channel] > 1.5 * rest + 20)
+
+
+@pytest.mark.parametrize("size", [1.0, 20.0])
+def test_picture_shows_all_that_moves_and_fills_the_view(size: float) -> None:
+    image = still(0.0, spacing=(0.0, size, 0.0))
+    red, blue = coloured(image, 0), coloured(image, 2)
+    assert min(len(red), len(blue)) > 20
+    pixels = np.vstack([red, blue])
+    reach = np.ptp(pixels, axis=0) / image.shape[:2]
+    assert 0.6 < reach.max() < 0.9
+    assert pixels.min() > 0 and np.all(pixels.max(axis=0) < np.array(image.shape[:2]) - 1)
+    if size > 1.0:  # The one at larger y is farther, and at the right.
+        assert blue[:, 1].mean() > red[:, 1].mean() and len(blue) < len(red)
+
+
+def test_picture_has_the_begin_of_the_motion_as_a_shadow_of_its_end() -> None:
+    swung, resting = still(0.75), still(0.0)
+    colors = [np.linalg.norm(image - image[0, 0], axis=2) for image in (swung, resting)]
+    faint = [np.mean((color > 5) & (color < 60)) for color in colors]
+    assert faint[0] > 3 * faint[1]
+
+
+def test_camera_has_all_points_in_view_and_one_at_the_edge() -> None:
+    points = np.random.default_rng(1).normal(size=(3, 50)) * [[5.0], [0.2], [1.0]] + [[3.0], [-40.0], [2.0]]
+    camera = fitting_camera(points, margin=1.0)
+    x, y, z = camera.pose.inverse() @ points  # in the frame of a camera of OpenCV
+    tangent = np.tan(np.deg2rad(75.0) / 2)
+    reach = np.maximum(np.abs(x) / (4 / 3), np.abs(y)) / (z * tangent)
+    assert z.min() > 0.0 and reach.max() == pytest.approx(1.0)
+    assert camera.pose.rotation().matrix()[2, 1] < 0.0  # The image's down is the world's down.
+
+
+def test_cameras_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="has no upward direction"):
+        Camera((1.0, 2.0, 5.0), (1.0, 2.0, 0.0))
+    with pytest.raises(ValueError, match="finite position"):
+        Camera((1.0, 2.0, np.nan), (1.0, 2.0, 0.0))
 
 
 def test_meshcat_listens_on_this_machine_only(meshcat: Meshcat) -> None:

@@ -195,7 +195,7 @@ def _written(
         from vtbdrake.visualization import show_motion
 
         try:
-            show_motion(meshcat, rerun.motion).save(folder / f"{stem}.html")
+            show_motion(meshcat, rerun.motion).save(folder / f"{stem}.html", shared=True)
             animation = f"{stem}.html"
         except ValueError as error:  # There is nothing to draw.
             notes.append(f"There is no animation: {one_line(error)}.")

@@ -26,6 +26,7 @@ from vtbdrake.cli.options import (
 )
 from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
 from vtbdrake.failures import one_line
+from vtbdrake.optimization.problem import PLANT_STATE
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.settings import schema
 from vtbdrake.state import Snapshot, Variable, Variables
@@ -33,9 +34,6 @@ from vtbdrake.state.variables import A, text_table
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.pedigree import Number
 from vtbdrake.testbed.testbed import MODES
-
-# The output port from which the motion of the simulated world is drawn.
-PLANT_STATE = "plant.state"
 
 # The number of entries of an array in a table of pedigrees.
 _SHOWN = 6
@@ -197,7 +195,7 @@ def rollout(
         from vtbdrake.optimization import Motion
         from vtbdrake.visualization import make_meshcat, show_motion
 
-        show_motion(make_meshcat(), Motion(scenario, result.times, result.record[PLANT_STATE])).save(html)
+        show_motion(make_meshcat(), Motion.of(scenario, result)).save(html)
     if result.failed:
         raise FailedError(f"the rollout failed: {one_line(result.message)}")
     if snapshot is not None:

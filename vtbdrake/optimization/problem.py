@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,14 +48,28 @@ if TYPE_CHECKING:
 
 Condition = Mapping[str, Any]
 
+PLANT_STATE = "plant.state"
+"""The output port with the motion of the simulated world."""
+
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of the simulated world: the plant's states [q; v] at ``times``, shape (n, nq + nv)."""
+    """The motion of the simulated world: the plant's states [q; v] at ``times``, shape (n, nq + nv).
+
+    With the quality trajectory f' at the same times, equation (13), and t* of its rollout, equation (16), if any.
+    """
 
     scenario: Scenario
     times: np.ndarray
     states: np.ndarray
+    quality: np.ndarray | None = None
+    t_star: float = nan
+
+    @classmethod
+    def of(cls, scenario: Scenario, result: RolloutResult) -> Motion:
+        """Return the motion in a rollout that `recording_motion` has prepared."""
+        quality = result.quality if len(result.times) and len(result.quality) == len(result.times) else None
+        return cls(scenario, result.times, result.record[PLANT_STATE], quality, result.t_star)
 
 
 def recording_motion(task: RolloutTask, testbed: VirtualTestbed) -> RolloutTask:
@@ -68,7 +83,7 @@ def recording_motion(task: RolloutTask, testbed: VirtualTestbed) -> RolloutTask:
             f"there is no motion to show: {type(task.scenario).__name__} has no MultibodyPlant; plot the quality over "
             "time instead, with plot()"
         )
-    return replace(task, record=("plant.state",), pruning=None)
+    return replace(task, record=(PLANT_STATE,), pruning=None)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -307,7 +322,7 @@ class Problem:
         """
         runner = self._runner(recording_motion(self.task, self.testbed), parameters)
         result = runner.run(split(parameters)[1])
-        return Motion(runner.task.scenario, result.times, result.record["plant.state"])
+        return Motion.of(runner.task.scenario, result)
 
     def _runner(self, task: RolloutTask, parameters: Mapping[str, Any]) -> RolloutRunner:
         return RolloutRunner(*self.placed(task, parameters))

@@ -313,7 +313,7 @@ class Reasoner:
         task = recording_motion(self.task, self.problem.testbed)
         values = decision.candidates[candidate].values if candidate else {}
         result = RolloutRunner(task, self.problem.testbed).run(values, start=decision.starts[0])
-        return Motion(task.scenario, result.times, result.record["plant.state"])
+        return Motion.of(task.scenario, result)
 
     def _check_executor(self) -> None:
         """Raise a ValueError if the executor cannot end a rollout early."""

@@ -15,6 +15,7 @@ import yaml
 
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.optimization import Motion, Problem, Study
+from vtbdrake.optimization.problem import PLANT_STATE
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult
 from vtbdrake.rollout.executor import run_rollouts
@@ -28,7 +29,6 @@ from vtbdrake.testing.campaign_results import ALL, CampaignResult, CampaignRollo
 
 ATTRIBUTE = "campaign"
 """The attribute of a study that names its rollouts and criteria."""
-_PLANT_STATE = "plant.state"
 
 
 class CampaignError(ValueError):
@@ -446,7 +446,7 @@ class Campaign:
                 f"{self.seeds.numbers[0]} to {self.seeds.numbers[-1]}"
             )
         problem, addresses = self.problem, [a for c in self.criteria.values() for a in c.addresses]
-        state = [_PLANT_STATE] if problem.testbed.plant is not None else []
+        state = [PLANT_STATE] if problem.testbed.plant is not None else []
         record = tuple(dict.fromkeys([*addresses, *self.record, *state]))
         values = problem.values((), condition=self.rollout_names.index((condition, seed)))
         task = replace(problem.task, record=record, catch=True)
@@ -462,7 +462,7 @@ class Campaign:
         motion = None
         if state and len(result.times) > 1:
             scenario = problem.scenario.with_fields(split(values)[0])
-            motion = Motion(scenario, result.times, result.record[_PLANT_STATE])
+            motion = Motion(scenario, result.times, result.record[PLANT_STATE])
         return Rerun(rollout, result, motion, {name: self._samples(c, result) for name, c in self.criteria.items()})
 
     def _samples(self, criterion: Criterion, result: RolloutResult) -> np.ndarray:

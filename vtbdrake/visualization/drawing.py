@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
 from pydrake.geometry import CalcObb, FrameId, GeometryId, Meshcat, QueryObject, Rgba, Role, SceneGraphInspector
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.camera import fitting_camera
+from vtbdrake.visualization.still import Still
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
@@ -21,9 +25,8 @@ if TYPE_CHECKING:
 _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
-# From where a robot is looked at, and how far away in terms of the diagonal of its box.
-_VIEW_DIRECTION = np.array([0.64, -0.68, 0.36])
-_VIEW_DISTANCE = 1.3
+# What moves in a live view gets a field of view that is larger than it needs by this factor.
+_ROOM = 1.6
 
 
 class Parts(Flag):
@@ -71,6 +74,8 @@ class Drawing:
         query = self._query(context)
         inspector = query.inspector()
         self._frames: list[tuple[FrameId, str]] = []
+        self._shapes: list[tuple[GeometryId, Rgba, bool]] = []  # with colour, and whether it moves
+        self._boxes: list[tuple[FrameId, NDArray[np.float64]]] | None = None  # the corners in each frame, see `corners`
         meshcat.Delete(path)
         for frame in inspector.GetAllFrameIds():
             moves = frame != inspector.world_frame_id() and not _is_anchored(testbed.plant, frame)
@@ -80,8 +85,10 @@ class Drawing:
             place = f"{path}/{inspector.GetName(frame)}".replace("::", "/")
             for geometry in geometries:
                 color = _color(inspector, geometry)
+                color = _tinted(color, tint, opacity) if moves else color
+                self._shapes.append((geometry, color, moves))
                 part = f"{place}/{inspector.GetName(geometry)}-{geometry.get_value()}".replace("::", "/")
-                meshcat.SetObject(part, inspector.GetShape(geometry), _tinted(color, tint, opacity) if moves else color)
+                meshcat.SetObject(part, inspector.GetShape(geometry), color)
                 meshcat.SetTransform(part, inspector.GetPoseInFrame(geometry))
             if moves:
                 self._frames.append((frame, place))
@@ -103,27 +110,63 @@ class Drawing:
     def _query(self, context: Context) -> QueryObject:
         return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(context))
 
+    def corners(self, context: Context) -> NDArray[np.float64]:
+        """Return the corners of the boxes around what moves, in the world frame, shape (3, n)."""
+        query = self._query(context)
+        if self._boxes is None:
+            self._boxes = [(frame, _boxes(query.inspector(), frame)) for frame, _ in self._frames]
+        return np.hstack([np.empty((3, 0)), *(query.GetPoseInWorld(frame) @ box for frame, box in self._boxes)])
+
     def fit_camera(self, context: Context) -> None:
-        """Move the camera so that the moving frames fill the view, seen from the front at the right, and above."""
+        """Move the camera so that what moves is in view, with room around it."""
+        corners = self.corners(context)
+        if corners.size:
+            camera = fitting_camera(corners, margin=_ROOM)
+            self._meshcat.SetCameraPose(camera.position, camera.target)
+
+    def add_to(
+        self,
+        still: Still,
+        context: Context,
+        *,
+        parts: Parts = Parts.ALL,
+        opacity: float = 1.0,
+        X_WP: RigidTransform | None = None,
+    ) -> None:
+        """Add what is drawn to a still picture, in the poses of a context.
+
+        Args:
+            still: The picture.
+            context: A root context of the testbed.
+            parts: The parts of what is drawn that are added.
+            opacity: A factor of the opacity of what moves.
+            X_WP: The pose of the path in Meshcat, if it has been displaced.
+        """
         query = self._query(context)
         inspector = query.inspector()
-        corners = []
-        for frame, _ in self._frames:
-            for geometry in inspector.GetGeometries(frame, Role.kIllustration):
-                box = CalcObb(inspector.GetShape(geometry))
-                if box is not None:
-                    X_WB = query.GetPoseInWorld(frame) @ inspector.GetPoseInFrame(geometry) @ box.pose()
-                    corners.append(X_WB @ (_CORNERS * box.half_width()).T)
-        if not corners:
-            return
-        points = np.hstack(corners)
-        lower, upper = points.min(axis=1), points.max(axis=1)
-        center, size = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))
-        self._meshcat.SetCameraPose(center + _VIEW_DISTANCE * size * _VIEW_DIRECTION, center)
+        for geometry, color, moves in self._shapes:
+            if not parts & (Parts.MOVING if moves else Parts.ANCHORED):
+                continue
+            X_PG = RigidTransform(query.GetPoseInWorld(geometry))  # a copy: Drake returns a reference
+            still.add(
+                inspector.GetShape(geometry),
+                X_PG if X_WP is None else X_WP @ X_PG,
+                Rgba(color.r(), color.g(), color.b(), color.a() * (opacity if moves else 1.0)),
+            )
 
     def delete(self) -> None:
         """Remove it from the scene."""
         self._meshcat.Delete(self.path)
+
+
+def _boxes(inspector: SceneGraphInspector, frame: FrameId) -> NDArray[np.float64]:
+    """Return the corners of the boxes around the shapes of a frame, in that frame, shape (3, n)."""
+    corners = [np.empty((3, 0))]
+    for geometry in inspector.GetGeometries(frame, Role.kIllustration):
+        if (box := CalcObb(inspector.GetShape(geometry))) is not None:
+            X_FB = inspector.GetPoseInFrame(geometry) @ box.pose()
+            corners.append(X_FB @ (_CORNERS * box.half_width()).T)
+    return np.hstack(corners)
 
 
 def _is_anchored(plant: MultibodyPlant | None, frame: FrameId) -> bool:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import TYPE_CHECKING
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import to_hex
@@ -17,9 +22,13 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
+from vtbdrake.components.rendering import RenderingError
+from vtbdrake.failures import one_line
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.camera import fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
+from vtbdrake.visualization.still import Still
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
@@ -31,8 +40,28 @@ if TYPE_CHECKING:
 # Colours for all kinds of colour vision (Okabe and Ito).
 _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
+# Colour of the curve of a motion in the robot's own colours.
+_UNTINTED = "#555555"
+
+# The opacity of what moves in the picture of a recording, at instants from its begin to its end.
+_EXPOSURES = (0.15, 0.3, 1.0)
+
+# The scripts and styles of pages, and the tag before the script of Meshcat's viewer.
+_PAGE = Path(__file__).parents[1] / "web" / "page"
+_SCRIPT_TAG = '<script type="text/javascript">'
+
 # Keyframes lie on whole milliseconds; the browser interpolates between them.
 _RESOLUTION = 1000.0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The quality trajectory of a motion, equation (13), beside its recording."""
+
+    times: np.ndarray  # in s, shape (n,)
+    values: np.ndarray  # shape (n,)
+    t_star: float  # t*, equation (16), in s; NaN if there is none
+    color: str
 
 
 @dataclass(frozen=True, repr=False)
@@ -43,35 +72,104 @@ class Scene:
     title: str = ""  # a caption
     legend: Mapping[str, str] = field(default_factory=dict)  # label -> colour, below the caption
     height: int = 400  # of the notebook's cell output, in pixels
+    curves: Mapping[str, Curve] = field(default_factory=dict)  # label -> curve, bound to the clock of the recording
+    still: Still | None = None  # what readers without a kernel see
 
     def page(self) -> str:
         """Return the scene as one self-contained HTML page."""
         head, tag, tail = self.meshcat.StaticHtml().rpartition("</body>")
-        return f"{head}{self._caption()}{tag}{tail}"
+        return f"{head}{self._overlay()}{tag}{tail}"
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the `page` to a file. The file is written completely or not at all."""
+    def save(self, path: str | os.PathLike[str], *, shared: bool = False) -> None:
+        """Write the `page` to a file, for any web browser. The file is written completely or not at all.
+
+        Args:
+            path: The file.
+            shared: Write the script of Meshcat's viewer, which is most of a page, to a file of its own in the same
+                folder, for all pages there.
+        """
+        page = self.page()
+        if shared:
+            # Drake's StaticZip would share meshes and textures, too; but browsers do not read these from a disk.
+            head, _, rest = page.partition(_SCRIPT_TAG)
+            script, end, tail = rest.partition("</script>")
+            if not end or len(script) < len(tail):
+                raise ValueError("the page of this version of Meshcat has no script that could be shared")
+            name = f"meshcat-{hashlib.sha256(script.encode()).hexdigest()[:16]}.js"
+            place = Path(path).parent / name
+            if not place.exists():
+                with whole_file(place) as partial:
+                    partial.write_text(script, encoding="utf-8")
+            page = f'{head}<script type="text/javascript" src="{name}">{end}{tail}'
         with whole_file(path) as partial:
-            partial.write_text(self.page(), encoding="utf-8")
+            partial.write_text(page, encoding="utf-8")
 
-    def _caption(self) -> str:
+    def _overlay(self) -> str:
+        """Return caption, legend, clock and curves, which `page/recording.js` moves."""
         rows = [f"<b>{html.escape(self.title)}</b>"] if self.title else []
         rows += [
-            f'<span style="color:{html.escape(color, quote=True)}">&#9632;</span> {html.escape(name)}'
+            f'<span><span style="color:{html.escape(color, quote=True)}">&#9632;</span> {html.escape(name)}</span>'
             for name, color in self.legend.items()
         ]
-        style = (
-            "position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,0.85);border-radius:6px;"
-            "font:14px/1.5 sans-serif;color:#222"
+        curves = [
+            {
+                "label": name,
+                "color": curve.color,
+                "times": curve.times.tolist(),
+                "values": [value if isfinite(value) else None for value in curve.values.tolist()],
+                "star": _star(curve),
+            }
+            for name, curve in self.curves.items()
+        ]
+        data = json.dumps({"curves": curves}, allow_nan=False).replace("</", "<\\/")
+        style, script = [_read("recording.css")], [_read("recording.js")]
+        if curves:
+            style.insert(0, _read("vendor/uPlot.min.css"))
+            script.insert(0, _read("vendor/uPlot.iife.min.js"))
+        return "\n".join(
+            [
+                f"<style>{''.join(style)}</style>",
+                f'<div id="vtb-caption">{"".join(rows)}<output id="vtb-clock"></output></div>',
+                '<div id="vtb-curves"></div>' if curves else "",
+                f'<script type="application/json" id="vtb-recording">{data}</script>',
+                *(f"<script>{text}</script>" for text in script),
+                "",
+            ]
         )
-        return f'<div id="caption" style="{style}">{"<br>".join(rows)}</div>\n' if rows else ""
 
     def __repr__(self) -> str:
         return "<Scene in 3D: run the cell to see it>"
 
-    def _repr_html_(self) -> str:
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        """Show the recording in a notebook; its picture, where there is no kernel."""
         style = f"width: 100%; height: {self.height}px; border: 0"
-        return f'<iframe srcdoc="{html.escape(self.page())}" style="{style}"></iframe>'
+        page = f'<iframe srcdoc="{html.escape(self.page())}" style="{style}"></iframe>'
+        return picture_bundle(repr(self), self.still) | {"text/html": page}
+
+
+def picture_bundle(text: str, still: Still | None) -> dict[str, Any]:
+    """Return how something that is drawn appears in a notebook without a kernel: its picture, or a text.
+
+    There is no picture of what nothing moves in, or on a machine that cannot render.
+    """
+    if still is None or still.camera is None:
+        return {"text/plain": text}
+    try:
+        return {"text/plain": text, "image/png": base64.b64encode(still.png()).decode()}
+    except RenderingError as error:
+        return {"text/plain": f"{text}\n(no picture: {one_line(error)})"}
+
+
+def _star(curve: Curve) -> tuple[float, float] | None:
+    """Return t* and the quality at t*."""
+    if not isfinite(curve.t_star):
+        return None
+    value = float(np.interp(curve.t_star, curve.times, curve.values))
+    return (curve.t_star, value) if isfinite(value) else None
+
+
+def _read(name: str) -> str:
+    return (_PAGE / name).read_text(encoding="utf-8")
 
 
 def make_meshcat() -> Meshcat:
@@ -98,8 +196,8 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
     """
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
-    _record(meshcat, [_Actor(motion=motion, path=prefix)], rate)
-    return Scene(meshcat)
+    still = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate)
+    return Scene(meshcat, curves=_curves({"": motion}, {"": _PALETTE[0]}), still=still)
 
 
 def show_motions(
@@ -153,8 +251,8 @@ def show_motions(
             )
         )
     meshcat.Delete(prefix)
-    _record(meshcat, actors, rate)
-    return Scene(meshcat, legend=tints)
+    still = _record(meshcat, actors, rate)
+    return Scene(meshcat, legend=tints, curves=_curves(motions, tints), still=still)
 
 
 def show_poses(
@@ -192,18 +290,18 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    stages = _Stages()
+    stages, still, corners = _Stages(), Still(), []
     for name, motion in motions.items():
         new = motion.scenario not in stages
         stage = stages[motion.scenario]
         if new:
             path = f"{prefix}/surroundings/{len(stages)}"
-            Drawing(meshcat, stage.testbed, stage.context, path, parts=Parts.ANCHORED)
+            Drawing(meshcat, stage.testbed, stage.context, path, parts=Parts.ANCHORED).add_to(still, stage.context)
         states = _states(motion, stage.testbed, f"{prefix}/{name}")
         instants = np.linspace(0, len(states) - 1, count).round().astype(int)
         for k, sample in enumerate(dict.fromkeys(instants.tolist())):
             stage.set_state(states[sample])
-            Drawing(
+            drawing = Drawing(
                 meshcat,
                 stage.testbed,
                 stage.context,
@@ -212,7 +310,10 @@ def show_poses(
                 opacity=opacities.get(name, 1.0),
                 parts=Parts.MOVING,
             )
-    return Scene(meshcat, title=title, legend=tints)
+            drawing.add_to(still, stage.context)
+            corners.append(drawing.corners(stage.context))
+    _fit_camera(meshcat, still, corners)
+    return Scene(meshcat, title=title, legend=tints, still=still)
 
 
 class _Stage:
@@ -287,16 +388,37 @@ def _states(motion: Motion, testbed: VirtualTestbed, path: str) -> np.ndarray:
     return states
 
 
-def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> None:
-    end, stages = max(float(actor.motion.times[-1]) for actor in actors), _Stages()
+def _curves(motions: Mapping[str, Motion], colors: Mapping[str, str]) -> dict[str, Curve]:
+    """Return the quality curves of the motions that have one."""
+    return {
+        name: Curve(motion.times, motion.quality, motion.t_star, colors.get(name, _UNTINTED))
+        for name, motion in motions.items()
+        if motion.quality is not None
+    }
+
+
+def _fit_camera(meshcat: Meshcat, still: Still, corners: list[np.ndarray]) -> None:
+    """Let the page and the picture begin with a view of all that moves, wherever it moves to."""
+    points = np.hstack([np.empty((3, 0)), *corners])
+    if np.isfinite(points).all() and points.size:
+        still.camera = fitting_camera(points)
+        meshcat.SetCameraPose(still.camera.position, still.camera.target)
+
+
+def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> Still:
+    """Record the motions, and return a picture of them."""
+    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), _Stages(), Still()
+    corners: list[np.ndarray] = []
     meshcat.DeleteRecording()
     meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
     try:
         for actor in actors:
-            actor.play(meshcat, stages[actor.motion.scenario], end, rate)
+            corners += actor.play(meshcat, stages[actor.motion.scenario], end, rate, still)
     finally:
         meshcat.StopRecording()
     meshcat.PublishRecording()
+    _fit_camera(meshcat, still, corners)
+    return still
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,7 +432,8 @@ class _Actor:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     surroundings: bool = True
 
-    def play(self, meshcat: Meshcat, stage: _Stage, end: float, rate: float) -> None:
+    def play(self, meshcat: Meshcat, stage: _Stage, end: float, rate: float, still: Still) -> list[np.ndarray]:
+        """Record the motion, add instants of it to the picture, and return the corners of all that moves."""
         states = _states(self.motion, stage.testbed, self.path)
         drawing = Drawing(
             meshcat,
@@ -321,11 +444,20 @@ class _Actor:
             opacity=self.opacity,
             parts=Parts.ALL if self.surroundings else Parts.MOVING,
         )
-        meshcat.SetTransform(self.path, RigidTransform(self.offset))
-        for time, sample in _keyframes(self.motion.times, end, rate):
+        X_WP = RigidTransform(self.offset)
+        meshcat.SetTransform(self.path, X_WP)
+        corners, keyframes = [], _keyframes(self.motion.times, end, rate)
+        for time, sample in keyframes:
             stage.set_state(states[sample])
             # Meshcat rounds the time of a keyframe down; the quarter keeps it off the edge.
             drawing.pose(stage.context, time_in_recording=time + 0.25 / _RESOLUTION)
+            corners.append(X_WP @ drawing.corners(stage.context))
+        instants = np.linspace(0, len(keyframes) - 1, len(_EXPOSURES)).round().astype(int)
+        for number, opacity in zip(instants, _EXPOSURES, strict=True):
+            stage.set_state(states[keyframes[number][1]])
+            drawing.add_to(still, stage.context, parts=Parts.MOVING, opacity=opacity, X_WP=X_WP)
+        drawing.add_to(still, stage.context, parts=Parts.ANCHORED, X_WP=X_WP)
+        return corners
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:
