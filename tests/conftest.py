@@ -6,9 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -71,3 +72,12 @@ def user_types(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
         return importlib.import_module("vtb_test_types")
     finally:
         sys.path.remove(str(folder))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A Chromium without a window."""
+    from tests.chromium import running_browser
+
+    with running_browser() as running:
+        yield running

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import io
-import shutil
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
+from tests.chromium import PATIENCE, needs_chromium, screenshot
 from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking")
-PATIENCE = 120_000  # ms
 GREEN, BLUE = np.array([0, 158, 115]), np.array([0, 114, 178])  # tints of the ghosts
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium: apt-get install chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, "--disable-component-update"])
-        yield running
-        running.close()
+pytestmark = [pytest.mark.slow, needs_chromium]
 
 
 @pytest.fixture
@@ -55,9 +39,7 @@ def page(browser: Browser, running: View) -> Iterator[Page]:
 
 def picture(page: Page) -> np.ndarray:
     """The scene, between panel and bar, when all that has been sent is drawn; shape (height, width, 3)."""
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    clip = {"x": 345, "y": 110, "width": 650, "height": 480}
-    return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).astype(int)
+    return screenshot(page, clip={"x": 345, "y": 110, "width": 650, "height": 480})
 
 
 def share(image: np.ndarray, color: np.ndarray) -> float:

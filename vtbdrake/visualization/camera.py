@@ -33,7 +33,7 @@ class Camera:
         values = np.array([self.position, self.target], dtype=float)
         if values.shape != (2, 3) or not np.isfinite(values).all():
             raise ValueError(f"a camera has a finite position (3,) and target (3,), not {self.position}, {self.target}")
-        if np.allclose(*values[:, :2], rtol=0.0, atol=1e-9 * (1.0 + float(np.abs(values).max()))):
+        if float(np.abs(np.diff(values[:, :2], axis=0)).max()) < 1e-9 * (1.0 + float(np.abs(values).max())):
             raise ValueError(
                 f"a camera above its target, at {self.position} and {self.target}, has no upward direction"
             )
@@ -71,5 +71,5 @@ def fitting_camera(points_W: NDArray[np.float64], *, margin: float = 1.15) -> Ca
 
 
 def _camera(target: NDArray[np.float64], distance: float) -> Camera:
-    position = target + distance * _DIRECTION
-    return Camera(*(tuple(map(float, point)) for point in (position, target)))
+    (x, y, z), (target_x, target_y, target_z) = target + distance * _DIRECTION, target
+    return Camera((float(x), float(y), float(z)), (float(target_x), float(target_y), float(target_z)))
