@@ -12,6 +12,8 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexe
 from vtbdrake.components.casadi_system import CasadiSystem, clamp
 from vtbdrake.state import NamedVector, Quantity
 from vtbdrake.state.declarations import DISCRETE, PARAMETER, Element
+from vtbdrake.testbed.hand import HAND_SIZE
+from vtbdrake_diagrams.manipulator import leading
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
 from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
@@ -37,6 +39,7 @@ def make_dps(
     arm: Arm | None = None,
     compile: bool = True,
     knows_tool: bool = False,
+    led_by_hand: bool = False,
 ) -> Diagram:
     """Return the DPS: ``sense`` calibrates, ``env`` perceives, ``impl`` controls, ``act`` limits.
 
@@ -55,6 +58,7 @@ def make_dps(
             the same, bit for bit.
         knows_tool: Add ``tool``, whose parameters ``mass`` (kg) and ``center`` (3, m) are what the DPS knows about the
             tool. Mental rollouts and predictions use them; the control law and ``env`` do not.
+        led_by_hand: Add the command ``hand`` and the motion `led`, see `leading`.
 
     Raises:
         ValueError: There is no such law.
@@ -66,11 +70,15 @@ def make_dps(
     sense = builder.AddNamedSystem("sense", _make_sense())
     env = builder.AddNamedSystem("env", _make_env(model, period=period, compile=compile))
     perceived = env.GetOutputPort(_STATE)
-    impl = builder.AddNamedSystem("impl", _make_impl(model, law, perceived.size(), period=period, compile=compile))
+    impl = builder.AddNamedSystem(
+        "impl", _make_impl(model, law, perceived.size(), period=period, compile=compile, led_by_hand=led_by_hand)
+    )
     act = builder.AddNamedSystem("act", _make_act(model.arm, impl.GetOutputPort(_STATE).size()))
     for signal in SENSOR_SIGNALS:
         builder.ExportInput(sense.GetInputPort(signal), signal)
     builder.ExportInput(impl.GetInputPort("wanted"), "motion")
+    if led_by_hand:
+        builder.ExportInput(impl.GetInputPort("hand"), "hand")
     builder.Connect(sense.get_output_port(), env.GetInputPort("measured"))
     builder.Connect(sense.get_output_port(), impl.GetInputPort("measured"))
     builder.Connect(perceived, impl.GetInputPort("perceived"))
@@ -167,7 +175,9 @@ def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
     )
 
 
-def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, compile: bool) -> System:
+def _make_impl(
+    model: ArmDynamics, law: str, perceived: int, *, period: float, compile: bool, led_by_hand: bool
+) -> System:
     """Return the system of motions and control law; ``torque`` changes no faster than ``torque_rate``.
 
     ``perceived`` is the size of the state of ``env``.
@@ -182,6 +192,7 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
         **parameters(model.arm),
         # At most from one end of the range to the other within a period.
         "torque_rate": (model.arm.torque_rates, "N m/s", (0.0, 2.0 * np.array(model.arm.torques) / period)),
+        **(leading.GAINS if led_by_hand else {}),
     }
     p = _symbols(gains)
     state: States = {
@@ -192,13 +203,16 @@ def _make_impl(model: ArmDynamics, law: str, perceived: int, *, period: float, c
         "reference": (model.arm.home, "rad"),
         **control_law.state,
     }
+    if led_by_hand:
+        state |= leading.STATE | {"tip_pose": (leading.pose_matrix(model), "1, m")}
     x = _symbols(state)
-    r = reference(command, q, x, p, period=period)
+    hand = casadi.SX.sym("hand", HAND_SIZE) if led_by_hand else None
+    r = reference(command, q, x, p, period=period, hand=hand, model=model)
     torque, remembered = control_law.torque(model, q, v, wrench, r, x, p, period)
     reach = period * p["torque_rate"]
     torque = clamp(torque, x["torque"] - reach, x["torque"] + reach)
     following = {"torque": torque, **r.state, **remembered}
-    inputs = {"measured": z, "perceived": environment, "wanted": command}
+    inputs = {"measured": z, "perceived": environment, "wanted": command, **({} if hand is None else {"hand": hand})}
     return _system(
         "impl",
         following,

@@ -5,10 +5,11 @@ r"""The predefined motions, as references for the control laws.
     2 swing    in joint space to another pose and back
     3 press    the tip moves straight ahead, waits, and returns
     4 circle   the tip moves on a circle across the tool's axis
+    5 led      the tip follows a hand, see `leading`; only where the scenario is ``led_by_hand``
 
 All start and end at rest, where the one before ended: whatever the command, the reference is continuous with its first
 and second derivative. A command is obeyed when the motion under way has ended (motions repeat); `follow` at once, and
-what comes after `follow` is always `home`.
+what comes after `follow` is always `home`. `led` ends when another motion is commanded and the tip has come to rest.
 
 Everything moves by the minimum-jerk profile P(x) = 10 x^3 - 15 x^4 + 6 x^5 (Flash, Hogan, "The Coordination of Arm
 Movements", 1985).
@@ -23,7 +24,8 @@ from math import pi
 import casadi
 
 from vtbdrake_diagrams.manipulator.arm import Arm
-from vtbdrake_diagrams.manipulator.dynamics import Expression
+from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression
+from vtbdrake_diagrams.manipulator.leading import is_at_rest, lead
 
 
 class Motion(IntEnum):
@@ -34,6 +36,7 @@ class Motion(IntEnum):
     SWING = 2
     PRESS = 3
     CIRCLE = 4
+    LED = 5
 
     @property
     def label(self) -> str:
@@ -67,7 +70,7 @@ class Reference:
         following: 1 during `follow`.
         ease: 0 at the begin and end of a Cartesian motion and at most 1 between, with its first derivative: when the
             arm may do what the tip does not feel.
-        state: The next values of ``motion``, ``clock`` and ``start``.
+        state: The next values of ``motion``, ``clock`` and ``start``, and of `leading.STATE` if a hand may lead.
     """
 
     in_joints: Expression
@@ -83,7 +86,14 @@ class Reference:
 
 
 def reference(
-    command: Expression, q: Expression, state: dict[str, Expression], p: dict[str, Expression], *, period: float
+    command: Expression,
+    q: Expression,
+    state: dict[str, Expression],
+    p: dict[str, Expression],
+    *,
+    period: float,
+    hand: Expression | None = None,
+    model: ArmDynamics | None = None,
 ) -> Reference:
     """Return the reference of the motion that is under way.
 
@@ -94,6 +104,8 @@ def reference(
             ``reference`` of the law at the last instant, shape (7,).
         p: The values of `parameters`.
         period: The sample period, in seconds.
+        hand: The command of the hand that may lead, shape (8,); None if none may.
+        model: The arm that it leads.
     """
     before = state["motion"]
     follow = command < Motion.FOLLOW + 0.5
@@ -101,7 +113,11 @@ def reference(
     away = casadi.mmax(casadi.fabs(p["home"] - state["start"])) > 1e-6
     durations = [0, away * p["home_duration"], p["swing_duration"], p["press_duration"], p["circle_duration"]]
     # The last instant of a motion, at which it has arrived, is the first of the next one.
-    begins = casadi.logic_or(released, state["clock"] > _choose(before, durations) + period / 2)
+    ended = state["clock"] > _choose(before, durations) + period / 2
+    if hand is not None:
+        let_go = casadi.logic_and(casadi.logic_not(_is(command, Motion.LED)), is_at_rest(state["lead_twist"]))
+        ended = casadi.if_else(_is(before, Motion.LED), let_go, ended)
+    begins = casadi.logic_or(released, ended)
     motion = casadi.if_else(begins, casadi.if_else(released, Motion.HOME, casadi.floor(command + 0.5)), before)
     motion = casadi.if_else(follow, Motion.FOLLOW, motion)
     clock = casadi.if_else(casadi.logic_or(follow, released), 0, casadi.if_else(begins, period, state["clock"]))
@@ -132,7 +148,15 @@ def reference(
     in_joints = 1 - is_press - is_circle
     x = clock / (is_press * p["press_duration"] + is_circle * p["circle_duration"] + in_joints)
     ease = (1 - in_joints) * 8 / 15 * _flank(x, 1)[1]
-    return Reference(in_joints, start + joint[0], joint[1], joint[2], *tip, _is(motion, Motion.FOLLOW), ease, following)
+    joint[0] += start
+    if hand is not None and model is not None:
+        # Until `led` has ended, whatever is commanded comes after the tip has come to rest.
+        is_led, obeyed = _is(motion, Motion.LED), _is(command, Motion.LED)
+        last = [state[name] for name in ("reference", "lead_twist", "lead_velocity")]
+        led = lead(model, hand, obeyed, *last, p, period=period)
+        joint = [casadi.if_else(is_led, *pair) for pair in zip((led.q, led.v, led.a), joint, strict=True)]
+        following |= {"lead_twist": is_led * led.twist, "lead_velocity": is_led * led.v, "tip_pose": led.pose}
+    return Reference(in_joints, *joint, *tip, _is(motion, Motion.FOLLOW), ease, following)
 
 
 def _flank(x: Expression, duration: Expression) -> tuple[Expression, Expression, Expression]:

@@ -20,7 +20,7 @@ from vtbdrake.components.sensors import (
 )
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.maps import vector_map
+from vtbdrake.lcm.maps import VectorMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.settings import setting
@@ -31,6 +31,8 @@ from vtbdrake.testbed import (
     Signal,
     VirtualTestbedBuilder,
 )
+from vtbdrake.testbed.hand import HAND_SIZE, HandCommand
+from vtbdrake_diagrams.manipulator import leading
 from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dps import gravity_torque, make_dps
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics
@@ -43,6 +45,16 @@ LARGEST_DELAY = 50
 
 KNOWN_TOOL = {"sim.sys.arm.tool.mass": "dps.tool.mass", "sim.sys.arm.tool.center_of_mass": "dps.tool.center"}
 """The DPS's variables about its tool, by the variable of the simulated world."""
+
+HAND_REACH = 2.0
+"""The largest coordinate of a position that a hand may command (m)."""
+
+HAND_MAX_AGE = 0.1
+"""The age at which the last pose of a hand that leads is given up (s)."""
+
+
+def _hand_map() -> VectorMap:
+    return vector_map("ARM_HAND", {"hand": "val"}, stamp="timestamp")
 
 
 def _plant() -> MultibodyPlantConfig:
@@ -63,6 +75,9 @@ class ManipulatorScenario(Scenario):
     )
     knows_tool: bool = setting(
         False, "Whether mass and centre of the tool in mental rollouts and predictions are those of dps.tool."
+    )
+    led_by_hand: bool = setting(
+        False, "Whether a hand may lead the tip, by the command u.hand, while u.motion is that of led."
     )
     wall: bool = setting(False, "Whether there is a wall; False is free space.")
     wall_distance: float = setting(
@@ -118,14 +133,35 @@ class ManipulatorScenario(Scenario):
                     idle=0.0,
                 )
             ],
-            commands=[Signal("motion", size=1, lower=0.0, upper=float(max(Motion)), default=int(Motion.HOME))],
+            commands=self._commands(),
+        )
+
+    def _commands(self) -> list[Signal]:
+        last = Motion.LED if self.led_by_hand else Motion.CIRCLE
+        motion = Signal("motion", size=1, lower=0.0, upper=float(last), default=int(Motion.HOME))
+        if not self.led_by_hand:
+            return [motion]
+        reach = np.array([1.0, 1.0, 1.0, 1.0, 1.0, *(3 * [HAND_REACH])])
+        hand = Signal("hand", size=HAND_SIZE, lower=-reach, upper=reach, default=leading.REST, max_age=HAND_MAX_AGE)
+        return [motion, hand]
+
+    def hand_command(self) -> HandCommand | None:
+        """Return how a hand leads the tip: in a box in front of the arm, under the motion `led`."""
+        if not self.led_by_hand:
+            return None
+        return HandCommand(
+            command="hand",
+            pose="dps.impl.tip_pose",
+            begin={"motion": int(Motion.LED)},
+            lower=(0.25, -0.5, 0.1),
+            upper=(0.85, 0.5, 1.0),
         )
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the arm: it answers each state at once; after a fault, the arm floats in place.
 
         The arm speaks the messages of an iiwa, with their signs, but does not compensate gravity: its command is the
-        whole torque. It publishes the wrench at its flange; ARM_MOTION chooses the motion.
+        whole torque. It publishes the wrench at its flange; ARM_MOTION chooses the motion, ARM_HAND leads the tip.
         """
         status = {
             "joint_position": "joint_position_measured",
@@ -138,7 +174,10 @@ class ManipulatorScenario(Scenario):
             protocol=Protocol(
                 sense=[iiwa_status(status), vector_map("WRENCH", lcmt_force_torque, wrench, stamp="timestamp")],
                 act=[iiwa_command(["joint_torque"])],
-                commands=[vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"})],
+                commands=[
+                    vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"}),
+                    *([_hand_map()] if self.led_by_hand else []),
+                ],
                 reported={"joint_torque": "joint_torque_reported"},
             ),
             period=self.period,
@@ -166,7 +205,13 @@ class ManipulatorScenario(Scenario):
         return replace(self, **{name: getattr(self, name).without_chance() for name in names})
 
     def make_dps(self) -> Diagram:
-        return make_dps(self.law, period=self.period, compile=self.compile, knows_tool=self.knows_tool)
+        return make_dps(
+            self.law,
+            period=self.period,
+            compile=self.compile,
+            knows_tool=self.knows_tool,
+            led_by_hand=self.led_by_hand,
+        )
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:
         # Imported here: the DPS on the robot runs without a plant.

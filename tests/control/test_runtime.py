@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -961,6 +962,43 @@ def test_received_commands_reach_the_dps_or_are_counted():
     done = runtime.cycle()
     assert done.changes == () and bridge.commands["target"].rejected == {"refused": 1}
     assert np.array_equal(runtime.target.read(runtime.context, "u.target"), [0.3, 0.2])
+
+
+class LapsingServo(ServoScenario):
+    """The servo, whose target lapses after 20 ms."""
+
+    def interface(self):
+        target = Signal("target", size=2, unit="m", default=[0.05, 0.0], max_age=0.0205)
+        return replace(super().interface(), commands=[target])
+
+
+def test_command_that_is_not_renewed_returns_to_its_default(caplog):
+    scenario, clock = LapsingServo(), SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, still)
+    received = bridge.commands["target"] = ReceivedSignal()
+    runtime = Runtime(scenario.build(), bridge, period=PERIOD, clock=clock)
+    cycles = []
+    runtime.watch(cycles.append)
+    runtime.write({"u.target": [0.1, 0.1]})
+    runtime.run(cycles=50)  # It did not come from the bridge, and stays.
+    assert np.array_equal(runtime.read("u.target"), [0.1, 0.1])
+    for value in (TARGET, TARGET, [0.05, 0.0]):
+        received.accept(np.array(value), clock.now(), np.nan)
+        runtime.run(cycles=15)
+        assert np.array_equal(runtime.read("u.target"), value)
+    runtime.run(cycles=50)
+    assert "returns to its default" not in caplog.text
+    received.accept(TARGET, clock.now(), np.nan)
+    sent_at = clock.now()
+    cycles.clear()
+    runtime.run(cycles=50)
+    changes = [(c.now - sent_at, change.values["u.target"].tolist()) for c in cycles for change in c.changes]
+    assert [values for _, values in changes] == [TARGET.tolist(), [0.05, 0.0]]
+    assert [when for when, _ in changes] == pytest.approx([0.0, 0.021], abs=1e-9)
+    assert caplog.text.count("no command target for 0.0205 s: it returns to its default") == 1
+    received.accept(TARGET, clock.now() - 1.0, np.nan)  # It has waited somewhere.
+    runtime.cycle()
+    assert np.array_equal(runtime.read("u.target"), [0.05, 0.0])
 
 
 @pytest.mark.parametrize("address", ["T_act.velocity", "T_sense.speed", "time"])

@@ -285,7 +285,7 @@ class Runtime(Stepped):
         now = self._read_at = self.clock.now()
         pace = self._note_pace()
         self._serve()
-        self.apply_commands()
+        self.apply_commands(now)
         self.feed()
         self.slow_parts.receive()
         active = self.active

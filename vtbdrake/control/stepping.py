@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
 from vtbdrake.control.bridge import Bridge
@@ -183,6 +184,13 @@ class Stepped:
         # For each signal, the count of the newest value that the target has got.
         self._sensed = dict.fromkeys(bridge.sensed, 0)
         self._commands = dict.fromkeys(bridge.commands, 0)
+        # Commands whose value lapses when it is too old: the largest age and the default.
+        self._lapses = {
+            signal.name: (signal.max_age, signal.default_vector())
+            for signal in target.interface.commands
+            if signal.name in bridge.commands and signal.max_age < inf
+        }
+        self._lapsing: set[str] = set()
         # For each command, the reasons to reject it that have been logged.
         self._logged_rejections: dict[str, frozenset[str]] = dict.fromkeys(bridge.commands, frozenset())
         self.read_switches()
@@ -233,25 +241,43 @@ class Stepped:
                 self._ports.feed(name, received.value)
                 self._fed[name] = received.value
 
-    def apply_commands(self) -> None:
-        """Write the commands u that the bridge has received.
+    def apply_commands(self, now: float) -> None:
+        """Write the commands u that the bridge has received, and the default of one whose last value is too old.
 
         One that cannot be written is counted as rejected. Of each reason to reject one, the first case is logged.
+
+        Args:
+            now: Present time on the clock of `ReceivedSignal.arrived`, in seconds.
         """
         for name, received in self.bridge.commands.items():
             if received.count != self._commands[name]:
                 self._commands[name] = received.count
-                address = f"{COMMAND}{name}"
                 try:
-                    self.write({address: np.reshape(received.value, self.target.variables()[address].shape)})
+                    self._write_command(name, received.value)
                 except ValueError:
                     received.reject("refused")
+                else:
+                    self._note_lapsing(name, received.value)
+            if name in self._lapsing and received.age(now) > (max_age := self._lapses[name][0]):
+                self._lapsing.discard(name)
+                self._write_command(name, self._lapses[name][1])
+                _log.warning("no command %s for %g s: it returns to its default", name, max_age)
             if len(received.rejected) > len(self._logged_rejections[name]):
                 new = ", ".join(received.rejected.keys() - self._logged_rejections[name])
                 _log.warning(
                     "a message with the command %s was rejected (%s); more like it are only counted", name, new
                 )
                 self._logged_rejections[name] = frozenset(received.rejected)
+
+    def _write_command(self, name: str, value: ArrayLike) -> None:
+        address = f"{COMMAND}{name}"
+        self.write({address: np.reshape(value, self.target.variables()[address].shape)})
+
+    def _note_lapsing(self, name: str, value: ArrayLike) -> None:
+        """Remember a command whose value is another than its default, and lapses."""
+        self._lapsing.discard(name)
+        if name in self._lapses and not np.array_equal(value, self._lapses[name][1]):
+            self._lapsing.add(name)
 
     def read(self, address: str) -> Any:
         """Return the present value of a variable or a port of the target, for example ``real.sense.<signal>``.

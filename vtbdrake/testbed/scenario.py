@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from vtbdrake.deployment import Deployment, Runtime
+    from vtbdrake.testbed.hand import HandCommand
     from vtbdrake.validity_domain import ValidityDomain
 
 # With 1.51.1, and not with 1.58, poses and contact results after a fixed step of CENIC are those before the step.
@@ -211,6 +212,10 @@ class Scenario(ABC):
         from vtbdrake.deployment import Deployment
 
         return Deployment()
+
+    def hand_command(self) -> HandCommand | None:
+        """Return how a hand in virtual reality leads the robot, or None if no command u takes its pose."""
+        return None
 
     def deploy(
         self, url: str, *, record: str | os.PathLike[str] | None = None, **options: Any

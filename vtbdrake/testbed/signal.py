@@ -32,7 +32,8 @@ class Signal:
         lower, upper: Limits of the entries, scalars or arrays of shape (size,).
         rate: Limit of the first derivative by time, a scalar or shape (size,).
         acceleration: Limit of the second derivative by time, a scalar or shape (size,).
-        max_age: Largest age in seconds; an older sample is stale.
+        max_age: Largest age in seconds; an older sample is stale. A command u that a bridge received returns to its
+            default then.
         idle: For an actuator signal, the command of the simulated actuator while the real one is driven.
         default: The value of a command until another one is given; by default zeros.
     """
