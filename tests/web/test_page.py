@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.web.test_drive import LimitedPendulumScenario, problem
 from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
@@ -202,3 +203,34 @@ def test_closed_session_is_told(page: Page, running: View) -> None:
     running.close()
     drawn(page, "document.body.dataset.session === 'ended'")
     assert "the session has ended" in page.inner_text("#vtb-messages")
+
+
+def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser) -> None:
+    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0)) as running:
+        opened = browser.new_page(viewport={"width": 1280, "height": 800})
+        opened.set_default_timeout(PATIENCE)
+        # A gamepad that the test holds: Chromium asks for it in each poll.
+        opened.add_init_script(
+            "window.axes = [0, 0, 0, 0];"
+            "navigator.getGamepads = () => [{connected: true, axes: window.axes, buttons: []}, null];"
+        )
+        opened.goto(running.url)
+        opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+        opened.click("#vtb-drive summary")
+        opened.click("#vtb-drive-begin")
+        opened.wait_for_selector("#vtb-drive-keep")
+        opened.keyboard.down("ArrowRight")
+        drawn(opened, "parseFloat(vtb.parts[0].status.textContent.match(/u.angle +(\\S+)/)?.[1]) > 0.1")
+        opened.keyboard.up("ArrowRight")
+        assert 0.1 < running.session.snapshot()["u.angle"] <= 1.0
+        opened.click("#vtb-drive-drop")
+        opened.wait_for_selector("#vtb-drive-begin")
+        assert "magnitude" in opened.locator("#vtb-messages").inner_text()
+        assert running.session.snapshot()["u.angle"] == 0.0
+        opened.click("#vtb-drive-begin")
+        opened.evaluate("window.axes = [-0.5, 0, 0, 0]")
+        drawn(opened, "parseFloat(vtb.parts[0].status.textContent.match(/u.angle +(\\S+)/)?.[1]) < -0.1")
+        opened.click("#vtb-drive-keep")
+        opened.wait_for_selector("#vtb-drive-begin")
+        assert -1.0 <= running.session.snapshot()["u.angle"] < -0.1
+        opened.close()

@@ -10,6 +10,7 @@ import numpy as np
 
 from vtbdrake.control.limits import Bounds
 from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -105,9 +106,13 @@ class Differences:
         # The address of each number; empty where variables are computed from several: `_computed` are compared then.
         self._address = np.full(self._layout.size, "", dtype=object)
         self._computed: dict[str, Variable] = {}
+        # What the layout does not hold: commands u and switches.
+        self._boards: dict[str, Variable] = {}
         for address, variable in testbed.variables().items():
             if (place := self._layout.slice_of(variable)) is not None:
                 self._address[place] = address
+            elif address.startswith((COMMAND, T_SENSE, T_ACT)):
+                self._boards[address] = variable
             elif not variable.derived:
                 self._computed[address] = variable
         self._differed = np.zeros(self._layout.size, dtype=bool)
@@ -116,10 +121,9 @@ class Differences:
     def compare(self, ours: Context, theirs: Context) -> None:
         """Compare the two contexts, which stand at the same time."""
         differ = ~_close(self._layout.take(ours).numbers, self._layout.take(theirs).numbers) & ~self._differed
-        if not differ.any():
-            return
         self._differed |= differ
         addresses = set(self._address[differ])
+        addresses |= {a for a, v in self._boards.items() if not np.all(_close(v.get(ours), v.get(theirs)))}
         if "" in addresses:
             addresses |= {a for a, v in self._computed.items() if not np.all(_close(v.get(ours), v.get(theirs)))}
         addresses -= {"", *(difference.address for difference in self.first)}

@@ -53,18 +53,20 @@ class Server:
             await page.serve(self)
         finally:
             self._pages.remove(page)
-            if self._steering is page:
-                self._steering = next(iter(self._pages), None)
             with suppress(SessionError):
+                if self._steering is page:
+                    self._steering = next(iter(self._pages), None)
+                    await run_in_threadpool(self._session.deflect, {})  # Its keys are released.
                 await run_in_threadpool(self._session.watch, page, ())
 
     def steers(self, page: Page) -> bool:
         """Return whether a page may change anything: one at a time."""
         return self._steering is page
 
-    def take_over(self, page: Page) -> None:
+    async def take_over(self, page: Page) -> None:
         """Let a page steer, instead of the one that does."""
         self._steering = page
+        await run_in_threadpool(self._session.deflect, {})
 
 
 class Page:
@@ -90,15 +92,21 @@ class Page:
             "cancel_preview": lambda _: session.cancel_preview(),
             "cancel_comparison": lambda _: session.cancel_comparison(),
             "watch": self._watch,
+            "drive": self._drive,
+            "deflect": lambda message: session.deflect(message["deflections"]),
+            "end_drive": self._end_drive,
         }
 
     async def serve(self, server: Server) -> None:
         """Answer commands, and send frames."""
+        problem = self._session.problem
         hello = {
             "type": "hello",
             "scenario": self._session.scenario.name(),
             "variables": dict(self._session.variables),
             "bodies": list(self._session.bodies),
+            "quality": "" if problem is None else problem.objectives[0].name,
+            "handles": [handle.description() for handle in self._session.handles.values()],
         }
         await send(self._browser, hello)
         await first_of(
@@ -120,12 +128,20 @@ class Page:
     async def _carry_out(self, message: Mapping[str, Any], server: Server) -> Any:
         name = message.get("do")
         if name == "take over":
-            return server.take_over(self)
+            return await server.take_over(self)
         if name not in self._commands:
             raise SessionError(f"there is no command {name!r}; there are: {', '.join(self._commands)}")
         if name != "watch" and not server.steers(self):
             raise SessionError("another page steers this session: take over first")
         return await run_in_threadpool(self._commands[name], message)
+
+    def _drive(self, message: Mapping[str, Any]) -> bool:
+        compare = bool(message.get("compare", False))
+        self._session.drive(message["addresses"], returning=message.get("returning", ()), compare=compare)
+        return True
+
+    def _end_drive(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        return self._session.end_drive(keep=bool(message["keep"])).summary()
 
     def _watch(self, message: Mapping[str, Any]) -> None:
         self._session.watch(self, message["addresses"])

@@ -19,16 +19,19 @@ import numpy as np
 
 from vtbdrake.argument_checks import as_number
 from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.rollout.course import task_without_problem
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.web.drive import Driven, Driver, Handle, handles
 from vtbdrake.web.fork import CommandLimits, Differences, Fork
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
     from pydrake.systems.framework import Context
 
+    from vtbdrake.optimization import Problem
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
 
@@ -86,6 +89,7 @@ class Frame:
         failure: Why the simulation has ended; empty while it can go on.
         preview: What the preview has found: ``time``, ``end``, ``refused``; None if there is none.
         comparison: Time and first differences of the course without the last intervention; None if there is none.
+        drive: What is driven by hand, see `Driver.status`; None while nothing is.
     """
 
     number: int
@@ -100,6 +104,7 @@ class Frame:
     failure: str
     preview: Mapping[str, Any] | None
     comparison: Mapping[str, Any] | None
+    drive: Mapping[str, Any] | None = None
 
 
 @dataclass
@@ -170,10 +175,12 @@ class Session:
         start: A snapshot to start from; s0 if left out.
         values: Variables that are set first, by address.
         config: How it runs.
+        problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
 
     Attributes:
         latest: The last frame.
         variables: What can be watched and set: by address, ``kind``, ``shape``, ``unit``, ``bounds``, ``settable``.
+        handles: What can be driven by hand, by address.
         bodies: Paths in Meshcat of what moves.
         meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
 
@@ -188,11 +195,16 @@ class Session:
         start: Snapshot | None = None,
         values: Mapping[str, Any] | None = None,
         config: SessionConfig | None = None,
+        problem: Problem | None = None,
     ) -> None:
+        if problem is not None and problem.scenario.record() != scenario.record():
+            raise SessionError(f"the problem is one of {problem.scenario!r}, but what is watched is {scenario!r}")
         self.scenario = scenario
+        self.problem = problem
         self.config = config or SessionConfig()
         self.latest: Frame | None = None
         self.variables: Mapping[str, Mapping[str, Any]] = {}
+        self.handles: Mapping[str, Handle] = {}
         self.bodies: tuple[str, ...] = ()
         self.meshcat_url = ""
         self._start, self._values = start, dict(values or {})
@@ -261,7 +273,7 @@ class Session:
 
     def switch(self, mode: str | None = None, *, sense: Any = None, act: Any = None) -> None:
         """Throw switches, as `VirtualTestbed.switch` does."""
-        self._do(lambda: self._testbed.switch(self._context, mode, sense=sense, act=act))
+        self._do(lambda: self._throw(mode, sense, act))
 
     def seek(self, when: float) -> None:
         """Pause, and go back to the last state that was kept at or before a time.
@@ -277,6 +289,36 @@ class Session:
     def cancel_preview(self) -> None:
         """End the preview."""
         self._do(self._end_preview)
+
+    def drive(self, addresses: Collection[str], *, returning: Collection[str] = (), compare: bool = False) -> None:
+        """Take over: let hands move commands u or actuators from now on, in a fork.
+
+        The fork is a rollout of the session's problem, and ends as one; without a problem, after an hour.
+
+        Args:
+            addresses: Some of `handles`.
+            returning: Those of them that return when they are released; the others stay where they are.
+            compare: Let the course that nobody drives go on as a ghost, see `Frame.comparison`.
+
+        Raises:
+            ValueError: An address cannot be driven, or something is driven already.
+        """
+        self._do(lambda: self._begin_drive(tuple(addresses), tuple(returning), compare))
+
+    def deflect(self, deflections: Mapping[str, Any]) -> None:
+        """Deflect sticks, see `Driver.deflect`; while nothing is driven, nothing happens."""
+        self._do(lambda: self._driver.deflect(deflections) if self._driver is not None else None)
+
+    def end_drive(self, *, keep: bool = True) -> Driven:
+        """End the drive, pause, and return it; the session goes on from there, or from where the drive began.
+
+        Args:
+            keep: Whether the driven course is the present from now on.
+
+        Raises:
+            SessionError: Nothing is driven.
+        """
+        return self._do(lambda: self._end_drive(keep))
 
     def cancel_comparison(self) -> None:
         """End the course without the last intervention."""
@@ -337,6 +379,8 @@ class Session:
         self._pace, self._playing, self._failure = _Pace(), False, ""
         self._preview: _Preview | None = None
         self._comparison: _Comparison | None = None
+        self._driver: Driver | None = None
+        self.handles = handles(self._testbed)
         self._readers: dict[str, Callable[..., Any]] = {}
         self._history: deque[tuple[float, Snapshot]] = deque(maxlen=self.config.history_size)
         self._meshcat: Meshcat = make_meshcat()
@@ -374,7 +418,7 @@ class Session:
 
     def _drop(self) -> None:
         """Give up the Meshcat, which must end in the thread that made it, and all that refers to it."""
-        for name in ("_preview", "_comparison", "_drawing", "_simulator", "_context", "_meshcat"):
+        for name in ("_preview", "_comparison", "_driver", "_drawing", "_simulator", "_context", "_meshcat"):
             self.__dict__.pop(name, None)
         gc.collect()
 
@@ -440,7 +484,7 @@ class Session:
         after = step * (floor(self._context.get_time() / step + 1e-6) + 1)
         self._forget_future()
         try:
-            self._simulator.AdvanceTo(after)
+            after = self._advance(after)
         except FAILURES as error:
             self._failure, self._playing = one_line(error), False
             return
@@ -448,6 +492,15 @@ class Session:
             comparison.fork.advance_to(after)
             if not comparison.fork.failure:
                 comparison.differences.compare(self._context, comparison.fork.context)
+
+    def _advance(self, after: float) -> float:
+        """Advance to a time, or as far as a driven rollout goes in a step, and return the time."""
+        if self._driver is None:
+            self._simulator.AdvanceTo(after)
+        else:
+            self._driver.advance()
+            self._playing = self._playing and not self._driver.ended
+        return float(self._context.get_time())
 
     def _forget_future(self) -> None:
         while self._history and self._history[-1][0] > self._context.get_time():
@@ -513,6 +566,7 @@ class Session:
             failure=self._failure,
             preview=None if self._preview is None else self._preview.status(),
             comparison=None if self._comparison is None else self._comparison.status(),
+            drive=None if self._driver is None else self._driver.status(),
         )
         with self._frame_ready:
             self.latest = frame
@@ -531,25 +585,35 @@ class Session:
     # -- what the commands do
 
     def _play(self) -> None:
-        if self._failure:
-            raise SessionError(f"the simulation has failed ({self._failure}): go back, or reset")
+        self._refuse_ended()
         self._playing = True
         self._pace.start(self._context.get_time(), time.monotonic())
+
+    def _refuse_ended(self) -> None:
+        if self._failure:
+            raise SessionError(f"the simulation has failed ({self._failure}): go back, or reset")
+        if self._driver is not None and self._driver.ended:
+            raise SessionError(f"the driven rollout has ended ({self._driver.ended}): keep it, or drop it")
+
+    def _refuse_driven(self, action: str) -> None:
+        if self._driver is not None:
+            raise SessionError(f"{action} has to wait until the drive has ended: keep it, or drop it")
 
     def _pause(self) -> None:
         self._playing = False
 
     def _advance_steps(self, steps: int) -> None:
-        if self._failure:
-            raise SessionError(f"the simulation has failed ({self._failure}): go back, or reset")
+        self._refuse_ended()
         self._playing = False
         for _ in range(steps):
-            self._step()
+            if self._driver is None or not self._driver.ended:
+                self._step()
         self._next_frame = 0.0
 
     def _reset(self) -> None:
         self._end_preview()
         self._end_comparison()
+        self._driver = None
         self._begin()
         self._pace.start(self._context.get_time(), time.monotonic())
         self._next_frame = 0.0
@@ -559,32 +623,64 @@ class Session:
         self._pace.start(self._context.get_time(), time.monotonic())
 
     def _write(self, values: dict[str, Any], compare: bool) -> None:
+        if self._driver is not None:
+            self._driver.set(values)
+            self._end_preview()
+            return
         before = self._testbed.fork(self._simulator) if compare else None
         self._testbed.write(self._context, values)
         self._end_preview()
         if before is not None:
-            self._end_comparison()
-            fork = Fork(self._testbed, before)
-            self._comparison = _Comparison(
-                fork, Differences(self._testbed), self._ghost(fork.context, "without", _WITHOUT)
-            )
+            self._begin_comparison(before)
         self._next_frame = 0.0
+
+    def _begin_comparison(self, before: Snapshot) -> None:
+        self._end_comparison()
+        fork = Fork(self._testbed, before)
+        self._comparison = _Comparison(fork, Differences(self._testbed), self._ghost(fork.context, "without", _WITHOUT))
 
     def _seek(self, when: float) -> None:
         if not isfinite(when):
             raise SessionError(f"a session goes back to a time in seconds, not to {when}")
         if not self._history:
             raise SessionError("no state has been kept yet")
-        self._playing = False
+        self._refuse_driven("going back")
         self._end_preview()
         self._end_comparison()
         earlier = [entry for entry in self._history if entry[0] <= when + 1e-9]
         _, snapshot = earlier[-1] if earlier else self._history[0]
+        self._go_on_from(snapshot)
+
+    def _go_on_from(self, snapshot: Snapshot) -> None:
+        self._playing = False
         self._context = self._testbed.default_context()
         self._testbed.restore(self._context, snapshot)
         self._simulator = self._testbed.simulator(self._context, restored=True)
         self._failure = ""
         self._next_frame = 0.0
+
+    def _begin_drive(self, addresses: tuple[str, ...], returning: tuple[str, ...], compare: bool) -> None:
+        self._refuse_driven("another drive")
+        self._refuse_ended()
+        task = task_without_problem(self.scenario) if self.problem is None else self.problem.task
+        before = self._testbed.fork(self._simulator)
+        driver = Driver(self._testbed, before, task, step=self.config.step, addresses=addresses, returning=returning)
+        self._end_preview()
+        if compare:
+            self._begin_comparison(before)
+        self._driver, self._context = driver, driver.context
+        self._next_frame = 0.0
+
+    def _end_drive(self, keep: bool) -> Driven:
+        if self._driver is None:
+            raise SessionError("nothing is driven: take over first")
+        driven = self._driver.end()
+        snapshot = self._driver.released() if keep else driven.course.start
+        self._driver = None
+        if not keep:
+            self._end_comparison()
+        self._go_on_from(snapshot)
+        return driven
 
     def _begin_preview(self, values: dict[str, Any]) -> None:
         fork = Fork(self._testbed, self._testbed.snapshot(self._context), values)
@@ -593,6 +689,10 @@ class Session:
             self._end_preview()
             ghost = self._ghost(fork.context, "preview", _PREVIEW)
         self._preview = _Preview(fork, fork.time + self.config.preview_horizon, ghost)
+
+    def _throw(self, mode: str | None, sense: Any, act: Any) -> None:
+        self._refuse_driven("a switch")
+        self._testbed.switch(self._context, mode, sense=sense, act=act)
 
     def _end_preview(self) -> None:
         if self._preview is not None and self._preview.ghost is not None:

@@ -9,6 +9,7 @@ from vtbdrake.lazy import extra_module
 from vtbdrake.web.session import Session, SessionConfig
 
 if TYPE_CHECKING:
+    from vtbdrake.optimization import Problem
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.server import Server
@@ -47,6 +48,7 @@ def view(
     start: Snapshot | None = None,
     values: Mapping[str, Any] | None = None,
     config: SessionConfig | None = None,
+    problem: Problem | None = None,
     port: int = 0,
     hosts: Collection[str] = (),
 ) -> View:
@@ -57,6 +59,7 @@ def view(
         start: A snapshot to start from; s0 if left out.
         values: Variables that are set first, by address.
         config: How it runs.
+        problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
 
@@ -69,7 +72,7 @@ def view(
         extra_module(name, purpose="the live page", extra="web")
     from vtbdrake.web.server import Server
 
-    session = Session(scenario, start=start, values=values, config=config)
+    session = Session(scenario, start=start, values=values, config=config, problem=problem)
     try:
         return View(session, Server(session, port=port, hosts=hosts))
     except BaseException:

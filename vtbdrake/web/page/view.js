@@ -1,6 +1,7 @@
 // The controls of a session, beside Meshcat's viewer, whose page loads this module.
 
 import { Connection, element, load, number } from "./common.js";
+import { Drive } from "./drive.js";
 
 const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
 const WINDOW = 20; // s of simulated time in a plot
@@ -145,6 +146,8 @@ class Page {
     this.watched = new Map();
     this.variables = {};
     this.frames = 0;
+    // Each has a section of the panel in `root`, and is told of the session's messages.
+    this.parts = [new Drive(this)];
     this.#build();
     this.session = new Connection({
       hello: (message) => this.#hello(message),
@@ -180,6 +183,7 @@ class Page {
         this.sections,
         element("p", {}, element("label", {}, this.compare, " show the course without the change, too")),
         this.differences,
+        ...this.parts.map((part) => part.root),
         element("h2", {}, "Switches"),
         this.switches,
         element("h2", {}, "Camera"),
@@ -206,8 +210,10 @@ class Page {
     dispatchEvent(new Event("resize"));
   }
 
-  #hello({ scenario, variables, bodies }) {
+  #hello(message) {
+    const { scenario, variables, bodies } = message;
     this.variables = variables;
+    for (const part of this.parts) part.hello(message);
     this.follow.append(...bodies.map((path) => element("option", { value: path }, path.replace(/^now\//, ""))));
     this.title.textContent = scenario.split(":").at(-1);
     this.title.title = scenario;
@@ -347,6 +353,7 @@ class Page {
     for (const [address, value] of Object.entries(frame.values)) this.watched.get(address)?.show(frame.time, value);
     this.#showSwitches(frame.positions);
     this.#showState(frame);
+    for (const part of this.parts) part.frame(frame);
     this.frames += 1;
     document.body.dataset.frame = frame.number;
     document.body.dataset.frames = this.frames;
