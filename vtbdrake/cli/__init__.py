@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module, metadata
-from typing import Any
+from typing import IO, Any
 
 import click
+from click.shell_completion import add_completion_class
 
+from vtbdrake.cli.completion import ColonBash
 from vtbdrake.failures import one_line
 
-__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "FailedError", "main"]
+__all__ = ["BAD_INPUT", "FAILED", "BadInputError", "FailedError", "json_requested", "main"]
 
 BAD_INPUT = 2
 FAILED = 1
@@ -22,6 +27,7 @@ _COMMANDS = {
     "boundary": "problem:boundary",
     "calibrate": "calibrate:calibrate",
     "campaign": "campaign:campaign",
+    "completion": "completion:completion",
     "diagram": "testbed:diagram",
     "doctor": "doctor:doctor",
     "export": "log:export",
@@ -45,16 +51,41 @@ _COMMANDS = {
 _EXPECTED = (ValueError, OSError, ModuleNotFoundError)
 
 
+add_completion_class(ColonBash)
 _CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True}
 
 
-class BadInputError(click.ClickException):
+_JSON = "vtbdrake.json"
+
+
+def json_requested() -> bool:
+    """Return whether the running command has the option ``--json``."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(_JSON))
+
+
+class _Error(click.ClickException):
+    """An error that is printed on stderr: as one line ``Error: ...``, or with ``--json`` as an object."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self._as_json = json_requested()  # There is no context when it is printed.
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        if self._as_json:
+            described = {"error": self.format_message(), "exit_code": self.exit_code}
+            click.echo(json.dumps(described), file=file, err=file is None)
+        else:
+            super().show(file)
+
+
+class BadInputError(_Error):
     """The program cannot use its input."""
 
     exit_code = BAD_INPUT
 
 
-class FailedError(click.ClickException):
+class FailedError(_Error):
     """The program tried to do what the user asked for, and failed."""
 
     exit_code = FAILED
@@ -73,22 +104,38 @@ class _Commands(click.Group):
         command: click.Command = getattr(import_module(f"vtbdrake.cli.{module}"), function)
         return command
 
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except click.UsageError as error:
-            path = error.ctx.command_path if error.ctx is not None else ctx.command_path
-            raise BadInputError(one_line(f"{error.format_message()} ('{path} --help' shows an example)")) from error
-        except _EXPECTED as error:
-            if ctx.params["traceback"]:
-                raise
-            raise BadInputError(one_line(error)) from error
-        except RuntimeError as error:
-            from vtbdrake.rollout import WorkerError
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        # Looked for here, because an error in the options comes before their values are known.
+        words = args[: args.index("--")] if "--" in args else args
+        ctx.meta[_JSON] = "--json" in words
+        with _reported(ctx):
+            return super().parse_args(ctx, args)
 
-            if ctx.params["traceback"] or not isinstance(error, WorkerError):
-                raise
-            raise FailedError(one_line(error)) from error
+    def invoke(self, ctx: click.Context) -> Any:
+        with _reported(ctx):
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _reported(ctx: click.Context) -> Iterator[None]:
+    """Turn every expected error into a `BadInputError` or `FailedError`."""
+    try:
+        yield
+    except click.exceptions.NoArgsIsHelpError:
+        raise
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx is not None else ctx.command_path
+        raise BadInputError(one_line(f"{error.format_message()} ('{path} --help' shows an example)")) from error
+    except _EXPECTED as error:
+        if ctx.params.get("traceback"):
+            raise
+        raise BadInputError(one_line(error)) from error
+    except RuntimeError as error:
+        from vtbdrake.rollout import WorkerError
+
+        if ctx.params.get("traceback") or not isinstance(error, WorkerError):
+            raise
+        raise FailedError(one_line(error)) from error
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:

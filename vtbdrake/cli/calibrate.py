@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,14 +18,14 @@ from vtbdrake.cli.options import (
     scenario_argument,
     settings,
 )
-from vtbdrake.cli.output import finite
-from vtbdrake.machine import MachineConfig
-from vtbdrake.testbed import Scenario
+from vtbdrake.cli.output import json_option, show
+from vtbdrake.machine.config import MachineConfig
 
 if TYPE_CHECKING:
     from vtbdrake.calibration import Calibration, SelfTest
     from vtbdrake.optimization import Parameter
     from vtbdrake.recording import Log
+    from vtbdrake.testbed import Scenario
 
 
 def _parse_unit(text: str) -> tuple[str, str]:
@@ -62,7 +61,7 @@ def _parse_unit(text: str) -> tuple[str, str]:
     multiple=True,
 )
 @option("--save FILE", "Write the calibrated scenario: .yaml.", parse=output(".yaml"))
-@option("--json", "Print a JSON object instead of a table.", name="as_json", is_flag=True)
+@json_option
 @option("--self-test", "Calibrate simulated machines whose numbers are hidden, instead of LOGS.", is_flag=True)
 @option(
     "--set ADDRESS=VALUE",
@@ -90,7 +89,6 @@ def calibrate(
     measured_torque: bool,
     period: float | None,
     save: Path | None,
-    as_json: bool,
     self_test: bool,
     values: tuple[Setting, ...],
     trials: int,
@@ -136,10 +134,10 @@ def calibrate(
         machine = MachineConfig(disturbance={torque: disturbance} if disturbance else {})
         trial: dict[str, Any] = {"seconds": seconds, "trials": trials, "seed": seed, "values": settings(values)}
         tested = test(scenario, parameters, machine=machine, **trial, **model)
-        click.echo(json.dumps(_tested(tested), indent=2) if as_json else tested)
+        show(tested, _tested(tested))
         return
     result = fit(scenario, [_read(path, position, torque, **table) for path in logs], parameters, **model)
-    click.echo(json.dumps(_fitted(result), indent=2) if as_json else result)
+    show(result, _fitted(result))
     if save is not None:
         result.scenario.save(save)
     if not result.accepted:
@@ -178,22 +176,22 @@ def _fitted(result: Calibration) -> dict[str, Any]:
     numbers = [
         {
             "address": each.address,
-            "start": finite(each.start),
-            "value": finite(each.value),
-            "deviation": finite(each.deviation),
-            "interval": [finite(each.lower), finite(each.upper)],
-            "verdict": str(each.verdict),
+            "start": each.start,
+            "value": each.value,
+            "deviation": each.deviation,
+            "interval": [each.lower, each.upper],
+            "verdict": each.verdict,
         }
         for each in result.parameters.values()
     ]
     return {
         "parameters": numbers,
-        "fit": finite(result.fit),
-        "holdout": finite(result.holdout),
-        "correlation": finite(result.correlation),
-        "reasons": list(result.reasons),
-        "combinations": list(result.combinations),
-        "remarks": list(result.remarks),
+        "fit": result.fit,
+        "holdout": result.holdout,
+        "correlation": result.correlation,
+        "reasons": result.reasons,
+        "combinations": result.combinations,
+        "remarks": result.remarks,
     }
 
 
@@ -202,10 +200,10 @@ def _tested(result: SelfTest) -> dict[str, Any]:
         {
             "address": address,
             "truths": [trial.truth[address] for trial in result.trials],
-            "errors": result.errors(address).tolist(),
+            "errors": result.errors(address),
             "covered": int(result.covered(address).sum()),
             "intervals": int(result.covered(address).size),
         }
         for address in result.addresses
     ]
-    return {"parameters": numbers, "trials": len(result.trials), "coverage": finite(result.coverage)}
+    return {"parameters": numbers, "trials": len(result.trials), "coverage": result.coverage}

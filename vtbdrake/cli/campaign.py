@@ -13,35 +13,16 @@ import click
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import grouped, option
-from vtbdrake.cli.output import number, save_recording, table, write_whole
+from vtbdrake.cli.output import emit, json_option, number, save_recording, say, table, write_whole
 from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.failures import one_line
-from vtbdrake.optimization.sweep import borrowed
-from vtbdrake.testing.campaign import Campaign, Rerun
-from vtbdrake.testing.campaign_report import (
-    Evidence,
-    cell_text,
-    failed_cells,
-    html_page,
-    junit_xml,
-    limits_text,
-    passed_text,
-    reason,
-    warning,
-)
-from vtbdrake.testing.campaign_results import (
-    ALL,
-    ERROR,
-    FAIL,
-    MET,
-    CampaignResult,
-    CampaignRollout,
-    Cell,
-    Comparison,
-)
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
+
+    from vtbdrake.testing.campaign import Campaign, Rerun
+    from vtbdrake.testing.campaign_report import Evidence
+    from vtbdrake.testing.campaign_results import CampaignResult, CampaignRollout, Cell, Comparison
 
 STUDY, PAGE, JUNIT, RESULTS = "study.db", "index.html", "junit.xml", "results.json"
 """The files in the folder of a campaign."""
@@ -58,6 +39,8 @@ def _parse_rollout(text: str) -> tuple[str, int]:
 
 def _print_schema(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
     if is_requested and not ctx.resilient_parsing:
+        from vtbdrake.testing.campaign import Campaign
+
         click.echo(json.dumps(Campaign.schema(), indent=2))
         ctx.exit()
 
@@ -91,6 +74,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, is_requested: bool) ->
     callback=_print_schema,
     help="Print the JSON Schema of FILE.",
 )
+@json_option
 def campaign(
     file: Path,
     folder: Path | None,
@@ -112,6 +96,10 @@ def campaign(
     Example:
       vtbdrake campaign walking.yaml --workers 4 --against baseline.yaml
     """
+    from vtbdrake.testing.campaign import Campaign
+    from vtbdrake.testing.campaign_report import html_page, junit_xml
+    from vtbdrake.testing.campaign_results import MET
+
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     stated = Campaign.load(file)
     folder = file.with_suffix("") if folder is None else folder
@@ -131,6 +119,7 @@ def campaign(
     write_whole(folder / JUNIT, junit_xml(result, commands).encode())
     write_whole(folder / RESULTS, result.to_json(comparisons=comparisons).encode())
     _print(result, commands, comparisons, folder)
+    emit(result.to_dict(comparisons=comparisons))
     if not result.is_complete:
         raise FailedError("not all rollouts were run: the same command resumes the campaign")
     if not result.is_met:
@@ -146,6 +135,8 @@ def _command(file: Path, folder: Path, name: str) -> str:
 
 
 def _baseline(stated: Campaign, against: Path, running: dict[str, Any]) -> CampaignResult:
+    from vtbdrake.testing.campaign import Campaign
+
     if against.suffix not in (".yaml", ".yml"):
         return stated.baseline(against)
     other = Campaign.load(against)
@@ -160,6 +151,10 @@ def _gather_evidence(
     result: CampaignResult, folder: Path, *, executor: str, time_limit: float | None, **_: Any
 ) -> dict[str, Evidence]:
     """Run the first failure of each cell again; write log and animation."""
+    from vtbdrake.optimization.sweep import borrowed
+    from vtbdrake.testing.campaign_report import failed_cells
+    from vtbdrake.testing.campaign_results import ERROR, FAIL
+
     firsts = {cell.having(FAIL, ERROR)[0].name: cell.having(FAIL, ERROR)[0] for cell in failed_cells(result)}
     meshcat: Meshcat | None = None
     kept: dict[str, Evidence] = {}
@@ -182,6 +177,8 @@ def _written(
     stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: Path, meshcat: Meshcat | None
 ) -> Evidence:
     """Write log and animation of a rollout that was run again, and return what there is of it."""
+    from vtbdrake.testing.campaign_report import Evidence
+
     index = stated.rollout_names.index((rollout.condition, rollout.seed))
     stem = f"{index}-{re.sub(r'[^A-Za-z0-9_.-]', '_', rollout.condition)}-{rollout.seed}"
     notes, log, animation = [], "", ""
@@ -203,6 +200,9 @@ def _written(
 
 
 def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
+    from vtbdrake.testing.campaign_report import limits_text, reason
+    from vtbdrake.testing.campaign_results import ERROR, FAIL, Cell
+
     rerun = stated.run_again(*name)
     folder.mkdir(parents=True, exist_ok=True)
     meshcat = None
@@ -220,9 +220,12 @@ def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
         value = "" if status == ERROR else reason(cell, rerun.rollout)
         since = "" if time is None else f"{number(time)} s"
         rows.append((criterion_name, limits_text(criterion), value, status if criterion.is_limited else "", since))
-    click.echo(table(("criterion", "limit", "number", "", "violated from"), rows))
+    say(table(("criterion", "limit", "number", "", "violated from"), rows))
     files = [str(folder / name) for name in (kept.log, kept.animation) if name]
-    click.echo("\n".join(["", *files, kept.note]).rstrip())
+    say("\n".join(["", *files, kept.note]).rstrip())
+    titles = ("criterion", "limit", "number", "status", "violated_from")
+    criteria = [dict(zip(titles, row, strict=True)) for row in rows]
+    emit({"rollout": rerun.rollout, "criteria": criteria, "files": files, "note": kept.note})
     if rerun.result.failed:
         raise FailedError(f"the rollout failed: {one_line(rerun.result.message)}")
     if wrong:
@@ -230,27 +233,33 @@ def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
 
 
 def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[Comparison], folder: Path) -> None:
+    from vtbdrake.testing.campaign_report import failed_cells, passed_text, reason, warning
+    from vtbdrake.testing.campaign_results import ALL, ERROR, FAIL
+
     criteria = list(result.campaign.criteria)
     rows = []
     for condition in [*result.campaign.conditions, ALL]:
         cells = [result.cell(condition, name) for name in criteria]
         rows.append([condition, *("" if cell is None else _with_verdict(cell) for cell in cells)])
-    click.echo(table(["condition", *criteria], rows))
+    say(table(["condition", *criteria], rows))
     for cell in failed_cells(result):
         first = cell.having(FAIL, ERROR)[0]
-        click.echo(f"\n{cell.condition}, {cell.name}: {first.name}: {reason(cell, first)}\n  {commands[first.name]}")
+        say(f"\n{cell.condition}, {cell.name}: {first.name}: {reason(cell, first)}\n  {commands[first.name]}")
     if comparisons:
         rows = [
             [c.condition, c.criterion, *map(str, (c.both, c.gained, c.lost, c.neither)), f"{c.p:.3g}", c.difference]
             for c in comparisons
         ]
         head = ["condition", "criterion", "both pass", "only here", "only there", "neither", "p", "difference"]
-        click.echo("\n" + table(head, rows))
+        say("\n" + table(head, rows))
     if caution := warning(result):
-        click.echo(f"\nWarning: {caution}")
-    click.echo(f"\n{passed_text(result)}: {folder / PAGE}")
+        say(f"\nWarning: {caution}")
+    say(f"\n{passed_text(result)}: {folder / PAGE}")
 
 
 def _with_verdict(cell: Cell) -> str:
+    from vtbdrake.testing.campaign_report import cell_text
+    from vtbdrake.testing.campaign_results import MET
+
     mark = f" {cell.verdict}" if cell.is_judged and cell.verdict != MET else ""
     return cell_text(cell) + mark

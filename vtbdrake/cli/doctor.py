@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -15,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module, metadata
 from pathlib import Path
 
@@ -23,6 +22,7 @@ import click
 
 from vtbdrake.cli import FAILED
 from vtbdrake.cli.options import option
+from vtbdrake.cli.output import json_option, show
 from vtbdrake.drake_version import TESTED_DRAKE
 from vtbdrake.failures import one_line
 
@@ -296,9 +296,9 @@ def diagnose() -> list[Result]:
     type=click.Choice(list(CHECKS)),
     multiple=True,
 )
-@option("--json", "Print a JSON list of objects instead of lines.", name="as_json", is_flag=True)
+@json_option
 @click.pass_context
-def doctor(ctx: click.Context, required: tuple[str, ...], as_json: bool) -> None:
+def doctor(ctx: click.Context, required: tuple[str, ...]) -> None:
     """Check this computer, and say what to do about what is missing.
 
     The exit code is 1 if something fails that nothing works without. A warning (no rendering, no real-time rights, no
@@ -309,9 +309,6 @@ def doctor(ctx: click.Context, required: tuple[str, ...], as_json: bool) -> None
       vtbdrake doctor --require rendering --require real-time
     """
     results = diagnose()
-    if as_json:
-        click.echo(json.dumps([asdict(result) for result in results], indent=2))
-    else:
-        click.echo("\n".join(map(str, results)))
+    show("\n".join(map(str, results)), results)
     if any(result.status == FAILURE or (result.check in required and result.status == WARNING) for result in results):
         ctx.exit(FAILED)

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vtbdrake.cli.completion import complete_scenario
 from vtbdrake.cli.options import config_option, converted, option, parse_scenario
+from vtbdrake.cli.output import json_option, show
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
 from vtbdrake.monitoring.live.messages import RESET, SET
 
@@ -22,7 +24,7 @@ _SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
 
 
 @click.command()
-@click.argument("scenario", required=False, callback=converted(parse_scenario))
+@click.argument("scenario", required=False, callback=converted(parse_scenario), shell_complete=complete_scenario)
 @config_option(_DEFAULT, "--host ADDRESS")
 @config_option(_DEFAULT, "--port N")
 @config_option(
@@ -56,6 +58,7 @@ _SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
     type=int,
     multiple=True,
 )
+@json_option
 def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP, for networks without multicast.
 
@@ -85,10 +88,11 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
             "no channel of actuator commands is protected: give a SCENARIO, --protect CHANNEL, or --unprotected"
         )
     _log.info("protected channels: %s", ", ".join(config.protect) or "none")
-    click.echo(server.url)
+    show(server.url, {"url": server.url})
     serve(server)
     statistics = server.statistics()
-    click.echo(
+    show(
         f"{statistics.messages} messages relayed, {statistics.refused} rejected, "
-        f"{statistics.dropped} dropped for slow clients"
+        f"{statistics.dropped} dropped for slow clients",
+        statistics,
     )

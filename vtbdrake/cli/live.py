@@ -8,15 +8,12 @@ from contextlib import contextmanager
 from itertools import islice
 
 import click
-import numpy as np
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import Setting, converted, option, parse_setting, settings, timeout_option, url_option
-from vtbdrake.cli.output import finite
+from vtbdrake.cli.output import emit, json_option, plain, say, show
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.failures import one_line
-from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
-from vtbdrake.monitoring.live.client import watch as watch_live
 
 _addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
 
@@ -25,6 +22,7 @@ _addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRE
 @click.argument("values", nargs=-1, required=True, callback=converted(parse_setting), metavar="ADDRESS=VALUE...")
 @url_option
 @timeout_option
+@json_option
 def set_(values: tuple[Setting, ...], url: str, timeout: float) -> None:
     """Set variables of a running DPS, all in one cycle or none.
 
@@ -34,14 +32,18 @@ def set_(values: tuple[Setting, ...], url: str, timeout: float) -> None:
     Example:
       vtbdrake set --url tcpq://127.0.0.1:7700 u.motion=2 "dps.impl.stiffness=[20,20,20,900,900,900]"
     """
+    from vtbdrake.monitoring.live.client import LiveClient
+
     with _failures(), LiveClient(url, timeout=timeout) as client:
         client.set(settings(values))
+    emit(settings(values))
 
 
 @click.command()
 @_addresses
 @url_option
 @timeout_option
+@json_option
 def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
     """Print variables and output ports of a running DPS once.
 
@@ -51,10 +53,15 @@ def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
     Example:
       vtbdrake get --url tcpq://127.0.0.1:7700 u.motion dps.impl.stiffness
     """
+    import numpy as np
+
+    from vtbdrake.monitoring.live.client import LiveClient
+
     with _failures(), LiveClient(url, timeout=timeout) as client:
         values = client.get(addresses)
     for address, value in values.items():
-        click.echo(f"{address} = {np.asarray(value).tolist()}")
+        say(f"{address} = {np.asarray(value).tolist()}")
+    emit(values)
 
 
 @click.command()
@@ -63,21 +70,23 @@ def get(addresses: tuple[str, ...], url: str, timeout: float) -> None:
 @option("--every N", "Print every Nth cycle.", type=click.IntRange(min=1), default=100)
 @option("--count N", "End after N lines.  [default: endless]", type=click.IntRange(min=1))
 @timeout_option
+@json_option
 def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, timeout: float) -> None:
     """Print variables and output ports of a running DPS repeatedly.
 
     It prints until Ctrl-C, or until vtbdrake run ends. Each line is a JSON object with the time of the DPS in seconds
-    and the values by address. A value that is not finite is null.
+    and the values by address, with --json or without. A value that is not finite is null.
 
     \b
     Example:
       vtbdrake watch --url tcpq://127.0.0.1:7700 dps.impl.torque --every 500
     """
+    from vtbdrake.monitoring.live.client import watch as watch_live
+
     with _failures():
         try:
             for time, values in islice(watch_live(url, addresses, every=every, timeout=timeout), count):
-                plain = {address: finite(np.asarray(value).tolist()) for address, value in values.items()}
-                click.echo(json.dumps({"time": time, **plain}))
+                click.echo(json.dumps({"time": time, **plain(values)}))
         except KeyboardInterrupt:
             return
 
@@ -85,6 +94,7 @@ def watch(addresses: tuple[str, ...], url: str, every: int, count: int | None, t
 @click.command()
 @url_option
 @timeout_option
+@json_option
 def reset(url: str, timeout: float) -> None:
     """Let a running DPS command again after a fault that is over.
 
@@ -94,16 +104,18 @@ def reset(url: str, timeout: float) -> None:
     Example:
       vtbdrake reset --url tcpq://127.0.0.1:7700
     """
+    from vtbdrake.monitoring.live.client import LiveClient
+
     with _failures(), LiveClient(url, timeout=timeout) as client:
         released = client.reset()
-    for reason in released:
-        click.echo(f"this fault is over: {reason}")
-    if not released:
-        click.echo("no fault had latched")
+    text = "\n".join(f"this fault is over: {reason}" for reason in released)
+    show(text or "no fault had latched", {"released": released})
 
 
 @contextmanager
 def _failures() -> Iterator[None]:
+    from vtbdrake.monitoring.live.client import LiveError, LiveTimeoutError
+
     try:
         yield
     except (BridgeError, LiveError, LiveTimeoutError) as error:

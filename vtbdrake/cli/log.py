@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from vtbdrake.cli import FailedError
+from vtbdrake.cli.completion import complete_scenario
 from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
-from vtbdrake.cli.output import RECORDINGS, save_recording
+from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
 from vtbdrake.failures import one_line
-from vtbdrake.recording.export import EXPORTS
-from vtbdrake.recording.export import export as export_log
-from vtbdrake.recording.log_reader import read_log
-from vtbdrake.recording.replay import DIFFERENT
-from vtbdrake.recording.replay import replay as replay_log
-from vtbdrake.testbed import DpsAlone
-from vtbdrake.testbed.scenario import class_name
-from vtbdrake.testbed.scenario_file import scenario_class
 
 _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 
@@ -27,6 +21,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 @option(
     "--scenario MODULE:CLASS",
     "The scenario of the log, whose fields are in the log. Its code runs, so the user has to name it.",
+    shell_complete=complete_scenario,
 )
 @option(
     "--on",
@@ -37,6 +32,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 @set_option
 @option("--record ADDRESS", "Read ADDRESS after every cycle. May be repeated.", multiple=True)
 @option("--out FILE", "Write these values: .csv or .npz.", parse=output(*RECORDINGS))
+@json_option
 def replay(
     log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
 ) -> None:
@@ -51,6 +47,13 @@ def replay(
     Example:
       vtbdrake replay run.lcm --scenario vtbdrake_diagrams.manipulator:ManipulatorScenario
     """
+    from vtbdrake.recording.log_reader import read_log
+    from vtbdrake.recording.replay import DIFFERENT
+    from vtbdrake.recording.replay import replay as replay_log
+    from vtbdrake.testbed import DpsAlone
+    from vtbdrake.testbed.scenario import class_name
+    from vtbdrake.testbed.scenario_file import scenario_class
+
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
     opened = read_log(log)
@@ -68,16 +71,26 @@ def replay(
     report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:
         save_recording(out, report.times, report.record)
-    click.echo(report)
+    described: dict[str, Any] = {name: getattr(report, name) for name in ("outcome", "cycles", "digests", "ended")}
+    described |= {"first_difference": report.first_difference, "max_difference": report.max_difference}
+    described |= {"errors": report.errors, "versions": report.versions}
+    show(report, described)
     if report.outcome == DIFFERENT:
         raise FailedError(one_line(f"the replay differs: {report.first_difference}"))
     if report.ended and not values:
         raise FailedError(f"not everything was compared: {report.ended}")
 
 
+def _parse_export(text: str) -> Path:
+    from vtbdrake.recording.export import EXPORTS
+
+    return output(*EXPORTS)(text)
+
+
 @click.command()
 @_log
-@click.argument("out", callback=converted(output(*EXPORTS)))
+@click.argument("out", callback=converted(_parse_export))
+@json_option
 def export(log: Path, out: Path) -> None:
     """Write a LOG as MCAP (for Foxglove), CSV or Parquet.
 
@@ -87,6 +100,10 @@ def export(log: Path, out: Path) -> None:
     Example:
       vtbdrake export run.lcm run.mcap
     """
+    from vtbdrake.recording.export import export as export_log
+    from vtbdrake.recording.log_reader import read_log
+
     opened = read_log(log)
     export_log(opened, out)
-    click.echo(opened)
+    described = {"cycles": len(opened), "period": opened.header.period, "incomplete": opened.incomplete}
+    show(opened, {"file": out, "scenario": opened.header.scenario_name, **described})

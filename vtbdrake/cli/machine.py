@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,13 +19,13 @@ from vtbdrake.cli.options import (
     settings,
     url_option,
 )
-from vtbdrake.cli.output import number
+from vtbdrake.cli.output import emit, json_option, number, say, show
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.failures import one_line
-from vtbdrake.machine import Machine, MachineConfig, MachineLoop
-from vtbdrake.machine.loop import epoch, serve
-from vtbdrake.machine.machine import BRAKES
-from vtbdrake.testbed import Scenario
+from vtbdrake.machine.config import BRAKES, MachineConfig
+
+if TYPE_CHECKING:
+    from vtbdrake.testbed import Scenario
 
 _DEFAULT = MachineConfig()
 
@@ -76,6 +76,7 @@ def parse_deviation(text: str) -> tuple[str, float]:
     type=click.IntRange(0, 99),
     default=0,
 )
+@json_option
 def machine(
     scenario: Scenario,
     url: str,
@@ -101,6 +102,9 @@ def machine(
       vtbdrake machine vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 \\
           --perturb 0.05 --seed 3
     """
+    from vtbdrake.machine import Machine, MachineLoop
+    from vtbdrake.machine.loop import epoch, serve
+
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     config = MachineConfig(
         values=settings(values),
@@ -113,7 +117,7 @@ def machine(
     )
     simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
     for address, value in simulated.perturbed.items():
-        click.echo(f"{address} = {value}")
+        say(f"{address} = {value}")
     try:
         loop = MachineLoop(simulated, url)
         serve(
@@ -121,9 +125,10 @@ def machine(
             lock_step=lock_step,
             cycles=inf if cycles is None else cycles,
             priority=priority,
-            ready=lambda: click.echo(f"ready on {url}"),
+            ready=lambda: show(f"ready on {url}", {"url": url, "perturbed": simulated.perturbed}),
         )
     except BridgeError as error:
         raise FailedError(one_line(error)) from error
-    click.echo(loop.statistics)
-    click.echo(f"{number(simulated.time)} s simulated, {number(loop.lost)} s behind the clock")
+    say(loop.statistics)
+    say(f"{number(simulated.time)} s simulated, {number(loop.lost)} s behind the clock")
+    emit({"simulated": simulated.time, "lost": loop.lost, "statistics": loop.statistics.to_dict()})

@@ -7,12 +7,14 @@ from pathlib import Path
 import click
 
 from vtbdrake.cli.options import option
+from vtbdrake.cli.output import emit, json_option, say
 
 
 @click.command()
 @click.argument("name")
 @option("--urdf FILE", "The robot: a URDF, SDF or MJCF file, or package://...  [default: a small arm]", name="file")
 @option("--station FILE", "Instead of a robot, a station: a YAML file of Drake's hardware_sim, or FILE#KEY.")
+@json_option
 def new(name: str, file: str | None, station: str | None) -> None:
     """Write a project for a robot into the new folder NAME.
 
@@ -34,7 +36,8 @@ def new(name: str, file: str | None, station: str | None) -> None:
     project = write_project(folder, name, source)
     for note in source.notes:
         click.echo(f"note: {note}", err=True)
-    click.echo(f"{project.name}/ written, for {source}. Next:")
-    click.echo(f"  cd {name}")
-    click.echo("  python -m pytest")
-    click.echo(f"  python -m {name}.drive")
+    say(f"{project.name}/ written, for {source}. Next:")
+    say(f"  cd {name}")
+    say("  python -m pytest")
+    say(f"  python -m {name}.drive")
+    emit({"folder": project, "source": source, "notes": source.notes})

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import click
 
+from vtbdrake.cli.completion import complete_scenario
 from vtbdrake.settings import declared_settings
 
 if TYPE_CHECKING:
@@ -213,6 +214,23 @@ def positive(value: float) -> float:
     return value
 
 
+class LazyChoice(click.Choice[str]):
+    """A choice among names of the library, which is imported when they are needed: Drake takes its time.
+
+    Args:
+        load: Returns the names.
+    """
+
+    def __init__(self, load: Callable[[], Iterable[str]]) -> None:
+        self.case_sensitive = True
+        self._load = load
+
+    @property
+    def choices(self) -> Sequence[str]:  # type: ignore[override]
+        """Return the names."""
+        return tuple(self._load())
+
+
 def output(*suffixes: str, new: bool = False) -> Callable[[str], Path]:
     """Return a function that checks that a file can be written, and returns its path.
 
@@ -259,7 +277,8 @@ def scenario_argument(command: Callable[..., Any]) -> Callable[..., Any]:
     def with_scenario(*, scenario: Scenario, scenario_fields: tuple[tuple[str, Any], ...], **others: Any) -> Any:
         return command(scenario=scenario.with_fields(settings(scenario_fields)), **others)
 
-    return click.argument("scenario", callback=converted(parse_scenario))(_field_option(with_scenario))
+    argument = click.argument("scenario", callback=converted(parse_scenario), shell_complete=complete_scenario)
+    return argument(_field_option(with_scenario))
 
 
 set_option = option(

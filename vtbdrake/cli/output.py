@@ -1,23 +1,75 @@
-"""Output of the commands: numbers, tables, CSV files, recordings."""
+"""Output of the commands: text or JSON, numbers, tables, CSV files, recordings.
+
+A command prints by `show` (both forms), `say` (text alone) and `emit` (JSON alone), and has the option `json_option`.
+An object of JSON is one line. Numbers that are not finite are null, since JSON lacks them.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import click
 
-from vtbdrake.state.archive import whole_file
-from vtbdrake.state.variables import text_table
+from vtbdrake.cli import json_requested
+from vtbdrake.cli.options import option
+
+if TYPE_CHECKING:
+    import numpy as np
 
 RECORDINGS = (".csv", ".npz")
 """Suffixes of the files that `save_recording` writes."""
 
-table = text_table
+json_option = option("--json", "Print JSON instead of text; an error, too.", is_flag=True, expose_value=False)
+
+
+def show(text: object, data: Any) -> None:
+    """Print a result: the text, or with ``--json`` the data, for which see `plain`."""
+    say(text)
+    emit(data)
+
+
+def say(text: object) -> None:
+    """Print a text, unless ``--json`` asks for data."""
+    if not json_requested():
+        click.echo(str(text))
+
+
+def emit(data: Any) -> None:
+    """Print data, for which see `plain`, as a line of JSON if ``--json`` asks for it."""
+    if json_requested():
+        click.echo(json.dumps(plain(data), allow_nan=False))
+
+
+def plain(value: Any) -> Any:
+    """Return data of dictionaries, lists, dataclasses, arrays and numbers as JSON has them, and others as texts.
+
+    NaN and infinity become None.
+    """
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {item.name: plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, float):
+        return value if isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int) else str(value)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table with aligned columns."""
+    from vtbdrake.state.variables import text_table
+
+    return text_table(header, rows)
 
 
 def number(value: float) -> str:
@@ -25,15 +77,10 @@ def number(value: float) -> str:
     return f"{value + 0.0:.6g}"
 
 
-def finite(value: Any) -> Any:
-    """Replace NaN and infinity by None in a number or in nested lists, because JSON lacks them."""
-    if isinstance(value, list):
-        return [finite(item) for item in value]
-    return value if isfinite(value) else None
-
-
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file whole or not at all."""
+    from vtbdrake.state.archive import whole_file
+
     with whole_file(path) as partial:
         partial.write_bytes(content)
 
@@ -65,6 +112,8 @@ def save_recording(path: Path, times: np.ndarray, record: Mapping[str, Any]) -> 
     Raises:
         ValueError: A recording is not numeric.
     """
+    import numpy as np
+
     for address, values in record.items():
         if not isinstance(values, np.ndarray):
             raise ValueError(f"the recording of {address} is not numeric, and cannot be written to {path}")

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
+    LazyChoice,
     Setting,
     grouped,
     horizon_option,
@@ -30,18 +30,20 @@ from vtbdrake.cli.options import (
     settings,
     start_option,
 )
-from vtbdrake.cli.output import number, table, write_csv
+from vtbdrake.cli.output import emit, json_option, number, say, show, table, write_csv
 from vtbdrake.failures import one_line
-from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
-from vtbdrake.optimization.boundary import why_no_boundary
-from vtbdrake.optimization.parameter import Dimension, point_text
-from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.rollout.executor import NAMES
-from vtbdrake.rollout.named_function import FUNCTION, largest, magnitude, named_function, smallest
-from vtbdrake.state.variables import with_unit
-from vtbdrake.testbed import Scenario
 
-_CALL = re.compile(rf"({FUNCTION.pattern})\((.*)\)")
+if TYPE_CHECKING:
+    from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
+    from vtbdrake.optimization.parameter import Dimension
+    from vtbdrake.rollout import Constraint, Quality, RolloutResult
+    from vtbdrake.testbed import Scenario
+
+
+def _executors() -> tuple[str, ...]:
+    from vtbdrake.rollout.executor import NAMES
+
+    return NAMES
 
 
 def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -73,7 +75,7 @@ _problem_options = grouped(
 # For `Problem.sweep`, `Problem.boundary` and `Study.run`.
 executor_options = grouped(
     "running",
-    option("--executor", "Where rollouts run.", type=click.Choice(NAMES), default=NAMES[0]),
+    option("--executor", "Where rollouts run.", type=LazyChoice(_executors), default="auto"),
     option("--workers N", "The number of threads or processes.  [default: one per core]", type=click.IntRange(min=1)),
 )
 on_error_option = grouped(
@@ -116,6 +118,8 @@ def make_problem(
         minimize: Whether the quality is a cost.
         others: Other arguments of `Problem`.
     """
+    from vtbdrake.optimization import Problem
+
     common = list(settings(values).items())
     return Problem(
         scenario=scenario,
@@ -127,6 +131,9 @@ def make_problem(
 
 
 def _quality(text: str, of: Sequence[str]) -> Quality:
+    from vtbdrake.rollout import Quality
+    from vtbdrake.rollout.named_function import FUNCTION, magnitude, named_function
+
     if not FUNCTION.fullmatch(text):
         if of:
             raise click.UsageError(f"--of belongs to a quality module:function; {text} is an address")
@@ -143,13 +150,16 @@ def make_constraint(text: str, *, limit: str) -> Constraint:
         click.BadParameter: The text has another form.
         click.UsageError: The function does not exist.
     """
+    from vtbdrake.rollout import Constraint
+    from vtbdrake.rollout.named_function import FUNCTION, largest, named_function, smallest
+
     subject, _, bound = (part.strip() for part in text.rpartition("="))
     form = "ADDRESS=LIMIT or MODULE:FUNCTION(ADDRESS,...)=LIMIT"
     try:
         limits: dict[str, Any] = {limit: float(bound)}
     except ValueError as error:
         raise click.BadParameter(f"expected {form}, LIMIT a number, not {text!r}") from error
-    call = _CALL.fullmatch(subject)
+    call = re.fullmatch(rf"({FUNCTION.pattern})\((.*)\)", subject)
     if call is not None:
         of = [address.strip() for address in call[2].split(",") if address.strip()]
         return Constraint(named_function(call[1]), of=of, **limits)
@@ -171,6 +181,7 @@ def make_constraint(text: str, *, limit: str) -> Constraint:
 @executor_options
 @on_error_option
 @_file_options
+@json_option
 def sweep(
     scenario: Scenario,
     vary: tuple[tuple[Parameter, int], ...],
@@ -190,10 +201,11 @@ def sweep(
     """
     parameters, points = zip(*vary, strict=True)
     swept = make_problem(scenario, parameters, **problem).sweep(points, **running)
-    click.echo(_points_table(swept))
+    say(_points_table(swept))
     _write_files(swept, **files)
+    emit(_described(swept))
     _reject_failures(swept)
-    click.echo("\n" + _conclusion(swept))
+    say("\n" + _conclusion(swept))
     if not swept.complete:
         raise FailedError("the sweep was interrupted: the table shows the finished rollouts")
 
@@ -224,6 +236,7 @@ def sweep(
 @executor_options
 @on_error_option
 @_file_options
+@json_option
 def boundary(
     scenario: Scenario,
     vary: Parameter,
@@ -246,7 +259,34 @@ def boundary(
     assert result.sweep is not None
     _write_files(result.sweep, boundary=result, **files)
     _reject_failures(result.sweep)
-    click.echo(_report(result, result.sweep))
+    show(_report(result, result.sweep), _boundary_data(result, result.sweep))
+
+
+def _described(sweep: Sweep) -> dict[str, Any]:
+    """Return the points with their rollouts, and the best one if there is one."""
+    from vtbdrake.optimization.boundary import why_no_boundary
+
+    try:
+        point, h = sweep.best()
+        best: dict[str, Any] | None = {"point": point, "h": h}
+    except ValueError:
+        best = None
+    points = [
+        {
+            "point": dict(zip((p.address for p in sweep.parameters), point, strict=True)),
+            "condition": condition,
+            "h": rollout.h,
+            "t_star": rollout.t_star,
+            "end": rollout.end,
+            "message": rollout.message,
+        }
+        for point, condition, rollout in zip(sweep.points, sweep.condition, sweep.rollouts, strict=True)
+    ]
+    described: dict[str, Any] = {"conditions": sweep.conditions, "points": points}
+    described |= {"best": best, "complete": sweep.complete}
+    if not why_no_boundary(sweep):
+        described |= {"boundary": [sweep.boundary().lower, sweep.boundary().upper]}
+    return described
 
 
 def _points_table(sweep: Sweep) -> str:
@@ -263,6 +303,9 @@ def _points_table(sweep: Sweep) -> str:
 
 
 def _conclusion(sweep: Sweep) -> str:
+    from vtbdrake.optimization.boundary import why_no_boundary
+    from vtbdrake.optimization.parameter import point_text
+
     lines = [_condition(i, c) for i, c in enumerate(sweep.conditions)] if len(sweep.conditions) > 1 else []
     try:
         point, h = sweep.best()
@@ -275,7 +318,19 @@ def _conclusion(sweep: Sweep) -> str:
     return "\n".join(lines)
 
 
+def _boundary_data(boundary: Boundary, sweep: Sweep) -> dict[str, Any]:
+    names = ("address", "unit", "lower", "upper", "by_condition", "examined", "chances", "safe_beyond", "failed_at")
+    described = {name: getattr(boundary, name) for name in names}
+    return described | {"conditions": sweep.conditions, "rollouts": len(_rollouts(boundary, sweep))}
+
+
+def _rollouts(boundary: Boundary, sweep: Sweep) -> list[RolloutResult]:
+    return [*sweep.rollouts, *(boundary.repeated.rollouts if boundary.repeated is not None else ())]
+
+
 def _report(boundary: Boundary, sweep: Sweep) -> str:
+    from vtbdrake.state.variables import with_unit
+
     lines = [str(boundary)]
     several = len(sweep.conditions) > 1
     if several:
@@ -287,12 +342,14 @@ def _report(boundary: Boundary, sweep: Sweep) -> str:
     if boundary.failed_at:
         values = ", ".join(map(number, boundary.failed_at))
         lines.append(f"counted as unsafe: a rollout failed at {with_unit(values, boundary.unit)}")
-    rollouts = [*sweep.rollouts, *(boundary.repeated.rollouts if boundary.repeated is not None else ())]
+    rollouts = _rollouts(boundary, sweep)
     seconds = sum(rollout.wall_time for rollout in rollouts)
     return "\n".join([*lines, f"{len(rollouts)} rollouts, {seconds:.3g} s of simulation"])
 
 
 def _condition(index: int, condition: Mapping[str, Any]) -> str:
+    import numpy as np
+
     values = (f"{address} = {json.dumps(np.asarray(value).tolist())}" for address, value in condition.items())
     return f"condition {index} ({', '.join(values)})"
 

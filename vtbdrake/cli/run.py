@@ -6,6 +6,7 @@ import json
 import logging
 import signal
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,18 +23,18 @@ from vtbdrake.cli.options import (
     settings,
     url_option,
 )
-from vtbdrake.cli.output import number, write_whole
+from vtbdrake.cli.output import emit, json_option, number, say, show, write_whole
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.fault import FaultKind
-from vtbdrake.control.guards import Guards
 from vtbdrake.control.realtime import RealTime, RunawayError
-from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.deployment import Deployment
 from vtbdrake.failures import one_line
-from vtbdrake.recording.recorder import RecordingError
-from vtbdrake.state import Snapshot
-from vtbdrake.testbed import Scenario
+
+if TYPE_CHECKING:
+    from vtbdrake.control.guards import Guards
+    from vtbdrake.control.runtime import Runtime
+    from vtbdrake.recording.recorder import RecordingError
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import Scenario
 
 _log = logging.getLogger(__name__)
 
@@ -72,6 +73,7 @@ MOST_FAULTS = 20  # that are printed at the end
 @option("--live/--no-live", "Serve vtbdrake get, set, watch and reset.", default=True)
 @option("--record FILE", "Record the loop for vtbdrake replay: .lcm.", parse=output(".lcm", new=True))
 @option("--statistics FILE", "Write the timing of the loop: .json.", parse=output(".json"))
+@json_option
 def run(
     scenario: Scenario,
     url: str,
@@ -99,6 +101,9 @@ def run(
     Example:
       vtbdrake run vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
+    from vtbdrake.deployment import Deployment
+    from vtbdrake.recording.recorder import RecordingError
+
     logging.basicConfig(format="%(asctime)s %(message)s")
     for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
         logger.setLevel(logging.INFO)
@@ -113,15 +118,16 @@ def run(
         with ending_signals(signal.default_int_handler), logging_in_thread(), loop as runtime:
             begin = runtime.clock.now()
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
-                click.echo(real_time)
+                show(real_time, {"real_time": real_time.grants})
                 _run(runtime, wait=wait, seconds=seconds)
     except (BridgeError, RunawayError, ProcessStartError) as error:
         raise FailedError(one_line(error)) from error
     except RecordingError as error:
         incomplete = error
-    click.echo(runtime.statistics)
+    say(runtime.statistics)
     for path, counts in runtime.slow_parts.statistics.items():
-        click.echo(f"slow part {path}: {counts}")
+        say(f"slow part {path}: {counts}")
+    emit({"statistics": runtime.statistics.to_dict(), "slow_parts": runtime.slow_parts.statistics})
     try:
         if statistics is not None:
             write_whole(statistics, json.dumps(runtime.statistics.to_dict()).encode())
@@ -135,9 +141,10 @@ def _report_faults(guards: Guards, begin: float) -> None:
     """Print the faults of the loop."""
     faults = [fault for fault in guards.log if fault.kind != FaultKind.TOLD]
     for fault in faults[:MOST_FAULTS]:
-        click.echo(f"fault after {number(fault.time - begin)} s: {fault.reason}")
+        say(f"fault after {number(fault.time - begin)} s: {fault.reason}")
     if len(faults) > MOST_FAULTS:
-        click.echo(f"and {len(faults) - MOST_FAULTS} more faults")
+        say(f"and {len(faults) - MOST_FAULTS} more faults")
+    emit({"faults": [{"time": fault.time - begin, "reason": fault.reason} for fault in faults]})
     causes = [fault.reason for fault in guards.latched if fault.kind != FaultKind.TOLD]
     if causes:
         raise FailedError(f"the fallbacks took over: {'; '.join(causes)}")
@@ -145,6 +152,8 @@ def _report_faults(guards: Guards, begin: float) -> None:
 
 def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
     """Take over, and run until the time is up or Ctrl-C."""
+    from vtbdrake.control.switching import SwitchRefusedError
+
     try:
         runtime.take_over(timeout=wait)
         _log.info("the DPS commands; its time is %s s", number(runtime.time))

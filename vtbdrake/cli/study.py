@@ -6,7 +6,7 @@ import json
 import logging
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,14 +21,15 @@ from vtbdrake.cli.options import (
     parse_scaled_range,
     settings,
 )
-from vtbdrake.cli.output import table, write_csv
+from vtbdrake.cli.output import emit, json_option, say, table, write_csv
 from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, on_error_option, problem_options
-from vtbdrake.optimization import Choice, CVaR, Parameter, Quantile, Study
-from vtbdrake.optimization.risk import Risk
-from vtbdrake.rollout import Constraint
-from vtbdrake.testbed import Scenario
 
-_LEVELS = {"quantile": Quantile, "cvar": CVaR}
+if TYPE_CHECKING:
+    from vtbdrake.optimization import Choice, Parameter, Study
+    from vtbdrake.optimization.risk import Risk
+    from vtbdrake.rollout import Constraint
+    from vtbdrake.testbed import Scenario
+
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 _point = click.argument(
     "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
@@ -36,13 +37,16 @@ _point = click.argument(
 
 
 def _risk(text: str) -> str | Risk:
+    from vtbdrake.optimization import CVaR, Quantile
+
     name, colon, level = text.partition(":")
+    levels: dict[str, type[CVaR | Quantile]] = {"quantile": Quantile, "cvar": CVaR}
     if not colon:
         return text
-    if name not in _LEVELS:
+    if name not in levels:
         raise click.BadParameter(f"expected worst, mean, quantile:LEVEL or cvar:LEVEL, not {text!r}")
     try:
-        return _LEVELS[name](float(level))
+        return levels[name](float(level))
     except ValueError as error:
         raise click.BadParameter(f"the level of {name} is a number in (0, 1], not {level!r}") from error
 
@@ -136,6 +140,7 @@ def study() -> None:
     "solving",
     option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True),
 )
+@json_option
 def run(
     file: Path,
     scenario: Scenario,
@@ -165,7 +170,8 @@ def run(
     solving["options"] = settings(solving["options"]) or None
     with stated.study(file, **solving) as opened:
         opened.run(**running)
-        click.echo(opened.summary())
+        say(opened.summary())
+        emit({**_described(opened), "reason": opened.reason})
         if opened.reason == "interrupted":
             raise FailedError("the study was interrupted: the same command resumes it")
 
@@ -173,57 +179,84 @@ def run(
 @study.command()
 @_file
 @option("--csv FILE", "Write all points with their attributes.", parse=output(".csv"))
+@json_option
 def show(file: Path, csv: Path | None) -> None:
     """Show the results, waiting points and attributes of a study."""
+    from vtbdrake.optimization import Study
+
     with Study.open(file) as opened:
-        click.echo(opened.summary())
+        say(opened.summary())
         queue, attributes = opened.queue, opened.attributes
         if queue:
             header = ["waiting", *(parameter.address for parameter in opened.parameters)]
             rows = [[str(number), *map(str, point.values())] for number, point in queue.items()]
-            click.echo("\n" + table(header, rows))
+            say("\n" + table(header, rows))
         for key, value in attributes.items():
-            click.echo(f"attribute {key}: {json.dumps(value)}")
+            say(f"attribute {key}: {json.dumps(value)}")
+        emit({**_described(opened), "waiting": queue, "attributes": attributes})
         if csv is not None:
             write_csv(csv, opened.to_dict())
 
 
+def _described(study: Study) -> dict[str, Any]:
+    """Return what is in a study, with the points as columns."""
+    best = [{"point": trial.parameters, "values": trial.values} for trial in study.pareto()]
+    record = {name: study.record[name] for name in ("solver", "seed")}
+    return {**record, "rollouts": len(study), "best": best, "points": study.to_dict()}
+
+
 @study.command()
 @_file
 @_point
+@json_option
 def add(file: Path, point: tuple[tuple[str, Any], ...]) -> None:
     """Add a point, to be evaluated with the next batch."""
+    from vtbdrake.optimization import Study
+
     with Study.open(file) as opened:
         opened.add(settings(point))
+        emit({"waiting": opened.queue})
 
 
 @study.command()
 @_file
 @click.argument("number", type=int)
 @_point
+@json_option
 def edit(file: Path, number: int, point: tuple[tuple[str, Any], ...]) -> None:
     """Replace a waiting point; `show` lists the numbers."""
+    from vtbdrake.optimization import Study
+
     with Study.open(file) as opened:
         opened.edit(number, settings(point))
+        emit({"waiting": opened.queue})
 
 
 @study.command()
 @_file
 @click.argument("number", type=int)
+@json_option
 def remove(file: Path, number: int) -> None:
     """Remove a waiting point; `show` lists the numbers."""
+    from vtbdrake.optimization import Study
+
     with Study.open(file) as opened:
         opened.remove(number)
+        emit({"waiting": opened.queue})
 
 
 @study.command("attribute")
 @_file
 @click.argument("attribute", callback=converted(parse_field), metavar="KEY=VALUE")
 @option("--trial NUMBER", "Set it for the point of this trial, not for the study.", type=int)
+@json_option
 def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> None:
     """Set an attribute of a study, or of a point."""
+    from vtbdrake.optimization import Study
+
     with Study.open(file) as opened:
         trials = opened.trials if trial is not None else ()
         if trial is not None and not 0 <= trial < len(trials):
             raise click.BadParameter(f"the study has {len(trials)} trials, counted from 0, and no trial {trial}")
         opened.set_attribute(*attribute, point=None if trial is None else trials[trial].parameters)
+        emit(settings([attribute]))

@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import suggestion
 from vtbdrake.cli import BadInputError, FailedError
 from vtbdrake.cli.options import (
+    LazyChoice,
     Setting,
     horizon_option,
     option,
@@ -24,16 +22,28 @@ from vtbdrake.cli.options import (
     settings,
     start_option,
 )
-from vtbdrake.cli.output import RECORDINGS, entries, finite, number, save_recording, table, write_whole
+from vtbdrake.cli.output import (
+    RECORDINGS,
+    emit,
+    entries,
+    json_option,
+    number,
+    save_recording,
+    say,
+    show,
+    table,
+    write_whole,
+)
 from vtbdrake.failures import one_line
-from vtbdrake.optimization.problem import PLANT_STATE
-from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.settings import schema
-from vtbdrake.state import Snapshot, Variable, Variables
-from vtbdrake.state.variables import A, text_table
-from vtbdrake.testbed import Scenario
-from vtbdrake.testbed.pedigree import Number
-from vtbdrake.testbed.testbed import MODES
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pydrake.systems.framework import Context
+
+    from vtbdrake.rollout import RolloutResult
+    from vtbdrake.state import Snapshot, Variable, Variables
+    from vtbdrake.testbed import Scenario
 
 # The number of entries of an array in a table of pedigrees.
 _SHOWN = 6
@@ -44,10 +54,10 @@ _MANY = 64
 @click.command()
 @scenario_argument
 @option("--match TEXT", "Show only addresses that contain TEXT.", default="")
-@option("--json", "Print a JSON list of objects instead of a table.", name="as_json", is_flag=True)
+@json_option
 @option("--schema", "Print the JSON Schema of the scenario's fields instead.", name="as_schema", is_flag=True)
 @option("--pedigree", "Show where the static numbers of the world are from instead.", name="by_source", is_flag=True)
-def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool, by_source: bool) -> None:
+def variables(scenario: Scenario, match: str, as_schema: bool, by_source: bool) -> None:
     """List the variables of a testbed, or the fields of its scenario.
 
     The table shows address, kind, shape, unit, bounds and the value in s0 of every element of the state. Kind x is the
@@ -60,6 +70,8 @@ def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool, by
     Example:
       vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match payload
     """
+    from vtbdrake.argument_checks import suggestion
+
     if as_schema:
         click.echo(json.dumps(schema(type(scenario)), indent=2))
         return
@@ -72,22 +84,22 @@ def variables(scenario: Scenario, match: str, as_json: bool, as_schema: bool, by
     if by_source:
         rows = _pedigree(scenario, [variable for variable in matches if not variable.derived], context, match)
         titles = ("address", "value", "source", "interval", "note")
-        if as_json:
-            click.echo(json.dumps([dict(zip(titles, row, strict=True)) for row in rows], indent=2))
-        else:
-            click.echo(text_table(titles, rows))
-            sources = [row[2] for row in rows]
-            click.echo(", ".join(f"{sources.count(each)} {each}" for each in dict.fromkeys(sources)))
-    elif as_json:
-        click.echo(json.dumps([_plain(variable, context) for variable in matches], indent=2))
+        sources = [row[2] for row in rows]
+        counts = ", ".join(f"{sources.count(each)} {each}" for each in dict.fromkeys(sources))
+        show(f"{table(titles, rows)}\n{counts}", [dict(zip(titles, row, strict=True)) for row in rows])
     else:
-        click.echo(listed.table(context, pattern=match))
+        show(listed.table(context, pattern=match), [_described(variable, context) for variable in matches])
 
 
 def _pedigree(
     scenario: Scenario, variables: list[Variable], context: Context, match: str
 ) -> list[tuple[str, str, str, str, str]]:
     """Return rows (address, value, source, interval, note) of the static numbers of the world, and of fields."""
+    import numpy as np
+
+    from vtbdrake.state.variables import A
+    from vtbdrake.testbed.pedigree import Number
+
     numbers = scenario.pedigree.numbers
     texts: dict[str, str] = {}
     for variable in variables:
@@ -109,23 +121,29 @@ def _pedigree(
     return rows
 
 
-def _plain(variable: Variable, context: Context) -> dict[str, Any]:
-    value = variable.get(context)
+def _described(variable: Variable, context: Context) -> dict[str, Any]:
     return {
         "address": variable.address,
         "kind": variable.kind,
         "derived": variable.derived,
-        "shape": list(variable.shape),
+        "shape": variable.shape,
         "unit": variable.unit,
-        "bounds": [finite(bound) for bound in variable.bounds],
-        "value": finite(value if isinstance(value, float) else value.tolist()),
+        "bounds": variable.bounds,
+        "value": variable.get(context),
     }
+
+
+def _modes() -> list[str]:
+    from vtbdrake.testbed.testbed import MODES
+
+    return list(MODES)
 
 
 @click.command()
 @scenario_argument
-@option("--mode", "The positions of the switches.", type=click.Choice(list(MODES)), default="sim")
+@option("--mode", "The positions of the switches.", type=LazyChoice(_modes), default="sim")
 @option("-o --output FILE", "Write to FILE, not to the terminal.", name="out", parse=output(".svg"))
+@json_option
 def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
     """Draw a testbed as SVG: DPS, switches, both worlds (Figure 4).
 
@@ -137,9 +155,10 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 
     text = svg(scenario.build(mode=mode))
     if out is None:
-        click.echo(text)
+        show(text, {"svg": text})
     else:
         write_whole(out, text.encode())
+        emit({"file": out})
 
 
 @click.command()
@@ -152,6 +171,7 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 @option("--save FILE", "Write the recording: .csv or .npz.", parse=output(*RECORDINGS))
 @option("--snapshot FILE", "Write s(t_end), for --start.", parse=output())
 @option("--html FILE", "Write an animation for any web browser.", parse=output(".html"))
+@json_option
 def rollout(
     scenario: Scenario,
     horizon: float,
@@ -172,6 +192,9 @@ def rollout(
       vtbdrake rollout vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
           --set sim.sys.payload.mass=40 --record sim.sys.climber.base.pitch --save pitch.csv
     """
+    from vtbdrake.optimization.problem import PLANT_STATE
+    from vtbdrake.rollout import RolloutRunner, RolloutTask
+
     if save is not None and not record:
         raise click.UsageError("--save writes the addresses of --record, but nothing is recorded")
     testbed = scenario.build()
@@ -185,10 +208,14 @@ def rollout(
     runner = RolloutRunner(task, testbed)
     result = runner.run(parameters)
 
-    click.echo(_outcome(result))
+    say(_outcome(result))
     recorded_result = replace(result, record={address: result.record[address] for address in record})
-    if recorded_result.times.size and recorded_result.record:
-        click.echo("\n" + _extremes_table(recorded_result, testbed.variables()))
+    rows = _extremes_rows(recorded_result, testbed.variables()) if recorded_result.times.size else []
+    if rows:
+        say("\n" + table(_RECORDED, [(row[0], row[1], *(_cell(value) for value in row[2:])) for row in rows]))
+    described = {"end": result.end, "message": result.message, "simulated": _simulated(result)}
+    described |= {"wall_time": result.wall_time, "recorded": [dict(zip(_RECORDED, row, strict=True)) for row in rows]}
+    emit(described)
     if save is not None:
         save_recording(save, recorded_result.times, recorded_result.record)
     if html is not None:
@@ -202,8 +229,12 @@ def rollout(
         testbed.snapshot(runner.context).save(snapshot)
 
 
+def _simulated(result: RolloutResult) -> float:
+    return float(result.times[-1]) if result.times.size else 0.0
+
+
 def _outcome(result: RolloutResult) -> str:
-    simulated = float(result.times[-1]) if result.times.size else 0.0
+    simulated = _simulated(result)
     reason = f" ({one_line(result.message)})" if result.message and not result.failed else ""
     return "\n".join(
         (
@@ -215,23 +246,32 @@ def _outcome(result: RolloutResult) -> str:
     )
 
 
-def _extremes_table(result: RolloutResult, variables: Variables) -> str:
-    """Return a table of the final, smallest and largest value of every recorded entry."""
-    rows: list[tuple[str, ...]] = []
+# The columns of the table of what was recorded.
+_RECORDED = ("recorded", "unit", "final", "min", "max")
+
+
+def _extremes_rows(result: RolloutResult, variables: Variables) -> list[tuple[Any, ...]]:
+    """Return name, unit, final, smallest and largest value of every recorded entry."""
+    import numpy as np
+
+    rows: list[tuple[Any, ...]] = []
     for address, values in result.record.items():
         unit = variables[address].unit if address in variables else ""
         if not isinstance(values, np.ndarray):
-            rows.append((address, unit, f"{len(values)} values", "", ""))
+            rows.append((address, unit, f"{len(values)} values", None, None))
         elif values[0].size > _MANY:
-            rows.append((address, unit, f"{values[0].size} entries", *map(number, _extremes(values))))
+            rows.append((address, unit, f"{values[0].size} entries", *_extremes(values)))
         else:
-            rows += [
-                (name, unit, *map(number, (column[-1], *_extremes(column))))
-                for name, column in entries(address, values)
-            ]
-    return table(("recorded", "unit", "final", "min", "max"), rows)
+            rows += [(name, unit, float(column[-1]), *_extremes(column)) for name, column in entries(address, values)]
+    return rows
+
+
+def _cell(value: Any) -> str:
+    return "" if value is None else value if isinstance(value, str) else number(value)
 
 
 def _extremes(values: np.ndarray) -> tuple[float, float]:
+    import numpy as np
+
     numbers = values[~np.isnan(values)]
     return (float(numbers.min()), float(numbers.max())) if numbers.size else (np.nan, np.nan)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import threading
 import webbrowser
+from typing import TYPE_CHECKING
 
 import click
 
 from vtbdrake.cli.options import Setting, option, scenario_argument, set_option, settings, start_option
-from vtbdrake.state import Snapshot
-from vtbdrake.testbed import Scenario
+from vtbdrake.cli.output import json_option, show
+
+if TYPE_CHECKING:
+    from vtbdrake.state import Snapshot
+    from vtbdrake.testbed import Scenario
 
 
 @click.command()
@@ -22,7 +25,7 @@ from vtbdrake.testbed import Scenario
 @option("--host NAME:PORT", "A name under which a proxy offers the page. May be repeated.", name="hosts", multiple=True)
 @option("--play", "Let time run at once.", is_flag=True)
 @option("--browser/--no-browser", "Open the page in a browser.", name="browser", default=True)
-@option("--json", "Print the address as a JSON object.", name="as_json", is_flag=True)
+@json_option
 def view(
     scenario: Scenario,
     values: tuple[Setting, ...],
@@ -31,7 +34,6 @@ def view(
     hosts: tuple[str, ...],
     play: bool,
     browser: bool,
-    as_json: bool,
 ) -> None:
     """Watch and steer a testbed in a web browser, until Ctrl-C.
 
@@ -47,7 +49,7 @@ def view(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     with open_view(scenario, start=start, values=settings(values), port=port, hosts=hosts) as running:
-        click.echo(json.dumps({"url": running.url}) if as_json else running.url)
+        show(running.url, {"url": running.url})
         if play:
             running.session.play()
         if browser:

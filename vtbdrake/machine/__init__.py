@@ -15,43 +15,6 @@ It contains the world and the LCM protocol of the scenario, and nothing of the c
 * **Injected faults** on request, by LCM or by a `MachineProcess`: see `injected_faults` and `MachineLoop`.
 """
 
-from vtbdrake.machine.injected_faults import (
-    ClockJump,
-    Corrupt,
-    Delay,
-    Drop,
-    Duplicate,
-    Freeze,
-    InjectedFault,
-    InjectedFaultError,
-    NoBrake,
-    Reorder,
-    fault_from_dict,
-)
-from vtbdrake.machine.loop import DIED, MachineLoop
-from vtbdrake.machine.machine import PERTURBED, Machine, MachineConfig, MachineStatus, perturbed_values
-from vtbdrake.machine.process import MachineError, MachineProcess, MachineStatistics
+from vtbdrake.lazy import lazy_names
 
-__all__ = [
-    "DIED",
-    "PERTURBED",
-    "ClockJump",
-    "Corrupt",
-    "Delay",
-    "Drop",
-    "Duplicate",
-    "Freeze",
-    "InjectedFault",
-    "InjectedFaultError",
-    "Machine",
-    "MachineConfig",
-    "MachineError",
-    "MachineLoop",
-    "MachineProcess",
-    "MachineStatistics",
-    "MachineStatus",
-    "NoBrake",
-    "Reorder",
-    "fault_from_dict",
-    "perturbed_values",
-]
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -18,9 +18,10 @@ import numpy as np
 from vtbdrake.child_process import ChildService, ProcessStartError, report_ready
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.statistics import Histogram, LoopStatistics
+from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.injected_faults import InjectedFault
 from vtbdrake.machine.loop import MachineLoop, epoch, serve
-from vtbdrake.machine.machine import Machine, MachineConfig, MachineStatus
+from vtbdrake.machine.machine import Machine, MachineStatus
 from vtbdrake.testbed import Scenario
 
 

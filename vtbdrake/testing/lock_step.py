@@ -14,7 +14,8 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
-from vtbdrake.machine.machine import Machine, MachineConfig
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.machine import Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
 
 _REORDER_WINDOW = 0.1  # s, see `LcmBridge`

@@ -11,7 +11,8 @@ import pytest
 
 from tests.monitoring.residuals.line import Together
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.machine.machine import Machine, MachineConfig
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.machine import Machine
 from vtbdrake.monitoring.residuals import ResidualMonitor
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.motions import Motion

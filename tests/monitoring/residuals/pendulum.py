@@ -16,7 +16,8 @@ from tests.testbeds import PENDULUM
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.machine.machine import Machine, MachineConfig
+from vtbdrake.machine.config import MachineConfig
+from vtbdrake.machine.machine import Machine
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 

@@ -1,0 +1,95 @@
+"""Completion in a shell: bash asks the program itself, which answers without Drake."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.program import ROOT, error_of, run
+
+pytestmark = pytest.mark.one_python
+
+ROBOTS = "from vtbdrake import Scenario\n\nclass RobotScenario(Scenario):\n    pass\n\nclass Other:\n    pass\n"
+
+
+def completed(line: str, folder: Path) -> list[str]:
+    """Return what bash offers at the end of a line."""
+    program = folder / "bin" / "vtbdrake"
+    program.parent.mkdir(exist_ok=True)
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m vtbdrake.cli "$@"\n')
+    program.chmod(0o755)
+    script = (
+        f"compopt() {{ :; }}; source <(vtbdrake completion bash); COMP_LINE={line!r}; COMP_POINT=${{#COMP_LINE}}; "
+        "_vtbdrake_completion vtbdrake; printf '%s\\n' \"${COMPREPLY[@]}\""
+    )
+    path = f"{program.parent}:{os.environ['PATH']}"
+    result = subprocess.run(
+        ["bash", "-c", script],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stderr == ""
+    return result.stdout.split()
+
+
+def test_commands_options_and_choices(tmp_path: Path) -> None:
+    assert completed("vtbdrake ro", tmp_path) == ["rollout"]
+    assert completed("vtbdrake study ed", tmp_path) == ["edit"]
+    assert completed("vtbdrake rollout x:Y --hor", tmp_path) == ["--horizon"]
+    assert completed("vtbdrake diagram x:Y --mode tw", tmp_path) == ["twin"]
+
+
+def test_scenarios_of_the_folder_and_of_the_testbeds(tmp_path: Path) -> None:
+    (tmp_path / "robots.py").write_text(ROBOTS)
+    # Bash takes a colon for the end of a word.
+    assert completed("vtbdrake rollout robots:", tmp_path) == ["RobotScenario"]
+    assert completed("vtbdrake rollout rob", tmp_path) == ["robots:RobotScenario"]
+    assert completed("vtbdrake view vtbdrake_diagrams.cart_pole:", tmp_path) == ["CartPoleScenario"]
+    (tmp_path / "heavy.yaml").write_text("")
+    assert completed("vtbdrake rollout robots:RobotScenario@h", tmp_path) == ["heavy.yaml"]
+
+
+def test_no_command_needs_drake_to_be_completed() -> None:
+    program = (
+        "import click, sys\n"
+        "from vtbdrake.cli import main\n"
+        "def walk(group):\n"
+        "    context = click.Context(group)\n"
+        "    for name in group.list_commands(context):\n"
+        "        command = group.get_command(context, name)\n"
+        "        assert not {'pydrake', 'numpy'} & set(sys.modules), name\n"
+        "        if isinstance(command, click.Group): walk(command)\n"
+        "walk(main)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
+
+
+@pytest.mark.parametrize(("shell", "last"), [("zsh", "1"), ("fish", "roll")])
+def test_scripts_of_other_shells_ask_the_program(shell: str, last: str) -> None:
+    script = run("completion", shell).stdout
+    assert f"_VTBDRAKE_COMPLETE={shell}_complete" in script
+    asked = subprocess.run(
+        [sys.executable, "-c", "from vtbdrake.cli import main; main(prog_name='vtbdrake')"],
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "_VTBDRAKE_COMPLETE": f"{shell}_complete",
+            "COMP_WORDS": "vtbdrake roll",
+            "COMP_CWORD": last,
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "rollout" in asked.stdout
+
+
+def test_other_shells_are_refused() -> None:
+    assert "'bash', 'zsh', 'fish'" in error_of("completion", "tcsh")
