@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from math import inf
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, System
 from threadpoolctl import ThreadpoolController
 
@@ -32,17 +33,22 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import chord, compose, inverse, rotation
 from vtbdrake.components.localization.unit import (
     LOST,
+    TRACKING,
     UNIT_STATE_CODEC,
     Localization,
     LocalizationUnit,
     UnitState,
 )
+from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.scan import Scan
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed.slow_part import SlowPart
 
 # The time in s for which dead reckoning alone gives a valid pose; assumed.
 _PATIENCE = 10.0
+
+# Rows of x, y and heading in the covariance of a `PoseEstimate`.
+_PLANAR = [3, 4, 2]
 
 SETTLED = 0.5
 """The time in s before which nothing is detected: the vertical, which levels scans and images, must be known first."""
@@ -200,6 +206,16 @@ class PresentPose(AddressedSystem):
         )
         self.DeclareStateOutputPort("pose_estimate", self._estimate.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def pose_estimate(self, context: Context) -> PoseEstimate:
+        """Return the pose on the map with its covariance; height, roll and pitch are unknown."""
+        estimate = self._estimate.view(context)
+        if estimate.status != TRACKING:
+            return PoseEstimate.missing(time=estimate.time)
+        covariance = np.diag(np.full(6, inf))
+        covariance[np.ix_(_PLANAR, _PLANAR)] = estimate.covariance
+        X_WH = RigidTransform(RollPitchYaw(0.0, 0.0, estimate.heading), [*estimate.position, 0.0])
+        return PoseEstimate.of(X_WH, covariance, time=estimate.time)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         motion, pose, covariance, status, X_OH, time = (port.Eval(context) for port in self._ports.values())

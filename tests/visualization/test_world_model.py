@@ -70,7 +70,7 @@ def test_ellipsoid_holds_one_standard_deviation() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     one = WorldObject("a", "rock", PoseEstimate.of(RigidTransform([1.0, 2.0, 3.0]), root @ root.T, time=0.0))
-    X_WE, semi_axes = covariance_ellipsoid(one)
+    X_WE, semi_axes = covariance_ellipsoid(one.pose)
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     offsets = (semi_axes * directions) @ X_WE.rotation().matrix().T
@@ -81,7 +81,7 @@ def test_ellipsoid_holds_one_standard_deviation() -> None:
 
 def test_ellipsoid_is_flat_where_nothing_is_known(meshcat: Meshcat) -> None:
     one = WorldObject("a", "tree", position_estimate([0, 0, 0], deviation=[0.3, 0.3, np.inf]))
-    X_WE, semi_axes = covariance_ellipsoid(one)
+    X_WE, semi_axes = covariance_ellipsoid(one.pose)
     assert sorted(semi_axes) == pytest.approx([0.0, 0.3, 0.3])
     show_world_model(meshcat, WorldModel([one]))
     matrix = np.array(drawn(meshcat)["tree/a/covariance"]["object"]["matrix"]).reshape(4, 4).T

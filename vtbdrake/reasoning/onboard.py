@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
@@ -23,6 +24,7 @@ from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.slow_part import SlowFunction
 
 if TYPE_CHECKING:
+    from vtbdrake.reasoning.decision import Decision
     from vtbdrake.reasoning.space import Element
     from vtbdrake.rollout import Quality
 
@@ -152,6 +154,16 @@ class OnboardReasoner(SlowPart):
         groups = {name: self.declare_parameters(**{name: quantity}) for name, quantity in parameters.items()}
         self._candidate, self._candidate_at = groups[_CANDIDATE], groups[_CANDIDATE_AT]
 
+    def remember(self, count: int) -> None:
+        """Keep the last ``count`` decisions that this part makes in simulations, for `decision_shown`."""
+        self._decider.remember(count)
+
+    def decision_shown(self, context: Context) -> tuple[Reasoner, Decision] | None:
+        """Return the decision that the ports of ``context`` show, with its reasoner; None if it is not remembered."""
+        sampled_at, quality = (self.GetOutputPort(name).Eval(context).item() for name in ("sampled_at", _QUALITY))
+        matches = [d for d in self._decider.remembered if (d[1].time, d[1].quality) == (sampled_at, quality)]
+        return matches[-1] if matches else None
+
     def function_beside(self, period: float) -> SlowFunction:
         return replace(self.function, function=self._decider.limited(_SHARE * (self.latency - period)))
 
@@ -191,6 +203,7 @@ class _Decider:
         self._budget: Budget = replace(self._arguments["budget"], seconds=None)
         self._reasoner: Reasoner | None = None
         self._last_reason = ""
+        self.remembered: deque[tuple[Reasoner, Decision]] = deque(maxlen=0)
         self._taking_turns = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -199,6 +212,10 @@ class _Decider:
     def limited(self, seconds: float) -> _Decider:
         """Return a copy whose decisions beside a loop take at most ``seconds``."""
         return _Decider(self._arguments, seconds)
+
+    def remember(self, count: int) -> None:
+        """Keep the last ``count`` decisions."""
+        self.remembered = deque(self.remembered, maxlen=count)
 
     def prepare(self) -> None:
         """Make the reasoner of a process beside a loop, and let its workers build their testbeds."""
@@ -232,6 +249,7 @@ class _Decider:
             self._last_reason = reason
             if reason:
                 return None
+            self.remembered.append((self._reasoner, decision))
             # The decision may set only some entries of the candidate.
             decision.apply(self._testbed, self._context)
             return {

@@ -348,10 +348,18 @@ class VirtualTestbed(AddressedDiagram):
     def start_from_belief(self, context: Context) -> None:
         """Set the simulated world to what the DPS in ``context`` believes: s_sim(t0) from s_dps(t).
 
+        Raises:
+            ValueError: The testbed declares no belief, or a variable refuses its believed value.
+        """
+        self.write(context, self.belief(context))
+
+    def belief(self, context: Context) -> dict[str, ArrayLike]:
+        """Return what the DPS in ``context`` believes of the simulated world: values of its variables, by address.
+
         An estimate beyond the bounds of its target (a joint a little past its stop) is clipped.
 
         Raises:
-            ValueError: The testbed declares no belief, or a variable refuses its believed value.
+            ValueError: The testbed declares no belief, or there is none at present.
         """
         self.check_context(context)
         if not self.belief_rules:
@@ -359,10 +367,7 @@ class VirtualTestbed(AddressedDiagram):
                 "this testbed does not declare which estimates of its DPS set its simulated world: see "
                 "VirtualTestbedBuilder.believe"
             )
-        self.write(
-            context,
-            {
-                rule.target: np.clip(rule.value(self._variables, context), *self._variables[rule.target].bounds)
-                for rule in self.belief_rules
-            },
-        )
+        return {
+            rule.target: np.clip(rule.value(self._variables, context), *self._variables[rule.target].bounds)
+            for rule in self.belief_rules
+        }

@@ -40,7 +40,7 @@ def plot_decision(decision: Decision) -> Figure:
         raise ValueError("no rollout of the decision has a quality that could be drawn")
     figure = Picture(10.5, 4.2)
     left, right = figure.subplots(1, 2)
-    colors = _colors(decision)
+    colors = decision_colors(decision)
     for candidate in sorted(drawn, key=lambda c: _rank(decision, c)):
         width = 2.4 if candidate.number in (0, decision.chosen) else 1.0
         draw_trajectory(left, candidate.rollouts[0], color=colors[candidate.number], width=width)
@@ -92,7 +92,7 @@ def show_decision(
         raise ValueError(f"one candidate is shown at least, not {most}")
     ranked = [candidate for candidate in decision.ranked if candidate.rollouts]
     shown = ranked[:most] if decision.candidates[0] in ranked[:most] else [*ranked[: most - 1], decision.candidates[0]]
-    colors = _colors(decision)
+    colors = decision_colors(decision)
     labels = {c.number: f"{c.number}{' (plan in use)' if c.number == 0 else ''}" for c in shown}
     motions = {labels[c.number]: reasoner.motion(decision, c.number) for c in shown}
     tints = {labels[c.number]: colors[c.number] for c in shown}
@@ -102,7 +102,7 @@ def show_decision(
     return show_motions(meshcat, motions, prefix=prefix, colors=tints, opacity=opacity)
 
 
-def _colors(decision: Decision) -> dict[int, str]:
+def decision_colors(decision: Decision) -> dict[int, str]:
     """Return the colour of each candidate by its number."""
     qualities = [c.quality for c in decision.candidates if np.isfinite(c.quality)]
     norm = Normalize(min(qualities, default=0.0), max(qualities, default=1.0))

@@ -20,6 +20,7 @@ from vtbdrake.visualization.still import Still
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
+    from numpy.typing import NDArray
 
 # Of the primaries of sRGB, to the eye.
 _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
@@ -109,6 +110,11 @@ class Drawing:
 
     def _query(self, context: Context) -> QueryObject:
         return self._scene_graph.get_query_output_port().Eval(self._scene_graph.GetMyContextFromRoot(context))
+
+    def positions(self, context: Context) -> NDArray[np.float64]:
+        """Return the origins of the moving frames in the world in m, shape (n, 3)."""
+        query = self._query(context)
+        return np.array([query.GetPoseInWorld(frame).translation() for frame, _ in self._frames]).reshape(-1, 3)
 
     def corners(self, context: Context) -> NDArray[np.float64]:
         """Return the corners of the boxes around what moves, in the world frame, shape (3, n)."""

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pydrake.geometry import Ellipsoid, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
+from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.geometry import PartsOf
 from vtbdrake.components.world_model.model import WorldModel
-from vtbdrake.components.world_model.objects import RETIRED, TENTATIVE, WorldObject
+from vtbdrake.components.world_model.objects import RETIRED, TENTATIVE
 from vtbdrake.visualization.meshcat import Scene
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def show_world_model(
             meshcat.SetObject(f"{path}/marker", Sphere(marker), Rgba(red, green, blue, opacity))
             meshcat.SetTransform(f"{path}/marker", object_.X_WO)
         if deviations:
-            X_WE, semi_axes = covariance_ellipsoid(object_)
+            X_WE, semi_axes = covariance_ellipsoid(object_.pose)
             shape = Ellipsoid(*np.maximum(deviations * semi_axes, _FLAT))
             meshcat.SetObject(f"{path}/covariance", shape, Rgba(red, green, blue, _ELLIPSOID_OPACITY))
             meshcat.SetTransform(f"{path}/covariance", X_WE)
@@ -92,15 +93,15 @@ def show_world_model(
     return Scene(meshcat, legend={kind: color_of_kind.get(kind, _OTHERS) for kind in kinds})
 
 
-def covariance_ellipsoid(object_: WorldObject) -> tuple[RigidTransform, NDArray[np.float64]]:
+def covariance_ellipsoid(estimate: PoseEstimate) -> tuple[RigidTransform, NDArray[np.float64]]:
     """Return the pose in W of the ellipsoid of one standard deviation of the position, and its semi-axes (3,) in m.
 
     The semi-axis along a coordinate that is not known is 0.
     """
-    covariance = object_.pose.covariance[3:, 3:]
+    covariance = estimate.covariance[3:, 3:]
     variances, axes = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
     axes[:, 0] *= np.linalg.det(axes)
-    return RigidTransform(RotationMatrix(axes), object_.p_WoOo_W), np.sqrt(np.maximum(variances, 0.0))
+    return RigidTransform(RotationMatrix(axes), estimate.matrix[:, 3]), np.sqrt(np.maximum(variances, 0.0))
 
 
 def text_strokes(text: str, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

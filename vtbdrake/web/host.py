@@ -45,6 +45,7 @@ class Host:
         meshcat_url: The address of the Meshcat that the page shows.
         script: The module in the folder ``page`` that Meshcat's page loads.
         serve: Serves the socket of one page, from its acceptance on.
+        routes: What else is served.
         port: The port; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer it.
 
@@ -61,6 +62,7 @@ class Host:
         *,
         script: str,
         serve: Callable[[WebSocket], Awaitable[None]],
+        routes: Collection[Route] = (),
         port: int = 0,
         hosts: Collection[str] = (),
     ) -> None:
@@ -73,6 +75,7 @@ class Host:
             routes=[
                 WebSocketRoute("/session", self._serve_socket),
                 WebSocketRoute("/", self._relay_meshcat),
+                *routes,
                 Mount("/page", StaticFiles(directory=_PAGE)),
                 Route("/", self._index),
                 Route("/{path:path}", self._asset),

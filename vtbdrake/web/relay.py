@@ -8,34 +8,39 @@ from collections.abc import Awaitable, Callable
 
 import msgpack  # type: ignore[import-untyped]
 
-_TRANSFORM = "set_transform"
+_TRANSFORM, _OBJECT = "set_transform", "set_object"
+_HEAD = 1024  # bytes in which type and path of a message stand: objects may be large, and are not unpacked
 
 
 class Newest:
-    """A queue of Meshcat's messages, in which a transform replaces an older one of the same path that still waits.
+    """A queue of Meshcat's messages, in which a pose or an object replaces an older one of its path that still waits.
 
-    A transform never overtakes another message: what comes after it may delete its object.
+    A transform never overtakes another message: what comes after it may delete its object. An object, such as the
+    points of a scan, overtakes transforms and objects alone.
     """
 
     def __init__(self) -> None:
         self._messages: deque[list[bytes]] = deque()
-        self._transforms: dict[str, list[bytes]] = {}
+        # Those that wait and may be replaced, by path.
+        self._waiting: dict[str, dict[str, list[bytes]]] = {_TRANSFORM: {}, _OBJECT: {}}
         self._arrived = asyncio.Event()
-        self.replaced = 0  # number of transforms that were never sent
+        self.replaced = 0  # number of messages that were never sent
 
     def put(self, data: bytes) -> None:
         """Add a message."""
-        path = _path_of_transform(data)
-        if path is not None and (waiting := self._transforms.get(path)) is not None:
+        kind, path = _kind_and_path(data)
+        if (waiting := self._waiting.get(kind, {}).get(path)) is not None:
             waiting[0] = data
             self.replaced += 1
             return
         entry = [data]
         self._messages.append(entry)
-        if path is None:
-            self._transforms.clear()
+        if kind != _TRANSFORM:
+            self._waiting[_TRANSFORM].clear()
+        if kind not in self._waiting:
+            self._waiting[_OBJECT].clear()
         else:
-            self._transforms[path] = entry
+            self._waiting[kind][path] = entry
         self._arrived.set()
 
     async def get(self) -> bytes:
@@ -51,9 +56,9 @@ class Newest:
     def get_nowait(self) -> bytes:
         """Return the next message; there must be one."""
         entry = self._messages.popleft()
-        path = _path_of_transform(entry[0])
-        if path is not None and self._transforms.get(path) is entry:
-            del self._transforms[path]
+        kind, path = _kind_and_path(entry[0])
+        if self._waiting.get(kind, {}).get(path) is entry:
+            del self._waiting[kind][path]
         return entry[0]
 
 
@@ -84,9 +89,16 @@ async def relay(receive: Callable[[], Awaitable[bytes | str]], send: Callable[[b
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _path_of_transform(data: bytes) -> str | None:
-    """Return the path of a message that sets a transform, or None of another message."""
-    if _TRANSFORM.encode() not in data[:64]:  # Objects may be large: they are not unpacked.
-        return None
-    message = msgpack.unpackb(data)
-    return str(message["path"]) if message.get("type") == _TRANSFORM else None
+def _kind_and_path(data: bytes) -> tuple[str, str]:
+    """Return the type and the path of a message, in which they come first; empty if they do not."""
+    unpacker = msgpack.Unpacker(strict_map_key=False)
+    unpacker.feed(data[:_HEAD])
+    try:
+        unpacker.read_map_header()
+        names, values = [], []
+        for _ in range(2):
+            names.append(unpacker.unpack())
+            values.append(unpacker.unpack())
+    except (ValueError, msgpack.OutOfData, msgpack.UnpackException):
+        return "", ""
+    return (str(values[0]), str(values[1])) if names == ["type", "path"] else ("", "")

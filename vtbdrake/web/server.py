@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import io
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
+from PIL import Image
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
 from starlette.websockets import WebSocket
 
+from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.web.host import Host, answer_commands, first_of, send
+from vtbdrake.web.layers import LayerError
 from vtbdrake.web.session import Session, SessionError
 
 _FRAME_PERIOD = 0.05  # s of wall time between two frames for a page
 _PATIENCE = 1.0  # s, for a frame
+_JPEG_QUALITY = 80
+_ANYBODY = ("watch", "layers", "landmarks")  # commands of pages that do not steer
 
 
 class Server:
@@ -37,7 +46,14 @@ class Server:
         self._session = session
         self._steering: Page | None = None
         self._pages: list[Page] = []
-        self._host = Host(session.meshcat_url, script="view.js", serve=self._serve_page, port=port, hosts=hosts)
+        self._host = Host(
+            session.meshcat_url,
+            script="view.js",
+            serve=self._serve_page,
+            routes=[Route("/camera/{name}", self._camera_image)],
+            port=port,
+            hosts=hosts,
+        )
         self.url = self._host.url
 
     def close(self) -> None:
@@ -58,6 +74,22 @@ class Server:
                     self._steering = next(iter(self._pages), None)
                     await run_in_threadpool(self._session.deflect, {})  # Its keys are released.
                 await run_in_threadpool(self._session.watch, page, ())
+                await run_in_threadpool(self._session.show, page, ())
+
+    async def _camera_image(self, request: Request) -> Response:
+        """Return the present image of a camera as a JPEG."""
+        try:
+            data = await run_in_threadpool(self._encoded_image, request.path_params["name"])
+        except LayerError as error:
+            return PlainTextResponse(one_line(error), status_code=404)
+        except FAILURES as error:
+            return PlainTextResponse(one_line(error), status_code=503)
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+    def _encoded_image(self, camera: str) -> bytes:
+        data = io.BytesIO()
+        Image.fromarray(self._session.camera_image(camera)).save(data, "JPEG", quality=_JPEG_QUALITY)
+        return data.getvalue()
 
     def steers(self, page: Page) -> bool:
         """Return whether a page may change anything: one at a time."""
@@ -95,6 +127,8 @@ class Page:
             "drive": self._drive,
             "deflect": lambda message: session.deflect(message["deflections"]),
             "end_drive": self._end_drive,
+            "layers": lambda message: session.show(self, message["layers"]),
+            "landmarks": lambda message: session.landmarks(message["near"], int(message["count"])),
         }
 
     async def serve(self, server: Server) -> None:
@@ -107,6 +141,8 @@ class Page:
             "bodies": list(self._session.bodies),
             "quality": "" if problem is None else problem.objectives[0].name,
             "handles": [handle.description() for handle in self._session.handles.values()],
+            "layers": dict(self._session.layers),
+            "cameras": list(self._session.cameras),
         }
         await send(self._browser, hello)
         await first_of(
@@ -131,7 +167,7 @@ class Page:
             return await server.take_over(self)
         if name not in self._commands:
             raise SessionError(f"there is no command {name!r}; there are: {', '.join(self._commands)}")
-        if name != "watch" and not server.steers(self):
+        if name not in _ANYBODY and not server.steers(self):
             raise SessionError("another page steers this session: take over first")
         return await run_in_threadpool(self._commands[name], message)
 

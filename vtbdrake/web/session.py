@@ -26,8 +26,10 @@ from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
 from vtbdrake.web.drive import Driven, Driver, Handle, handles
 from vtbdrake.web.fork import CommandLimits, Differences, Fork
+from vtbdrake.web.layers import Layers
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
     from pydrake.geometry import Meshcat
     from pydrake.systems.framework import Context
 
@@ -90,6 +92,7 @@ class Frame:
         preview: What the preview has found: ``time``, ``end``, ``refused``; None if there is none.
         comparison: Time and first differences of the course without the last intervention; None if there is none.
         drive: What is driven by hand, see `Driver.status`; None while nothing is.
+        layers: What there is to say about each layer that is shown.
     """
 
     number: int
@@ -105,6 +108,7 @@ class Frame:
     preview: Mapping[str, Any] | None
     comparison: Mapping[str, Any] | None
     drive: Mapping[str, Any] | None = None
+    layers: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -182,6 +186,8 @@ class Session:
         variables: What can be watched and set: by address, ``kind``, ``shape``, ``unit``, ``bounds``, ``settable``.
         handles: What can be driven by hand, by address.
         bodies: Paths in Meshcat of what moves.
+        layers: The layers that can be shown: name -> title.
+        cameras: The cameras whose images can be shown.
         meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
 
     Raises:
@@ -206,10 +212,13 @@ class Session:
         self.variables: Mapping[str, Mapping[str, Any]] = {}
         self.handles: Mapping[str, Handle] = {}
         self.bodies: tuple[str, ...] = ()
+        self.layers: Mapping[str, str] = {}
+        self.cameras: tuple[str, ...] = ()
         self.meshcat_url = ""
         self._start, self._values = start, dict(values or {})
         self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
         self._watched: dict[object, tuple[str, ...]] = {}
+        self._shown: dict[object, tuple[str, ...]] = {}
         self._frame_ready = threading.Condition()
         self._closed = False
         ready: Future[None] = Future()
@@ -332,6 +341,29 @@ class Session:
         """
         self._do(lambda: self._watch(watcher, tuple(addresses)))
 
+    def show(self, viewer: object, layers: Collection[str]) -> None:
+        """Show layers to one of several viewers; an empty list ends it. A layer that nobody looks at costs nothing.
+
+        Raises:
+            LayerError: The testbed has no such layer.
+        """
+        self._do(lambda: self._show_layers(viewer, tuple(layers)))
+
+    def camera_image(self, camera: str) -> NDArray[np.uint8]:
+        """Return the present image of a camera, (height, width, 3).
+
+        Raises:
+            LayerError: The testbed has no such camera.
+        """
+        return self._do(lambda: self._layers.image(camera, self._context))
+
+    def landmarks(self, near: ArrayLike, count: int = 40) -> list[tuple[str, list[float]]]:
+        """Return identity and position in m of the objects of the shown world models, the nearest to a point."""
+        point = np.asarray(near, dtype=float)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise SessionError(f"landmarks are near a point (3,) in m, not {near!r}")
+        return self._do(lambda: self._layers.landmarks(point, count))
+
     def snapshot(self) -> Snapshot:
         """Return s(t) of the present."""
         return self._do(lambda: self._testbed.snapshot(self._context))
@@ -387,10 +419,15 @@ class Session:
         self.meshcat_url = self._meshcat.web_url()
         self._begin()
         self._drawing = None
+        size = 0.0
         if self._testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
             self._drawing.fit_camera(self._context)
             self.bodies = self._drawing.places
+            corners = self._drawing.corners(self._context)
+            size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
+        self._layers = Layers(self._meshcat, self._testbed, size)
+        self.layers, self.cameras = self._layers.titles, self._layers.cameras
         self.variables = {
             variable.address: {
                 "kind": variable.kind,
@@ -418,7 +455,7 @@ class Session:
 
     def _drop(self) -> None:
         """Give up the Meshcat, which must end in the thread that made it, and all that refers to it."""
-        for name in ("_preview", "_comparison", "_driver", "_drawing", "_simulator", "_context", "_meshcat"):
+        for name in ("_preview", "_comparison", "_driver", "_drawing", "_layers", "_simulator", "_context", "_meshcat"):
             self.__dict__.pop(name, None)
         gc.collect()
 
@@ -566,6 +603,7 @@ class Session:
             failure=self._failure,
             preview=None if self._preview is None else self._preview.status(),
             comparison=None if self._comparison is None else self._comparison.status(),
+            layers=self._layers.notes,
             drive=None if self._driver is None else self._driver.status(),
         )
         with self._frame_ready:
@@ -575,6 +613,7 @@ class Session:
     def _draw(self) -> None:
         if self._drawing is not None:
             self._drawing.pose(self._context)
+            self._layers.draw(self._context)
         for part in (self._preview, self._comparison):
             if part is not None and part.ghost is not None and not part.fork.failure:
                 try:
@@ -703,6 +742,14 @@ class Session:
         if self._comparison is not None and self._comparison.ghost is not None:
             self._comparison.ghost.delete()
         self._comparison = None
+
+    def _show_layers(self, viewer: object, layers: tuple[str, ...]) -> None:
+        elsewhere = [name for other, names in self._shown.items() if other is not viewer for name in names]
+        self._layers.show(dict.fromkeys((*elsewhere, *layers)))
+        self._shown.pop(viewer, None)
+        if layers:
+            self._shown[viewer] = layers
+        self._next_frame = 0.0
 
     def _watch(self, watcher: object, addresses: tuple[str, ...]) -> None:
         readers = {address: self._testbed.reader(address) for address in addresses}

@@ -171,6 +171,20 @@ def test_turning_scanner_sweeps_along_a_wall() -> None:
     np.testing.assert_allclose(scan.ranges, 4.0 / (flat * np.cos(heading)), atol=EXACT)
 
 
+def test_points_in_the_world_are_where_the_moving_scanner_has_hit() -> None:
+    motion = SpatialVelocity([0.1, -0.2, 0.4], [0.5, 0.3, -0.1])
+    pose = np.array([0.5, 0.1, 0.2, 0.3, -0.2, 0.1])
+    scanned = world(wall())
+    simulator = scanned.simulator(X_WT=at(4.5), V_WB=motion, pose=pose)
+    simulator.AdvanceTo(0.33)
+    context = scanned.scanner.GetMyContextFromRoot(simulator.get_context())
+    points = scanned.scanner.points_W(context)
+    assert len(points) == 988
+    # The scanner is beside the centre of its turning body, whose path is not straight.
+    np.testing.assert_allclose(points[:, 0], 4.0, atol=5e-3)
+    assert np.abs(scanned.scan(simulator.get_context()).points()[:, 0] - 4.0).max() > 0.3
+
+
 def test_pose_turns_the_scanner_on_its_body() -> None:
     pose = np.array([0.5, 0.1, 0.2, 0.3, -0.2, 0.1])
     scan = world(wall()).scans(0.2, X_WT=at(4.5), pose=pose)[-1]

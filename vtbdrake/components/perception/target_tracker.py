@@ -320,6 +320,13 @@ class TargetTracker(AddressedSystem):
         self.DeclareStateOutputPort("status", self._status.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
+    def pose_estimate(self, context: Context) -> PoseEstimate:
+        """Return the pose X_IT with its covariance, at the time of the last estimate that was fused."""
+        if not self._counts.view(context).fused:
+            return PoseEstimate.missing()
+        track = Track.of(self._track.array(context))
+        return PoseEstimate.of(track.X, track.P[:6, :6], time=track.time)
+
     def _update(self, context: Context, state: DiscreteValues) -> None:
         settings, counts = self._settings.view(context), self._counts.mutable(state)
         model = MotionModel(

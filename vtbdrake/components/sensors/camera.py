@@ -284,6 +284,15 @@ class Camera(AddressedSystem):
         """Return the time between two images (s)."""
         return self._period
 
+    def X_WC(self, context: Context) -> RigidTransform:
+        """Return the pose of the camera frame C in the world."""
+        X_PC = pose_from_array(self._settings.view(context).pose)
+        return _pose_of(self._query_port.Eval(context), self._frame_number) @ X_PC
+
+    def info(self, context: Context) -> CameraInfo:
+        """Return the size of the image, and the intrinsics."""
+        return CameraInfo(self._width, self._height, *self._settings.view(context).intrinsics)
+
     def render(self, context: Context) -> ImageRgba8U:
         """Return what the camera sees at present, without noise; nothing in the context changes.
 
@@ -323,11 +332,10 @@ class Camera(AddressedSystem):
         query = self._query_port.Eval(context)
         scene: RenderedScene = self._scene(context)
         view = scene.view(query, illumination)
-        X_WC = _pose_of(query, self._frame_number) @ pose_from_array(settings.pose)
+        X_WC = self.X_WC(context)
         self._check_outside(view, X_WC.translation())
-        info = CameraInfo(self._width, self._height, *settings.intrinsics)
         camera = RenderedView(
-            scene, view, info, (self._clipping_near, self._clipping_far), X_WC, points=self._supersampling
+            scene, view, self.info(context), (self._clipping_near, self._clipping_far), X_WC, points=self._supersampling
         )
         # Where nothing changes a pixel that is saturated, there is no need to know how bright it is.
         unsaturated = illumination.shadows or haze.extinction or settings.noise or settings.photon_noise

@@ -22,6 +22,7 @@ from pydrake.systems.framework import (
 
 from vtbdrake.arrays import Array, immutable
 from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
+from vtbdrake.components.perception.estimate import rotation_matrix
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
 from vtbdrake.scan import Scan
@@ -253,6 +254,24 @@ class LaserScanner(AddressedSystem):
         """Return the length of a slice (s)."""
         return self._slice_period
 
+    def points_W(self, context: Context) -> Array:
+        """Return the points of the last scan in the world, each where its ray was fired, in m, shape (n, 3).
+
+        The scanner is assumed to have moved with its present velocity since the scan began.
+        """
+        scan: Scan = context.get_abstract_state(int(self._scan)).get_value()
+        X_WL, V_WL = self._motion(context)
+        ages = scan.stamp + scan.times - context.get_time()
+        turns = rotation_matrix(np.outer(ages, V_WL.rotational()))
+        points = np.einsum("nij,nj->ni", turns, scan.points() @ X_WL.rotation().matrix().T)
+        return points + X_WL.translation() + np.outer(ages, V_WL.translational())
+
+    def _motion(self, context: Context) -> tuple[RigidTransform, SpatialVelocity]:
+        """Return X_WL and V_WL."""
+        X_WB, V_WB = (port.Eval(context)[self._body] for port in (self._poses_port, self._velocities_port))
+        X_BL = self._settings(context).X_BL
+        return X_WB @ X_BL, V_WB.Shift(X_WB.rotation() @ X_BL.translation())
+
     def resume(self, context: Context, scan: Scan) -> None:
         """Set the last complete scan to ``scan``, and begin a new one."""
         context.SetAbstractState(self._scan, scan)
@@ -336,8 +355,7 @@ class LaserScanner(AddressedSystem):
             beams = directions + config.divergence / 4.0 * generator.standard_normal(directions.shape)
             beams /= np.sqrt(np.einsum("ij,ij->i", beams, beams))[:, np.newaxis]
         X_WB, V_WB = self._poses_port.Eval(context), self._velocities_port.Eval(context)
-        X_WL = X_WB[self._body] @ settings.X_BL
-        V_WL = V_WB[self._body].Shift(X_WB[self._body].rotation() @ settings.X_BL.translation())
+        X_WL, V_WL = self._motion(context)
         # Beyond it, not even perpendicular surfaces are detected.
         reach = config.max_range * sqrt(config.reflectivity)
         hits = self._caster.cast(beams, times, X_WL=X_WL, V_WL=V_WL, X_WB=X_WB, V_WB=V_WB, reach=reach)

@@ -1,0 +1,115 @@
+"""Tests of the layers in a real browser: what is in the picture while they are shown, and not otherwise."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from tests.chromium import PATIENCE, needs_chromium
+from tests.web.test_page import drawn, picture, settle, share
+from tests.web.test_session import ANGLE
+from vtbdrake.testbed import Scenario
+from vtbdrake.web import View, view
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.satellite import SatelliteScenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+
+ORANGE, RED = np.array([214, 94, 0]), np.array([214, 0, 0])
+
+pytestmark = [pytest.mark.slow, needs_chromium]
+
+
+@contextmanager
+def shown(browser: Browser, scenario: Scenario) -> Iterator[tuple[Page, View]]:
+    """The page of a scenario."""
+    with view(scenario) as running:
+        page = browser.new_page(viewport={"width": 1000, "height": 650})
+        page.set_default_timeout(PATIENCE)
+        failures: list[str] = []
+        page.on("pageerror", lambda error: failures.append(str(error)))
+        page.goto(running.url)
+        page.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+        yield page, running
+        page.close()
+        assert not failures
+
+
+def toggle(page: Page, layer: str) -> None:
+    page.click(f"[id='vtb-layer-{layer}']")
+    settle(page)
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    return np.abs(after - before).max(axis=2) > 20
+
+
+def test_contact_forces_and_names_come_and_go(browser: Browser) -> None:
+    with shown(browser, SpaceClimberScenario()) as (page, running):
+        running.session.advance(40)
+        settle(page)
+        without = picture(page)
+        toggle(page, "forces")
+        with_forces = picture(page)
+        new = changed(without, with_forces)
+        assert new.mean() > 0.0005
+        assert share(with_forces[new][np.newaxis], ORANGE) > 0.5
+        assert "45.4 N reach" in page.inner_text("#vtb-layers")  # 28 kg on the Moon
+        toggle(page, "forces")
+        toggle(page, "names")
+        box = page.locator("#vtb-names span:text-is('payload')").bounding_box()
+        assert box is not None and box["x"] > 340.0
+        toggle(page, "names")
+        assert page.locator("#vtb-names span").count() == 0
+        assert changed(without, picture(page)).mean() < 1e-4
+
+
+def test_perceived_ghost_and_candidates_come_and_go(browser: Browser) -> None:
+    with shown(browser, CartPoleScenario(onboard=True, rollouts=4)) as (page, running):
+        running.session.advance(30)
+        running.session.write({ANGLE: 1.0})  # The DPS has not perceived it yet.
+        settle(page)
+        without = picture(page)
+        toggle(page, "perceived")
+        new = changed(without, picture(page))
+        assert new.mean() > 0.01
+        red, green, blue = picture(page)[new].mean(axis=0)
+        assert red > green + 5.0 and blue > green + 5.0  # purple
+        toggle(page, "perceived")
+        assert changed(without, picture(page)).mean() < 1e-4
+        toggle(page, "decisions")
+        running.session.advance(20)
+        drawn(page, "document.querySelector('#vtb-layers').textContent.includes('plan in use black')")
+        settle(page)
+        with_paths = picture(page)
+        toggle(page, "decisions")
+        assert changed(picture(page), with_paths).mean() > 0.001
+
+
+def test_laser_points_frustum_and_image_of_a_satellite(browser: Browser) -> None:
+    with shown(browser, SatelliteScenario()) as (page, running):
+        running.session.advance(135)  # The first scan ends at 1 s.
+        settle(page)
+        without = picture(page)
+        toggle(page, "laser")
+        assert share(picture(page), RED) > share(without, RED) + 2e-4
+        toggle(page, "laser")
+        toggle(page, "cameras")
+        new = changed(without, picture(page))
+        assert 2e-4 < new.mean() < 0.02
+        toggle(page, "cameras")
+        assert changed(without, picture(page)).mean() < 1e-4
+        image = "sim.sense.docking_camera"
+        page.check(f"[id='vtb-layer-image-{image}']")
+        drawn(page, "document.querySelector('#vtb-images figure')?.dataset.images >= 2")
+        inset = Image.open(io.BytesIO(page.locator("#vtb-images img").screenshot())).convert("RGB")
+        expected = running.session.camera_image(image).astype(float)
+        pixels = np.asarray(inset.resize(expected.shape[1::-1])).astype(float)
+        assert np.corrcoef(pixels.ravel(), expected.ravel())[0, 1] > 0.95
+        page.uncheck(f"[id='vtb-layer-image-{image}']")
+        assert page.locator("#vtb-images figure").count() == 0
