@@ -11,8 +11,6 @@ from pydrake.math import RigidTransform, RotationMatrix
 FIELD_OF_VIEW = np.deg2rad(75.0)
 """The vertical field of view of Meshcat's camera."""
 
-# The least width of a view in terms of its height.
-_ASPECT = 4.0 / 3.0
 # Points from the target to the camera: from the front at the right, and above.
 _DIRECTION = np.array([0.64, -0.68, 0.36]) / np.linalg.norm([0.64, -0.68, 0.36])
 
@@ -48,19 +46,20 @@ class Camera:
         return RigidTransform(RotationMatrix(np.column_stack([right, np.cross(forward, right), forward])), position)
 
 
-def fitting_camera(points_W: NDArray[np.float64], *, margin: float = 1.15) -> Camera:
-    """Return the nearest camera on a fixed line of sight that shows all points in a view of 4:3 or wider.
+def fitting_camera(points_W: NDArray[np.float64], *, margin: float = 1.15, aspect: float = 4.0 / 3.0) -> Camera:
+    """Return the nearest camera in a fixed direction of sight that shows all points.
 
     Args:
         points_W: The points, shape (3, n), n >= 1.
         margin: The field of view in terms of that which the points need.
+        aspect: The least width of the view in terms of its height.
     """
     center = 0.5 * (points_W.min(axis=1) + points_W.max(axis=1))
     R_WC = _camera(center, 1.0).pose.rotation()
     x, y, z = R_WC.inverse().matrix() @ (points_W - center[:, np.newaxis])
     tangent = np.tan(0.5 * FIELD_OF_VIEW) / margin
     shift, distances = np.zeros(3), []
-    for axis, place, slope in ((0, x, tangent * _ASPECT), (1, y, tangent)):
+    for axis, place, slope in ((0, x, tangent * aspect), (1, y, tangent)):
         # From shift and distance, |place - shift| <= slope (distance + z): both sides hold at the least distance.
         above, below = float((place / slope - z).max()), float((-place / slope - z).max())
         shift[axis] = 0.5 * slope * (above - below)

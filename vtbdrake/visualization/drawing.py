@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
+from vtbdrake.components.rendering import RenderingError
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.camera import fitting_camera
 from vtbdrake.visualization.still import Still
@@ -26,8 +27,9 @@ if TYPE_CHECKING:
 _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
-# What moves in a live view gets a field of view that is larger than it needs by this factor.
-_ROOM = 1.6
+# What moves in a live view gets a field of view that is larger than it needs by this factor, and a page that is as
+# narrow as this beside its panel.
+_ROOM, _ASPECT = 1.3, 0.8
 
 
 class Parts(Flag):
@@ -127,7 +129,7 @@ class Drawing:
         """Move the camera so that what moves is in view, with room around it."""
         corners = self.corners(context)
         if corners.size:
-            camera = fitting_camera(corners, margin=_ROOM)
+            camera = fitting_camera(corners, margin=_ROOM, aspect=_ASPECT)
             self._meshcat.SetCameraPose(camera.position, camera.target)
 
     def add_to(
@@ -159,6 +161,21 @@ class Drawing:
                 X_PG if X_WP is None else X_WP @ X_PG,
                 Rgba(color.r(), color.g(), color.b(), color.a() * (opacity if moves else 1.0)),
             )
+
+    def picture(self, context: Context) -> bytes | None:
+        """Return what is drawn in the poses of a context as PNG.
+
+        None: nothing in it moves, its state is not finite, or this machine cannot render.
+        """
+        corners = self.corners(context)
+        if not corners.size or not np.isfinite(corners).all():
+            return None
+        still = Still(fitting_camera(corners))
+        self.add_to(still, context)
+        try:
+            return still.png()
+        except RenderingError:
+            return None
 
     def delete(self) -> None:
         """Remove it from the scene."""

@@ -21,6 +21,10 @@ class Access:
     Browsers send cookies of this machine to all its ports, so the cookie is named after the port. A page of another
     origin can make a browser send requests, but neither choose their Host nor hide its Origin.
 
+    A frame in a notebook gets no such cookie: its site is that of a proxy or of VS Code. Its address begins with the
+    token instead, ``/TOKEN/``, and so do those of all that it loads. A page that does not know the token cannot make a
+    browser send it, so that Host and Origin, which are those of the proxy there, do not matter.
+
     Args:
         app: The application.
         port: The port of the server.
@@ -39,6 +43,9 @@ class Access:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
+            return
+        if self._is_token(scope["path"].split("/", 2)[1:2]) and scope["path"].count("/") > 1:
+            await self._app({**scope, "root_path": f"{scope.get('root_path', '')}/{self.token}"}, receive, send)
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         query = parse_qs(scope["query_string"].decode("latin-1"))
@@ -64,9 +71,13 @@ class Access:
         if origin is not None and urlsplit(origin).netloc != host:
             return f"pages of {origin} may not use this server"
         tokens = [*query.get("token", []), self._cookies(headers).get(self._cookie, "")]
-        if not any(secrets.compare_digest(token.encode(), self.token.encode()) for token in tokens):
+        if not self._is_token(tokens):
             return "the token is missing or wrong: open the address that the server has printed, with its token"
         return ""
+
+    def _is_token(self, texts: Collection[str]) -> bool:
+        """Return whether one of some texts is the token."""
+        return any(secrets.compare_digest(text.encode(), self.token.encode()) for text in texts)
 
     @staticmethod
     def _cookies(headers: dict[str, str]) -> dict[str, Any]:

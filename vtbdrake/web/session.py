@@ -368,6 +368,10 @@ class Session:
         """Return s(t) of the present."""
         return self._do(lambda: self._testbed.snapshot(self._context))
 
+    def picture(self) -> bytes | None:
+        """Return how the testbed looks now, as PNG; None if it has no geometry, or this machine cannot render."""
+        return self._do(lambda: None if self._drawing is None else self._drawing.picture(self._context))
+
     def wait_for_frame(self, after: int, timeout: float) -> Frame | None:
         """Return the first frame with a number above ``after``, or None if it does not come in time."""
         with self._frame_ready:
