@@ -80,6 +80,24 @@ def test_information_is_that_of_finite_differences() -> None:
     np.testing.assert_allclose(information.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
 
 
+def test_slopes_of_the_likelihood_are_those_of_finite_differences() -> None:
+    model = JointModel(PendulumScenario().build(), PARAMETERS)
+    recording = JointRecording.of(recorded(TRUTH, 6, seconds=2.0), model, position="position", torque="torque")
+    segments = Segments(model, [recording], duration=0.5)
+    linearized = segments.linearized(np.array([-0.35, 0.028, 0.19, 0.03]))
+
+    def unlikelihood(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        s, D, T = np.exp(logs)
+        return segments.unlikelihood(Noise(np.array([s]), np.array([D]), float(T)), linearized)
+
+    for noise in ([2e-4, 0.1, 0.05], [1e-3, 0.01, 0.2], [1e-5, 1.0, 0.005]):
+        logs = np.log(noise)
+        differences = [
+            (unlikelihood(logs + step)[0] - unlikelihood(logs - step)[0]) / 2e-4 for step in 1e-4 * np.eye(3)
+        ]
+        np.testing.assert_allclose(unlikelihood(logs)[1], differences, rtol=1e-5, atol=1e-3)
+
+
 def test_what_a_recording_will_tell_is_known_beforehand() -> None:
     log, names = recorded(TRUTH, 1, seconds=4.0), {"position": "position", "torque": "torque"}
     told = information(PendulumScenario(), log, PARAMETERS, noise=NOISE, **names)

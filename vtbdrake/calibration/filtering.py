@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
@@ -38,7 +38,6 @@ _FEWEST, _SMOOTHED = 50, 15
 _NOISE_SEGMENTS = 12
 # Commands with less jitter than this share of their period come by a clock.
 _REGULAR = 0.2
-_DIFFERENCE = 1e-5  # of the logarithm of a deviation
 _LEAST = 1e-9  # of a deviation, in rad or m
 
 
@@ -199,13 +198,22 @@ def stale(commands: Series, times: Array) -> NDArray[np.bool]:
     return np.asarray(times - commands.times[np.maximum(newest, 0)] > GAP * period)
 
 
-class _Filtered(NamedTuple):
-    """As `Innovations`, for K noises: (N, K, W, nq), (N, K, W, nq, nz), (K,) and (N + 1, K, W, 2 nq)."""
+class _Update(NamedTuple):
+    """What the filter has done with a measurement, for W segments.
 
+    Attributes:
+        gain: Kalman gain, (W, 3 nq, nq).
+        inverse: L^-1 of the covariance L L' of the innovations, (W, nq, nq).
+        white: The whitened innovations, (W, nq).
+        mean: The state after it, relative to the trajectory, (W, 3 nq).
+        P: Its covariance, (W, 3 nq, 3 nq).
+    """
+
+    gain: Array
+    inverse: Array
     white: Array
-    slopes: Array
-    log_determinant: Array
-    states: Array
+    mean: Array
+    P: Array
 
 
 class Segments:
@@ -255,7 +263,7 @@ class Segments:
         self._q = np.stack([recordings[i].q[span] for i, span in self._pieces], axis=1)
         steps = np.stack([np.diff(recordings[i].times[span]) for i, span in self._pieces], axis=1)
         self._h = steps / self._substeps if model.step_size <= 0.0 else np.full_like(steps, model.step_size)
-        self._functions = self._compile()
+        self._function = self._compile().map(self.steps * self.count)
 
     def _compile(self) -> casadi.Function:
         """Return the function (x, change, m, h, z) -> following x, and its Jacobians by x, m and z, side by side.
@@ -272,110 +280,152 @@ class Segments:
 
     def linearized(self, z: Array) -> Linearization:
         """Return the model along the trajectory."""
-        n, nu, nz = self.model.nq, self.model.nu, len(z)
+        n, nu = self.model.nq, self.model.nu
         motors = [self.model.motor(recording.times, recording.u, z) for recording in self._recordings]
         m = np.stack([motors[i][0][span][:-1] for i, span in self._pieces], axis=1)
         by = np.stack([motors[i][1][span][:-1] for i, span in self._pieces], axis=1)
         count = self.steps * self.count
-        mapped = self._functions.map(count)
         v = self.trajectory[:, :, n:]
         change = np.diff(v, axis=0) / self._substeps
         change = np.concatenate([change[:1], change[:-1]])  # That before the first step is about that of the first.
-        table = mapped(
-            self.trajectory[:-1].reshape(count, -1).T,
-            change.reshape(count, -1).T,
-            m.reshape(count, -1).T,
-            self._h.reshape(1, -1),
-            np.tile(z[:, np.newaxis], (1, count)),
-        )
-        columns = 1 + 2 * n + nu + nz
-        rows = np.moveaxis(np.asarray(table).reshape(2 * n, count, columns), 0, 1)
-        parts = rows.reshape(self.steps, self.count, 2 * n, columns)
+        # CasADi's columns are rows here.
+        columns = (self.trajectory[:-1], change, m, self._h, np.tile(z, (count, 1)))
+        arguments = [np.ascontiguousarray(argument).reshape(-1) for argument in columns]
+        table = np.empty((count, 1 + 2 * n + nu + len(z), 2 * n))
+        buffer: Any  # whose stubs ask for a size that it does not take
+        buffer, evaluate = self._function.buffer()
+        for i, argument in enumerate(arguments):
+            buffer.set_arg(i, argument.data)
+        buffer.set_res(0, table.reshape(-1).data)
+        evaluate()
+        parts = table.swapaxes(1, 2).reshape(self.steps, self.count, 2 * n, -1)
         following, A, by_m, slopes = np.split(parts, [1, 1 + 2 * n, 1 + 2 * n + nu], axis=3)
         for k, index in enumerate(self.model.drive_parameters):
             slopes[..., index] += np.einsum("twij,twj->twi", by_m, by[:, :, k])
         return Linearization(A, by_m @ self.model.selection.T, following[..., 0] - self.trajectory[1:], slopes.copy())
 
-    def innovations(self, noise: Noise, model: Linearization, *, selection: slice = slice(None)) -> Innovations:
-        """Return the innovations of the chosen segments."""
-        result = self._filtered([noise], model, selection)
-        log_determinant = float(result.log_determinant[0])
-        return Innovations(result.white[:, 0], result.slopes[:, 0], log_determinant, result.states[:, 0])
-
-    def _filtered(self, noises: Sequence[Noise], model: Linearization, selection: slice) -> _Filtered:
-        """Return the innovations for each of K noises, which are filtered side by side.
-
-        An array has K in front of the segments; the logarithm of the determinant is one for each noise, (K,).
-        """
-        n, K = self.model.nq, len(noises)
+    def innovations(
+        self,
+        noise: Noise,
+        model: Linearization,
+        *,
+        selection: slice = slice(None),
+        updates: list[_Update] | None = None,
+    ) -> Innovations:
+        """Return the innovations of the chosen segments; each update is appended to ``updates``, if that is given."""
+        n = self.model.nq
         A, B, defects, slopes = (part[:, selection] for part in model)
         trajectory, q = self.trajectory[:, selection], self._q[:, selection]
         N, W, nz = len(A), A.shape[1], slopes.shape[3]
-        # With an axis for the segments.
-        measurement = np.array([noise.measurement for noise in noises])[:, np.newaxis]
-        torque = np.array([noise.torque for noise in noises])[:, np.newaxis]
-        decay = np.exp(-self.period / np.array([noise.correlation_time for noise in noises]))[:, np.newaxis, np.newaxis]
-        transition = np.zeros((K, W, 3 * n, 3 * n))
-        transition[..., 2 * n :, 2 * n :] = decay[..., np.newaxis] * np.eye(n)
-        nothing = np.zeros((K, 1, 2 * n))
-        Q = _diagonal(np.concatenate([nothing, (1.0 - decay**2) * torque**2], axis=2))
-        R = _diagonal(measurement**2)
-        # A smoothed velocity is about as good as a difference over a few samples.
-        start = np.concatenate([measurement**2, (measurement / self.period) ** 2, torque**2], axis=2)
-        P = np.broadcast_to(_diagonal(start), transition.shape).copy()
+        F, Q, P = self._start(noise, W)
+        variance = noise.measurement**2
         # The state, relative to the trajectory, and its derivatives by the parameters, side by side.
-        X = np.zeros((K, W, 3 * n, 1 + nz))
-        white, by_z = np.empty((N, K, W, n)), np.empty((N, K, W, n, nz))
-        states = np.empty((N + 1, K, W, 2 * n))
+        X = np.zeros((W, 3 * n, 1 + nz))
+        white, by_z = np.empty((N, W, n)), np.empty((N, W, n, nz))
+        states = np.empty((N + 1, W, 2 * n))
         states[0] = trajectory[0]
-        log_determinant = np.zeros(K)
+        log_determinant = 0.0
         for k in range(N):
-            transition[..., : 2 * n, : 2 * n] = A[k]
-            transition[..., : 2 * n, 2 * n :] = B[k]
-            X = transition @ X
-            X[..., : 2 * n, 0] += defects[k]
-            X[..., : 2 * n, 1:] += slopes[k]
-            P = transition @ P @ np.swapaxes(transition, 2, 3) + Q
+            F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
+            X = F @ X
+            X[:, : 2 * n, 0] += defects[k]
+            X[:, : 2 * n, 1:] += slopes[k]
+            P = F @ P @ F.mT + Q
             try:
-                L = np.linalg.cholesky(P[..., :n, :n] + R)
+                L = np.linalg.cholesky(P[:, :n, :n] + np.diag(variance))
             except np.linalg.LinAlgError:
                 raise CalibrationError(
                     "the model runs away from the recordings within a step, for the parameters that fit their torques "
                     "best: another machine, other units, or ranges of the parameters that are too wide"
                 ) from None
+            inverse = np.linalg.inv(L)
             # Of the innovations: measured - expected.
-            rest = -X[..., :n, :]
-            rest[..., 0] += q[k + 1] - trajectory[k + 1, :, :n]
-            solved = np.linalg.solve(L, np.concatenate([rest, P[..., :n, :]], axis=3))
-            innovation, gain = solved[..., : 1 + nz], solved[..., 1 + nz :]
-            transposed = np.swapaxes(gain, 2, 3)
-            X = X + transposed @ innovation
+            rest = -X[:, :n]
+            rest[:, :, 0] += q[k + 1] - trajectory[k + 1, :, :n]
+            innovation = inverse @ rest
+            gain = P[:, :, :n] @ inverse.mT @ inverse
+            X += gain @ rest
             # Joseph's form: P stays positive, also where positions are all but exact.
-            K_gain = np.swapaxes(np.linalg.solve(np.swapaxes(L, 2, 3), gain), 2, 3)
-            update = np.broadcast_to(np.eye(3 * n), P.shape).copy()
-            update[..., :n] -= K_gain
-            P = update @ P @ np.swapaxes(update, 2, 3) + K_gain @ R @ np.swapaxes(K_gain, 2, 3)
-            white[k], by_z[k] = innovation[..., 0], innovation[..., 1:]
-            log_determinant += 2.0 * np.log(np.einsum("kwii->kwi", L)).sum(axis=(1, 2))
-            states[k + 1] = trajectory[k + 1] + X[..., : 2 * n, 0]
-        return _Filtered(white, by_z, log_determinant, states)
+            P -= gain @ P[:, :n]
+            P += (gain * variance - P[:, :, :n]) @ gain.mT
+            white[k], by_z[k] = innovation[:, :, 0], innovation[:, :, 1:]
+            log_determinant += 2.0 * float(np.log(np.einsum("wii->wi", L)).sum())
+            states[k + 1] = trajectory[k + 1] + X[:, : 2 * n, 0]
+            if updates is not None:
+                updates.append(_Update(gain, inverse, white[k], X[:, :, 0].copy(), P.copy()))
+        return Innovations(white, by_z, log_determinant, states)
+
+    def _start(self, noise: Noise, count: int) -> tuple[Array, Array, Array]:
+        """Return the transition F (W, ...) but for A and B, its noise Q and the covariance P (W, ...) at the start."""
+        n = self.model.nq
+        decay = np.exp(-self.period / noise.correlation_time)
+        F = np.zeros((count, 3 * n, 3 * n))
+        F[:, 2 * n :, 2 * n :] = decay * np.eye(n)
+        Q = np.diag(np.concatenate([np.zeros(2 * n), (1.0 - decay**2) * noise.torque**2]))
+        # A smoothed velocity is about as good as a difference over a few samples.
+        variances = [noise.measurement**2, (noise.measurement / self.period) ** 2, noise.torque**2]
+        return F, Q, np.tile(np.diag(np.concatenate(variances)), (count, 1, 1))
+
+    def unlikelihood(
+        self, noise: Noise, model: Linearization, *, selection: slice = slice(None)
+    ) -> tuple[float, Array]:
+        """Return -2 log of the likelihood but for a constant, and its gradient (2 nq + 1,).
+
+        The gradient is that by the logarithms of the noise's deviations of measurement and torque, and of its
+        correlation time: one pass backwards gives the derivatives r and (r r' - N) / 2 of the likelihood by means and
+        covariances (S. J. Koopman and N. Shephard, "Exact score for time series models in state space form",
+        Biometrika 79, 1992).
+        """
+        n, updates = self.model.nq, list[_Update]()
+        model = model._replace(slopes=model.slopes[..., :0])
+        innovations = self.innovations(noise, model, selection=selection, updates=updates)
+        A, B = model.A[:, selection], model.B[:, selection]
+        F, _, P_start = self._start(noise, A.shape[1])
+        r, N = np.zeros(F.shape[:2]), np.zeros_like(F)
+        by_R, by_Q, by_decay = np.zeros(n), np.zeros(n), 0.0
+        start = _Update(*(np.empty(0),) * 3, np.zeros(F.shape[:2]), P_start)
+        for k in range(len(A) - 1, -1, -1):
+            gain, inverse, white, _, _ = updates[k]
+            information = inverse.mT @ inverse
+            score = np.einsum("wji,wj->wi", inverse, white)
+            u = score - np.einsum("wji,wj->wi", gain, r)
+            by_R += 0.5 * (u**2 - np.einsum("wii->wi", information + gain.mT @ N @ gain)).sum(axis=0)
+            # Before the measurement.
+            r[:, :n] += u
+            N[:, :n] -= gain.mT @ N
+            N[:, :, :n] -= N @ gain
+            N[:, :n, :n] += information
+            slope = r[:, 2 * n :, np.newaxis] * r[:, np.newaxis] - N[:, 2 * n :]
+            by_Q += 0.5 * np.einsum("wii->i", slope[:, :, 2 * n :])
+            # Before the step.
+            F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
+            before = updates[k - 1] if k else start
+            by_decay += np.einsum("wi,wi->", r[:, 2 * n :], before.mean[:, 2 * n :])
+            by_decay += np.einsum("wij,wji->", slope, F @ before.P[:, :, 2 * n :])
+            r, N = np.einsum("wji,wj->wi", F, r), F.mT @ N @ F
+        by_start = 0.5 * (r**2 - np.einsum("wii->wi", N)).sum(axis=0)
+        decay, torque = np.exp(-self.period / noise.correlation_time), noise.torque**2
+        by_decay -= 2.0 * decay * float(torque @ by_Q)
+        gradient = np.concatenate(
+            [
+                2.0 * noise.measurement**2 * (by_R + by_start[:n] + by_start[n : 2 * n] / self.period**2),
+                2.0 * torque * ((1.0 - decay**2) * by_Q + by_start[2 * n :]),
+                [by_decay * decay * self.period / noise.correlation_time],
+            ]
+        )
+        return float((innovations.white**2).sum()) + innovations.log_determinant, -2.0 * gradient
 
     def likeliest_noise(self, z: Array, guess: Noise) -> Noise:
         """Return the noise of the largest likelihood, in some segments all over the recordings."""
         n = self.model.nq
         selection = slice(0, None, max(self.count // _NOISE_SEGMENTS, 1))
         model = self.linearized(z)
-        model = model._replace(slopes=model.slopes[..., :0])
 
         def noise_of(logs: Array) -> Noise:
             return Noise(np.exp(logs[:n]), np.exp(logs[n : 2 * n]), float(np.exp(logs[-1])))
 
         def unlikelihood(logs: Array) -> tuple[float, Array]:
-            # With its differences by each number: side by side, they cost little more than one of them.
-            points = np.vstack([logs, logs + _DIFFERENCE * np.eye(len(logs))])
-            filtered = self._filtered([noise_of(point) for point in points], model, selection)
-            values = (filtered.white**2).sum(axis=(0, 2, 3)) + filtered.log_determinant
-            return float(values[0]), (values[1:] - values[0]) / _DIFFERENCE
+            return self.unlikelihood(noise_of(logs), model, selection=selection)
 
         start = np.log([*guess.measurement, *guess.torque, guess.correlation_time])
         widths = np.array([3.0] * n + [6.0] * n)
@@ -385,8 +435,3 @@ class Segments:
         options = {"maxiter": 15}
         fit = scipy.optimize.minimize(unlikelihood, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return noise_of(fit.x)
-
-
-def _diagonal(values: Array) -> Array:
-    """Return diagonal matrices (..., n, n) of the values (..., n)."""
-    return np.asarray(values[..., np.newaxis] * np.eye(values.shape[-1]))
