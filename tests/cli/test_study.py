@@ -95,7 +95,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
         (["show", tmp_path / "none.db"], "does not exist"),
         (["add", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
         (["add", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
-        (["remove", file, 7], "no point 7 waits to be evaluated"),
+        (["remove", file, 7], "no intervention 7 waits"),
         (["attribute", file, "a=1", "--trial", 99], "no trial 99"),
         (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
         (["run", file, *BEGIN, "--rollouts", 4, "--parallel", 8], "was begun with parallel None, not 8"),

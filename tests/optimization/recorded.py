@@ -46,6 +46,7 @@ def recorded(
     }
     units = [""] * len(parameters) if units is None else list(units)
     meta = {"problem": problem, "solver": "TPE", "seed": 0, "options": {}, "units": units}
+    meta["limits"] = [None] * len(units)
     file = StudyFile(None, meta=meta)
     for batch, made in enumerate(points):
         trial = Trial(

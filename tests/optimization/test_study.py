@@ -518,7 +518,7 @@ def test_files_that_are_no_study_are_told_apart_and_left_alone(tmp_path):
     for path, message in [
         (text, "cannot be read .file is not a database."),
         (other, "SQLite file of another kind"),
-        (newer, "a study of version 7, but this vtbdrake reads version 2"),
+        (newer, "a study of version 7, but this vtbdrake reads version 3"),
         (truncated, "cannot be read"),
         (tmp_path / "none", "there is no study file"),
         (tmp_path / "no" / "folder", "there is no study file"),
@@ -700,7 +700,7 @@ def test_given_points_are_checked_at_once(tmp_path):
         study.add(2.0)
     with pytest.raises(ValueError, match="wrong about nonsense"):
         study.add({THETA: 0.0, RATE: 0.0, "nonsense": 1.0})
-    assert study._file.queue() == {}
+    assert study.queue == {}
 
 
 def test_a_study_says_what_it_is_about_and_what_happened(tmp_path):
@@ -783,14 +783,16 @@ def test_points_that_wait_can_be_changed_and_taken_back(tmp_path):
         with pytest.raises(ValueError, match="outside its range"):
             study.edit(third, [7.0, 0.0])
         with pytest.raises(
-            StudyError, match=f"no point {first} waits to be evaluated in .*; the queue has: {second}, {third}"
+            StudyError, match=f"no intervention {first} waits in .*; those that wait are: {second}, {third}"
         ):
             study.remove(first)
     with pendulum_problem().study(path) as study:
         study.run(rollouts=6, executor="serial", progress=False)
         given = [tuple(t.parameters.values()) for t in study.trials if t.origin == "user"]
         assert given == [(-0.5, 1.0), (0.75, 0.0)] and study.queue == {}
-        with pytest.raises(StudyError, match="no point 2 waits to be evaluated in .*; the queue has: none"):
+        with pytest.raises(
+            StudyError, match="no intervention 2 of the kind try waits in .*; those that wait are: none"
+        ):
             study.edit(second, [0.0, 0.0])
 
 

@@ -67,10 +67,24 @@ class Evaluator:
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([quality.sign for quality in problem.objectives])
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
+        self._allows: Callable[[Point], bool] = lambda _: True
         # Independent of the known ones, of which a resumed study has more.
         self._needed: set[RolloutKey] = set()
         # The number of rollouts that each point has needed since its last evaluation.
         self._untold: Counter[Point] = Counter()
+
+    @property
+    def needed(self) -> Collection[RolloutKey]:
+        """Return the rollouts that the evaluations so far have needed, whether they were known or run."""
+        return self._needed
+
+    def restrict(
+        self, allows: Callable[[Point], bool], evaluations: Sequence[Evaluation], *, budget: int | None
+    ) -> None:
+        """Let only points that ``allows`` accepts be the best, of those in ``evaluations`` and of new ones."""
+        self._allows, self.best, self._budget = allows, None, inf if budget is None else budget
+        for evaluation in evaluations:
+            self._remember(evaluation)
 
     def evaluate(self, points: Sequence[Point]) -> list[Evaluation]:
         """Return one evaluation per point, in their order."""
@@ -180,7 +194,7 @@ class Evaluator:
         return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
 
     def _remember(self, evaluation: Evaluation) -> None:
-        if len(self._signs) > 1 or not evaluation.counts:
+        if len(self._signs) > 1 or not evaluation.counts or not self._allows(evaluation.point):
             return
         if self.best is None or evaluation.values[0] > self.best.values[0]:
             self.best = evaluation
@@ -214,7 +228,7 @@ class Gradients:
         sign = problem.objectives[0].sign
         values, slopes = [], []
         for condition, runner in enumerate(self._runners):
-            parameters = split(problem.values(point, condition=condition))[1]
+            parameters = split(problem.assigned(point, condition=condition))[1]
             value, slope = runner.run(parameters, self._addresses)
             values.append(sign * value)
             slopes.append(sign * slope)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import TYPE_CHECKING, Any
@@ -278,8 +279,25 @@ class Problem:
         Raises:
             ValueError: As in `point`, or there is no such condition.
         """
-        values = {p.address: value for p, value in zip(self.parameters, self.point(point), strict=True)}
+        return self.assigned(self.point(point), condition=condition)
+
+    def assigned(self, point: Point, *, condition: int | None = None) -> dict[str, Any]:
+        """Return the same for a point whose values are valid: a study may have widened the ranges."""
+        values = {p.address: value for p, value in zip(self.parameters, point, strict=True)}
         return values if condition is None else {**self._condition(condition), **values}
+
+    def with_ranges(self, parameters: Sequence[Dimension]) -> Problem:
+        """Return the problem with other ranges of the same parameters, on the same testbed.
+
+        Raises:
+            ValueError: A range exceeds the bounds of its variable, or the parameters are others.
+        """
+        other = copy(self)
+        other.parameters = tuple(parameters)
+        if [p.address for p in parameters] != [p.address for p in self.parameters]:
+            raise ValueError("the ranges belong to other parameters than those of the problem")
+        other._check_addresses()
+        return other
 
     def _condition(self, number: int) -> Condition:
         count, index = len(self.conditions), as_whole("the number of a condition", number)

@@ -1,9 +1,10 @@
-"""What is known of a finished rollout, and of a point with all its rollouts."""
+"""What is known of a finished rollout, of a point with all its rollouts, and of an intervention."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
+from datetime import datetime
 from typing import Any
 
 from vtbdrake.failures import safe_text
@@ -67,3 +68,28 @@ class Trial(PointValues):
     def value(self) -> float:
         """Return the value of the first quality."""
         return self.values[0]
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """A change of a study by a person, as a row of the study's file.
+
+    Attributes:
+        number: Number in the file.
+        time: When it was written, in UTC.
+        name: Who wrote it.
+        kind: See `Study.intervene`.
+        payload: The arguments of its kind, as JSON data.
+        batch: The number of the first batch on which it had an effect; None while it waits for one.
+    """
+
+    number: int
+    time: datetime
+    name: str
+    kind: str
+    payload: Mapping[str, Any]
+    batch: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON data."""
+        return {**asdict(self), "time": self.time.isoformat(), "payload": dict(self.payload)}

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import getpass
 import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
 from datetime import datetime
-from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.failures import safe_text
@@ -20,19 +22,18 @@ from vtbdrake.optimization.identity import (
     code_changes,
     describe,
     differences,
-    dimensions,
     plain,
     revision,
     versions,
 )
-from vtbdrake.optimization.parameter import Dimension, checked_point, point_text
-from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
-from vtbdrake.optimization.solvers import Solver, make_solver
+from vtbdrake.optimization.parameter import Choice, Dimension, checked_point, point_text
+from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.statement import statement
+from vtbdrake.optimization.steering import CONTROLS, STOP, TRY, StudySearch, check_arguments
 from vtbdrake.optimization.study_file import StudyError, StudyFile
-from vtbdrake.optimization.study_run import StudyRun, check_budget
+from vtbdrake.optimization.study_run import BUDGET, SOLVER, TARGET, StudyRun, check_budget
 from vtbdrake.optimization.sweep import borrowed
-from vtbdrake.rollout import Executor
+from vtbdrake.rollout import Executor, RolloutResult
 from vtbdrake.rollout.task import catches
 
 if TYPE_CHECKING:
@@ -70,7 +71,6 @@ class Study:
         self._file = file
         self._problem = problem
         self._meta = file.meta
-        self._stopped = False
         self.reason = ""
         self.message = ""
 
@@ -111,9 +111,10 @@ class Study:
             "revision": revision(problem.scenario),
             "units": list(problem.units),
             "statement": statement(problem),
+            "limits": _limits(problem),
         }
         # An unknown solver, or one that cannot solve the problem, is refused before there is a file.
-        made = _solver(problem, meta, rollouts=None)
+        made = StudySearch.of(meta).make_solver()
         made.close()
         meta["solver"] = made.name
         requested = {"solver": solver, "seed": seed, "options": options, "parallel": parallel}
@@ -219,68 +220,283 @@ class Study:
         """
         problem = self._problem
         if problem is None:
-            raise StudyError(
-                f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
-            )
+            raise self._no_problem()
         check_budget(problem, rollouts=rollouts, seconds=seconds, target=target)
         catch = catches(on_error)
         for callback in callbacks:
             if not callable(callback):
                 raise ValueError(f"a callback is a function of a study and a trial, not {callback!r}")
 
-        def after_batch(batch: int) -> bool:
+        racing = len(problem.conditions) > 1 and len(problem.objectives) == 1 if racing is None else racing
+        self._run(
+            {"rollouts": rollouts, "seconds": seconds, "target": target},
+            executor=executor,
+            workers=workers,
+            time_limit=time_limit,
+            racing=racing,
+            catch=catch,
+            progress=progress,
+            callbacks=callbacks,
+        )
+        return self
+
+    def _run(
+        self,
+        budget: dict[str, Any],
+        *,
+        executor: str | Executor | FuturesExecutor,
+        workers: int | None,
+        time_limit: float | None,
+        racing: bool,
+        callbacks: Sequence[Callback],
+        **settings: Any,
+    ) -> None:
+        problem, rollouts = self._problem, budget["rollouts"]
+        assert problem is not None
+
+        def after_batch(batch: int) -> None:
             for trial in self._file.trials_of(batch) if callbacks else ():
                 for callback in callbacks:
                     callback(self, trial)
-            return self._stopped
 
-        self._stopped = False
-        racing = len(problem.conditions) > 1 and len(problem.objectives) == 1 if racing is None else racing
-        budget = rollouts if rollouts is not None else 10**9
+        most = rollouts if rollouts is not None else 10**9
         with (
-            borrowed(problem, executor, rollouts=budget, workers=workers, time_limit=time_limit) as opened,
+            borrowed(problem, executor, rollouts=most, workers=workers, time_limit=time_limit) as opened,
             self._file.running(versions=versions(), revision=revision(problem.scenario)) as reason,
         ):
-            run = StudyRun(
-                self._file,
-                problem,
-                self._make_solver(problem, rollouts, racing=racing),
-                opened,
-                racing=racing,
-                catch=catch,
-                progress=progress,
-                after_batch=after_batch,
-            )
-            self.reason, self.message = run.until(rollouts=rollouts, seconds=seconds, target=target)
+            if "outcomes" not in settings:  # A replay has the solver of the other study.
+                self._begin_solver(rollouts, racing=racing)
+            run = StudyRun(self._file, problem, opened, racing=racing, after_batch=after_batch, **settings)
+            self.reason, self.message = run.until(**budget)
             reason.append(self.reason)
-        return self
 
-    def stop(self) -> None:
-        """End the run after the present batch of points; may be called by a callback, or in another thread."""
-        self._stopped = True
-
-    def _make_solver(self, problem: Problem, rollouts: int | None, *, racing: bool) -> Solver:
+    def _begin_solver(self, rollouts: int | None, *, racing: bool) -> None:
+        """Let the solver begin from its first batch if the budget is larger than the one for which it was made."""
         self._meta = self._file.meta
         made_for, raced = self._meta.get("budget", 0), self._meta.get("racing")
         # A larger budget may be another sequence of points; a smaller one only ends the same sequence earlier.
         larger = made_for is not None and (rollouts is None or rollouts > made_for)
+        if raced is not None and self.search.budget_from is not None:
+            larger = False  # The budget is that of an intervention.
         if larger or racing != raced:
             self._file.begin_anew(budget=rollouts if larger else made_for, racing=racing)
             self._meta = self._file.meta
-        return _solver(problem, self._meta, rollouts=self._meta["budget"], racing=racing)
+
+    # -- interventions
+
+    def intervene(self, kind: str, *, by: str | None = None, **payload: Any) -> Intervention:
+        """Change the study, also while another process runs it.
+
+        The change is a row of the study's file. The process that runs the study makes it before its next batch of
+        points, or the next run does. From then on the points are those of the changed study: a resumed or replayed
+        study repeats them exactly. After a change of ranges, regions, solver or aspiration the method begins anew, at
+        the best point so far; it is told all evaluations in its space, and has the rest of the budget.
+
+        ====================  =========================================================================================
+        kind                  effect
+        ====================  =========================================================================================
+        pause, resume, stop   No further points are asked for; the run waits, goes on, or ends.
+        range                 The range of a parameter: ``address``, ``lower`` and ``upper`` within the bounds of its
+                              variable (of a field of the scenario: within its first range), or ``options`` of a choice.
+        freeze, unfreeze      A parameter, ``address``, is held at ``value`` (by default that of the best point), or is
+                              varied again.
+        forbid                No more points in ``region``, {address: [lower, upper] or options, ...}, where None is an
+                              open end. Its points count no longer as the best.
+        allow                 The region forbidden by intervention ``number`` is allowed again.
+        budget                ``rollouts`` that the study has in the end; None: no limit. It holds for later runs, too,
+                              whatever they are given.
+        solver                Another ``solver``, with its ``options``.
+        try                   A ``point``, address -> value, is evaluated before those of the solver; see `add`.
+        aspiration            Of several qualities: ``targets``, one value per quality. From now on the solver maximizes
+                              one value, how far all of them are exceeded (see `StudySearch.achievement`). None: the
+                              whole Pareto front again.
+        ====================  =========================================================================================
+
+        Args:
+            kind: One of the table.
+            by: Who makes the change; by default the user of this process.
+            payload: The arguments of the kind.
+
+        Raises:
+            ValueError: There is no such kind, it takes other arguments, or nothing would be left to search.
+            SolverError: The solver cannot search what would be left.
+            StudyError: The study is finished, nobody runs what is to be stopped, or the file cannot be written.
+        """
+        if kind == "freeze" and "value" not in payload and len(self.directions) == 1:
+            payload["value"] = self.best.parameters[self.search.parameter(payload.get("address"))[1].address]
+        if kind == TRY and "point" in payload:
+            payload["point"] = _by_address(self.parameters, payload["point"])
+        (intervention,) = self._intervene(kind, [payload], by=by)
+        return intervention
+
+    def _intervene(self, kind: str, payloads: Sequence[dict[str, Any]], *, by: str | None) -> list[Intervention]:
+        for payload in payloads:
+            check_arguments(kind, payload)
+        self._refuse_if_finished(kind)
+        stored = [plain(payload, f"the arguments of {kind}") for payload in payloads]
+        return self._file.intervene(kind, stored, name=safe_text(by) if by else _user(), check=self._check)
+
+    def _check(self, interventions: Sequence[Intervention]) -> None:
+        StudySearch.of(self._meta).after(interventions).check()
+
+    def _refuse_if_finished(self, kind: str) -> None:
+        if self.is_running:
+            return
+        if kind == STOP:
+            raise StudyError(f"no process runs {self.path or 'the study'}: there is nothing to stop")
+        sessions = self._file.sessions()
+        reason = sessions[-1]["reason"] if sessions else None
+        waiting = any(intervention.kind == "budget" for intervention in self._file.interventions(waiting=True))
+        if kind in (TRY, "budget") or waiting or reason not in (BUDGET, TARGET, SOLVER):
+            return
+        if kind in CONTROLS or reason == BUDGET:
+            raise StudyError(
+                f"{self.path or 'the study'} is finished (its last run ended by {reason}, with {len(self)} rollouts): "
+                "give it a larger budget first"
+            )
+
+    def pause(self, *, by: str | None = None) -> None:
+        """Let the run finish its batch of points and wait; see `intervene`."""
+        self.intervene("pause", by=by)
+
+    def resume(self, *, by: str | None = None) -> None:
+        """Let a paused run go on; see `intervene`."""
+        self.intervene("resume", by=by)
+
+    def stop(self, *, by: str | None = None) -> None:
+        """End the run after the present batch of points; may be called by a callback, or anywhere else."""
+        self.intervene(STOP, by=by)
+
+    def replay(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        without: Sequence[int] = (),
+        reuse: bool = True,
+        executor: str | Executor | FuturesExecutor = "auto",
+        workers: int | None = None,
+        time_limit: float | None = None,
+        on_error: str = "record",
+        progress: bool = True,
+    ) -> Study:
+        """Repeat the study from its first batch, into another file, and return it.
+
+        With all interventions the trials come out the same, to the last bit, up to the end of this study. (Trials that
+        an earlier solver made for a smaller budget are left out.) Without some of them it is the study as it would
+        have been, until its budget is spent. Pauses and stops are not repeated.
+
+        Args:
+            path: Path of the new file; None keeps the study in memory.
+            without: The numbers of the interventions to leave out.
+            reuse: Whether rollouts that this study has finished are taken over, and not run again.
+            executor: See `run`, as for the arguments below.
+            workers: See `run`.
+            time_limit: See `run`.
+            on_error: See `run`.
+            progress: See `run`.
+
+        Raises:
+            StudyError: The study was opened without its problem, has not run yet, or the new file exists.
+            ValueError: There is no such intervention, or a later one makes no sense without it.
+        """
+        if self._problem is None:
+            raise self._no_problem()
+        meta = self._file.meta
+        if "racing" not in meta:
+            raise StudyError(f"{self.path or 'the study'} has not run yet: there is nothing to replay")
+        if path is not None and Path(path).exists():
+            raise StudyError(f"{path} exists already: a study is replayed into a new file")
+        changes = [i for i in self.interventions if i.kind not in CONTROLS and i.batch is not None]
+        numbers = [intervention.number for intervention in changes]
+        for number in without:
+            if number not in numbers:
+                raise ValueError(f"no intervention {number} can be left out; those with an effect are: {numbers}")
+        changes = [intervention for intervention in changes if intervention.number not in without]
+        search = StudySearch.of(meta)
+        for intervention in changes:
+            search = search.after([intervention])
+            if intervention.kind != TRY:
+                search.check()
+        study = Study(StudyFile(path, meta=self._file.description), self._problem)
+        study._file.copy_interventions(changes)
+        study._run(
+            {"rollouts": len(self) if not without or meta["budget"] is None else meta["budget"]},
+            executor=executor,
+            workers=workers,
+            time_limit=time_limit,
+            racing=meta["racing"],
+            catch=catches(on_error),
+            progress=progress,
+            callbacks=(),
+            outcomes=self.rollouts if reuse else {},
+            batches=None if without else self._file.batches(),
+        )
+        return study
+
+    @property
+    def interventions(self) -> tuple[Intervention, ...]:
+        """Return all interventions, in their order."""
+        return tuple(self._file.interventions())
+
+    @property
+    def search(self) -> StudySearch:
+        """Return the ranges, regions, solver and budget, as the interventions so far leave them."""
+        return StudySearch.of(self._file.meta).after(self._file.interventions())
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether a process runs the study, this one or another."""
+        return self._file.is_running
+
+    @property
+    def problem(self) -> Problem:
+        """Return the problem, with the widest ranges that the study has had: all its points lie in them.
+
+        Raises:
+            StudyError: The study was opened without its problem.
+        """
+        if self._problem is None:
+            raise self._no_problem()
+        return self._problem.with_ranges(self.parameters)
+
+    def _no_problem(self) -> StudyError:
+        return StudyError(
+            f"{self._file.path} was opened without its problem: run problem.study({str(self._file.path)!r})"
+        )
 
     # -- points and attributes given by hand
 
-    def add(self, *points: Any) -> None:
+    def add(self, *points: Any, by: str | None = None) -> None:
         """Add points by hand, each a mapping address -> value or values in the order of the parameters.
 
+        They are interventions of the kind ``try``, see `intervene`.
         They are evaluated before the next points of the solver, in the process that runs the study, and the solver
         learns from them.
 
         Raises:
             ValueError: A point has other entries than the study, or one lies outside its range.
         """
-        self._file.enqueue([checked_point(self.parameters, point) for point in points])
+        parameters = self.parameters
+        self._intervene(TRY, [{"point": _by_address(parameters, point)} for point in points], by=by)
+
+    def add_results(self, point: Any, results: Sequence[RolloutResult], *, by: str | None = None) -> Intervention:
+        """Add a point by hand whose rollouts were run elsewhere, for example by `Problem.rollout` in another process.
+
+        Args:
+            point: As in `add`.
+            results: Its rollouts, one per condition of the problem.
+            by: As in `intervene`.
+
+        Raises:
+            ValueError: As in `add`, or there is another number of results.
+        """
+        values = _by_address(self.parameters, point)
+        count = len(self._meta["problem"]["conditions"])
+        if len(results) != count:
+            raise ValueError(f"a point has one rollout per condition, {count}, not {len(results)}")
+        for condition, result in enumerate(results):
+            self._file.add(tuple(values.values()), condition, Outcome.of(result))
+        return self.intervene(TRY, point=values, by=by)
 
     def edit(self, number: int, point: Any) -> None:
         """Replace a point of the `queue`.
@@ -289,17 +505,18 @@ class Study:
             StudyError: The queue has no point of that number: it was evaluated, removed, or never added.
             ValueError: As in `add`.
         """
-        self._file.change_queue(
-            as_whole("the number of a point in the queue", number), checked_point(self.parameters, point)
-        )
+        payload = {"point": _by_address(self.parameters, point)}
+        number = as_whole("the number of a point in the queue", number)
+        self._file.change_waiting(number, payload, kind=TRY, check=self._check)
 
     def remove(self, number: int) -> None:
-        """Remove a point from the `queue`.
+        """Remove a point from the `queue`, or another intervention that waits for its batch.
 
         Raises:
-            StudyError: The queue has no point of that number: it was evaluated, removed, or never added.
+            StudyError: No intervention of that number waits: it had its effect, was removed, or was never made.
+            ValueError: A later intervention makes no sense without it.
         """
-        self._file.change_queue(as_whole("the number of a point in the queue", number), None)
+        self._file.change_waiting(as_whole("the number of an intervention", number), None, check=self._check)
 
     def set_attribute(self, key: str, value: Any, *, point: Any = None) -> None:
         """Set an attribute of the study, or of a point: for example an operator or a remark. No result changes.
@@ -320,7 +537,7 @@ class Study:
     @property
     def queue(self) -> dict[int, dict[str, Any]]:
         """Return the points given by hand that are not evaluated yet: number -> the point, address -> value."""
-        return self._file.queue()
+        return {i.number: dict(i.payload["point"]) for i in self._file.interventions(waiting=True) if i.kind == TRY}
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -336,8 +553,8 @@ class Study:
 
     @property
     def parameters(self) -> tuple[Dimension, ...]:
-        """Return the parameters that are varied."""
-        return dimensions(self._meta["problem"])
+        """Return the parameters that are varied, with the widest ranges that the study has had."""
+        return self.search.widest
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -396,7 +613,7 @@ class Study:
         """
         if len(self.directions) > 1:
             raise ValueError("several qualities have no single best point: use pareto()")
-        candidates = [trial for trial in self.trials if trial.counts]
+        candidates = self._candidates()
         if not candidates:
             if not len(self):
                 raise ValueError("no rollout is finished yet: call run()")
@@ -407,11 +624,15 @@ class Study:
 
     def pareto(self) -> tuple[Trial, ...]:
         """Return the points that no other point beats in one quality without losing in another."""
-        candidates = [trial for trial in self.trials if trial.counts]
+        candidates = self._candidates()
         signed = [[s * v for s, v in zip(self.signs, trial.values, strict=True)] for trial in candidates]
         return tuple(
             t for t, values in zip(candidates, signed, strict=True) if not any(_dominates(o, values) for o in signed)
         )
+
+    def _candidates(self) -> list[Trial]:
+        allows = self.search.allows
+        return [trial for trial in self.trials if trial.counts and allows(trial.point)]
 
     def _failures(self) -> str:
         messages = [outcome.message for outcome in self.rollouts.values() if outcome.failed]
@@ -567,7 +788,7 @@ class Study:
         from vtbdrake.optimization.optuna_bridge import points_from_optuna
 
         points = points_from_optuna(self, storage, name=name)
-        self._file.enqueue(points)
+        self.add(*points)
         return len(points)
 
 
@@ -582,19 +803,24 @@ def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
     return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
 
 
-def _solver(problem: Problem, meta: Mapping[str, Any], *, rollouts: int | None, racing: bool = False) -> Solver:
-    """Return the solver of a study, made for a budget of rollouts."""
-    conditions, parallel = len(problem.conditions), meta.get("parallel")
-    budget = None if rollouts is None else ceil(rollouts / conditions)
-    # The rollouts of a batch are those of its points under all conditions; the first round of a race takes two each.
-    width = min(conditions, 2) if racing else conditions
-    return make_solver(
-        meta["solver"],
-        problem.parameters,
-        objectives=len(problem.objectives),
-        constraints=len(problem.constraints),
-        seed=meta["seed"],
-        budget=budget,
-        parallel=None if parallel is None else ceil(parallel / width),
-        **meta["options"],
-    )
+def _by_address(parameters: Sequence[Dimension], point: Any) -> dict[str, Any]:
+    """Check a point and return its values by address."""
+    return {p.address: value for p, value in zip(parameters, checked_point(parameters, point), strict=True)}
+
+
+def _limits(problem: Problem) -> list[list[float] | None]:
+    """Return the bounds of the varied variables; None for a choice, and for a field of the scenario."""
+    variables = problem.testbed.variables()
+    return [
+        None
+        if parameter.is_field or isinstance(parameter, Choice)
+        else [float(np.asarray(bound)) for bound in variables[parameter.address].bounds]
+        for parameter in problem.parameters
+    ]
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # A container may have a user without a name.
+        return f"user {os.getuid()}"

@@ -12,20 +12,21 @@ import sqlite3
 import threading
 import time
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
+from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.write_ahead_log import lost_writes
 from vtbdrake.rollout.task import QUALITY_FAILED
 
-VERSION = 2
+VERSION = 3
 _APPLICATION = 0x56544253  # "VTBS"
 
 # Each table also has a last column, ``checksum``.
@@ -38,8 +39,8 @@ _TABLES = {
     "trials": "batch INTEGER, position INTEGER, point TEXT, trial_values TEXT, violations TEXT, exact INTEGER, "
     "origin TEXT, method TEXT",
     "gradients": "point TEXT PRIMARY KEY, gradient TEXT",
-    # Points given by hand; ``batch`` is NULL while they wait.
-    "given": "number INTEGER PRIMARY KEY, point TEXT, batch INTEGER",
+    # What people change; ``batch`` is NULL while a change waits for the batch on which it has an effect.
+    "interventions": "number INTEGER PRIMARY KEY, time TEXT, name TEXT, kind TEXT, payload TEXT, batch INTEGER",
     "sessions": "number INTEGER PRIMARY KEY, started TEXT, ended TEXT, reason TEXT, versions TEXT, revision TEXT",
     # The user's attributes of a point, or of the study if the point is empty.
     "attributes": "point TEXT, key TEXT, value TEXT",
@@ -47,7 +48,8 @@ _TABLES = {
 _KEYS = {"rollouts": "point, condition", "trials": "batch, position", "attributes": "point, key"}
 # The pages of the write-ahead log before they are written to the file, where every row is checked.
 _LOG_PAGES = 200
-_ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units"}
+_PROGRESS = {"told", "first_position", "rollouts_before"}
+_ABOUT = {"problem", "solver", "seed", "options", "versions", "revision", "units", "limits"}
 
 
 class StudyError(ValueError):
@@ -146,6 +148,8 @@ class StudyFile:
             for table, columns in _TABLES.items():
                 key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
                 self._db.execute(f"CREATE TABLE {table} ({columns}, checksum INTEGER{key})")
+            # The process that runs the study asks before every batch what waits.
+            self._db.execute("CREATE INDEX batches ON interventions (batch)")
             self._set(meta)
             self._db.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {VERSION}")
@@ -228,6 +232,11 @@ class StudyFile:
         """Return the description of the study by name: the problem, the solver, the seed and so on."""
         return {key: json.loads(value) for key, value, _ in self._rows("meta")}
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """Return the description without the progress, for another file."""
+        return {key: value for key, value in self.meta.items() if key not in _PROGRESS}
+
     def _set(self, values: Mapping[str, Any]) -> None:
         self._insert("meta", [(key, json.dumps(value)) for key, value in values.items()], instead="REPLACE")
 
@@ -262,6 +271,11 @@ class StudyFile:
         """Return all finished rollouts by (point, number of the condition)."""
         return dict(_outcomes(self._rows("rollouts", "ORDER BY rowid")))
 
+    def outcomes_of(self, points: Sequence[Point]) -> dict[RolloutKey, Outcome]:
+        """Return the finished rollouts of points."""
+        rows = [self._rows("rollouts", "WHERE point = ? ORDER BY condition", (encode(point),)) for point in points]
+        return dict(_outcomes(chain.from_iterable(rows)))
+
     def finished(self) -> dict[RolloutKey, datetime]:
         """Return when each rollout was finished, in UTC."""
         rows = self._rows("rollouts")
@@ -274,6 +288,15 @@ class StudyFile:
     def completed_batches(self) -> int:
         """Return the number of batches whose evaluations the solver was told."""
         return self._get("told", 0)
+
+    def batches(self) -> int:
+        """Return the number of batches of the present solver that have trials."""
+        query = "SELECT coalesce(max(batch) + 1, 0) FROM trials WHERE position >= ?"
+        return max(self.completed_batches(), self._number(query, (self._get("first_position", 0),)))
+
+    def rollouts_before(self) -> int:
+        """Return the number of rollouts that were finished before the present solver began."""
+        return self._get("rollouts_before", 0)
 
     def save_trials(self, batch: int, trials: Mapping[int, Trial], *, complete: bool) -> None:
         """Record trials of a batch, by their positions in it.
@@ -313,7 +336,8 @@ class StudyFile:
     def _withdraw(self) -> None:
         """Mark all trials as those of an earlier solver."""
         after = self._number("SELECT coalesce(max(position) + 1, 0) FROM trials")
-        self._set({"told": 0, "first_position": max(after, self._get("first_position", 0))})
+        first = max(after, self._get("first_position", 0))
+        self._set({"told": 0, "first_position": first, "rollouts_before": self.count()})
 
     def change_code(
         self, problem: Mapping[str, Any], parts: Sequence[str], *, versions: Mapping[str, str], revision: str
@@ -442,43 +466,88 @@ class StudyFile:
         """Return all gradients by point."""
         return {decode(point): tuple(json.loads(gradient)) for point, gradient, _ in self._rows("gradients")}
 
-    # -- points given by hand
+    # -- interventions
 
-    def enqueue(self, points: Sequence[Point]) -> None:
-        """Put points into the queue, to be evaluated with the next batch."""
-        with self._transaction():
-            first = self._number("SELECT coalesce(max(number), 0) + 1 FROM given")
-            self._insert("given", [(first + k, encode(point), None) for k, point in enumerate(points)])
+    def intervene(
+        self,
+        kind: str,
+        payloads: Sequence[Mapping[str, Any]],
+        *,
+        name: str,
+        check: Callable[[Sequence[Intervention]], None],
+    ) -> list[Intervention]:
+        """Record interventions of a kind, all or none.
 
-    def points_by_hand(self, batch: int, *, new: bool) -> list[Point]:
-        """Return the points given by hand that belong to a batch; with ``new``, the queue joins the batch first."""
-        if new and self._rows("given", "WHERE batch IS NULL"):
-            with self._transaction():
-                waiting = [(number, point, batch) for number, point, *_ in self._rows("given", "WHERE batch IS NULL")]
-                self._insert("given", waiting, instead="REPLACE")
-        return [decode(row["point"]) for row in self._rows("given", "WHERE batch = ? ORDER BY number", (batch,))]
-
-    def queue(self) -> dict[int, dict[str, Any]]:
-        """Return the points that wait to be evaluated: number -> the point, address -> value."""
-        rows = self._rows("given", "WHERE batch IS NULL ORDER BY number")
-        return {row["number"]: self._by_address(decode(row["point"])) for row in rows}
-
-    def change_queue(self, number: int, point: Point | None) -> None:
-        """Replace a point of the queue, or remove it if ``point`` is None.
-
-        Raises:
-            StudyError: The queue has no point of that number.
+        Args:
+            kind: Their kind.
+            payloads: The arguments of each.
+            name: Who makes them.
+            check: Called with all interventions of the study and the new ones behind them; an exception records
+                nothing.
         """
         with self._transaction():
-            if not self._rows("given", "WHERE number = ? AND batch IS NULL", (number,)):
-                waiting = ", ".join(str(other) for other in self.queue()) or "none"
+            rows = self.interventions()
+            first, now = 1 + max((row.number for row in rows), default=0), datetime.now(UTC)
+            new = [Intervention(first + k, now, name, kind, payload) for k, payload in enumerate(payloads)]
+            check([*rows, *new])
+            self._insert("interventions", [_row(intervention) for intervention in new])
+        return new
+
+    def copy_interventions(self, interventions: Sequence[Intervention]) -> None:
+        """Record interventions of another file as they are."""
+        with self._transaction():
+            self._insert("interventions", [_row(intervention) for intervention in interventions])
+
+    def interventions(self, *, waiting: bool = False) -> list[Intervention]:
+        """Return all interventions, or only those that wait for a batch, in their order."""
+        return [
+            Intervention(number, datetime.fromisoformat(time), name, kind, json.loads(payload), batch)
+            for number, time, name, kind, payload, batch, _ in self._rows(
+                "interventions", f"{'WHERE batch IS NULL ' if waiting else ''}ORDER BY number"
+            )
+        ]
+
+    def begin(self, interventions: Sequence[Intervention], *, batch: int) -> list[Intervention]:
+        """Record that interventions have an effect on a batch and on those after it; return those that still waited."""
+        with self._transaction():
+            waiting = {intervention.number for intervention in self.interventions(waiting=True)}
+            begun = [replace(i, batch=batch) for i in interventions if i.number in waiting]
+            self._insert("interventions", [_row(intervention) for intervention in begun], instead="REPLACE")
+        return begun
+
+    def change_waiting(
+        self,
+        number: int,
+        payload: Mapping[str, Any] | None,
+        *,
+        kind: str | None = None,
+        check: Callable[[Sequence[Intervention]], None],
+    ) -> None:
+        """Replace the payload of an intervention that waits, or remove it if ``payload`` is None.
+
+        Args:
+            number: Its number.
+            payload: Its new arguments.
+            kind: The kind that it must have; None: any.
+            check: As in `intervene`.
+
+        Raises:
+            StudyError: No intervention of that number and kind waits.
+        """
+        with self._transaction():
+            rows = {intervention.number: intervention for intervention in self.interventions()}
+            waiting = [n for n, row in rows.items() if row.batch is None and kind in (None, row.kind)]
+            if number not in waiting:
                 raise StudyError(
-                    f"no point {number} waits to be evaluated in {self.path or 'the study'}; the queue has: {waiting}"
+                    f"no intervention {number}{f' of the kind {kind}' if kind else ''} waits in "
+                    f"{self.path or 'the study'}; those that wait are: {', '.join(map(str, waiting)) or 'none'}"
                 )
-            if point is None:
-                self._db.execute("DELETE FROM given WHERE number = ?", (number,))
-            else:
-                self._insert("given", [(number, encode(point), None)], instead="REPLACE")
+            intervention = rows.pop(number)
+            self._db.execute("DELETE FROM interventions WHERE number = ?", (number,))
+            if payload is not None:
+                rows[number] = replace(intervention, payload=payload)
+                self._insert("interventions", [_row(rows[number])])
+            check([rows[key] for key in sorted(rows)])
 
     # -- attributes
 
@@ -508,6 +577,17 @@ def _outcomes(rows: Iterable[sqlite3.Row]) -> Iterator[tuple[RolloutKey, Outcome
                 _float(h), _float(value), tuple(json.loads(measures)), _float(t_star), end, message, _float(wall_time)
             ),
         )
+
+
+def _row(intervention: Intervention) -> tuple[Any, ...]:
+    return (
+        intervention.number,
+        intervention.time.isoformat(timespec="milliseconds"),
+        intervention.name,
+        intervention.kind,
+        json.dumps(dict(intervention.payload)),
+        intervention.batch,
+    )
 
 
 def _checksum(table: str, row: Sequence[Any]) -> int:
@@ -567,7 +647,7 @@ def _claim(path: Path | None) -> Iterator[None]:
         except OSError as error:
             raise StudyError(f"the study {path} cannot be run, as its lock cannot be created: {error}") from error
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock_exclusively(handle)
         except BlockingIOError as error:
             os.close(handle)
             raise StudyError(
@@ -584,6 +664,15 @@ def _claim(path: Path | None) -> Iterator[None]:
     finally:
         lock.unlink(missing_ok=True)
         os.close(handle)
+
+
+def _lock_exclusively(handle: int) -> None:
+    """Take the lock, which a process that asks `_is_claimed` holds for some microseconds."""
+    for _ in range(10):
+        with suppress(BlockingIOError):
+            return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        time.sleep(0.005)
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _is_claimed(path: Path) -> bool:

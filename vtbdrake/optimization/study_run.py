@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from math import inf, isfinite, isnan
+from types import MappingProxyType
 
 from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.evaluator import ROUND, Evaluator, Gradients
 from vtbdrake.optimization.problem import Problem
-from vtbdrake.optimization.records import Outcome, RolloutKey, Trial
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, Solver, ask_within
+from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
+from vtbdrake.optimization.solvers.solver import Evaluation, Point, ask_within
+from vtbdrake.optimization.steering import CONTROLS, STOP, TRY, SteeredSolver, StudySearch
 from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.rollout import Executor
 from vtbdrake.rollout.executor import watched
@@ -24,9 +27,13 @@ from vtbdrake.testbed.interrupt import Interruptible
 _log = logging.getLogger(__name__)
 
 BUDGET, TIME, TARGET, SOLVER, INTERRUPTED, STOPPED = "budget", "time", "target", "solver", "interrupted", "stopped"
+REPLAYED = "replayed"
 
 # A solver of a small space may ask for known points for ever; the run ends after this many such batches in a row.
 _KNOWN_BATCHES = 50
+
+# A paused run looks this often whether it may go on, in seconds.
+POLL_PERIOD = 0.1
 
 # The period of log messages about the progress without a terminal, in seconds.
 LOG_PERIOD = 30.0
@@ -44,36 +51,50 @@ class _RunEnd(Exception):  # noqa: N818
 class StudyRun:
     """One run of a study. The solver is first told the recorded evaluations, batch by batch.
 
+    Before every batch it looks for interventions in the file. A new one has its effect on a batch of which no rollout
+    has begun, and the file says on which.
+
     Args:
         file: The file of the study; this process has claimed it.
         problem: The problem to solve.
-        solver: A new solver for the budget that is recorded in the file.
         executor: Runs the rollouts.
         racing: See `Evaluator`.
         catch: Whether a failed quality function fails its rollout only; see `RolloutTask`.
         progress: Show a progress bar in a terminal or a notebook, and log the progress elsewhere.
-        after_batch: Called with the number of every batch that is recorded for the first time; True ends the run.
+        after_batch: Called with the number of every batch that is recorded for the first time.
+        outcomes: Outcomes of another study of the problem, which are recorded instead of rollouts.
+        batches: The number of batches after which the run ends; None: any number.
     """
 
     def __init__(
         self,
         file: StudyFile,
         problem: Problem,
-        solver: Solver,
         executor: Executor,
         *,
         racing: bool,
         catch: bool,
         progress: bool,
-        after_batch: Callable[[int], bool],
+        after_batch: Callable[[int], None],
+        outcomes: Mapping[RolloutKey, Outcome] = MappingProxyType({}),
+        batches: int | None = None,
     ) -> None:
         self._file = file
         self._problem = problem
         self._task = replace(problem.task, catch=True) if catch else problem.task
         self._warned = False
-        self._solver = solver
         self._executor = executor
+        self._finished_elsewhere = outcomes
+        self._last_batch = inf if batches is None else batches
         self._outcomes: dict[RolloutKey, Outcome] = file.outcomes()
+        interventions = file.interventions()
+        begun = StudySearch.of(file.meta)
+        self._solver = SteeredSolver(begun, racing=racing)
+        self._changes = [intervention for intervention in interventions if intervention.kind not in CONTROLS]
+        self._newest = begun.after(interventions)
+        # Their run has ended in another way.
+        stops = [i for i in interventions if i.kind == STOP and i.batch is None]
+        file.begin(stops, batch=file.completed_batches())
         # Not the budget of this run: how points are evaluated must not depend on where a study is interrupted.
         budget, parallel = file.meta["budget"], file.meta.get("parallel")
         self._evaluator = Evaluator(
@@ -84,7 +105,7 @@ class StudyRun:
             budget=inf if budget is None else budget,
             round_size=max(ROUND, parallel or 1),
         )
-        self._gradients = Gradients(problem) if solver.wants_gradient else None
+        self._gradients = Gradients(problem) if self._solver.wants_gradient else None
         self._slopes = file.gradients()
         self._completed = file.completed_batches()
         # The trials of earlier solvers, made for other budgets: point -> whether one of them is exact.
@@ -97,13 +118,19 @@ class StudyRun:
         self._after_batch = after_batch
         self._next_log = inf
         self._bar: tqdm | None = None  # type: ignore[type-arg]
+        self._requested: float = inf
         self._limit: float = inf
         self._deadline = inf
         self._target: float | None = None
 
-    def until(self, *, rollouts: int | None, seconds: float | None, target: float | None) -> tuple[str, str]:
+    def until(
+        self, *, rollouts: int | None, seconds: float | None = None, target: float | None = None
+    ) -> tuple[str, str]:
         """Run the study; return the reason of the end, in a word and in a sentence."""
-        self._limit = inf if rollouts is None else rollouts
+        self._requested = inf if rollouts is None else rollouts
+        self._set_limit()
+        if self._newest.budget_from is not None and self._limit != self._requested:
+            _log.warning("%s holds, not that of this run", self._budget_text)
         self._deadline = inf if seconds is None else time.monotonic() + seconds
         if target is not None:
             self._target = self._problem.objectives[0].sign * target
@@ -112,7 +139,11 @@ class StudyRun:
         if self._progress and not shown:
             self._next_log = time.monotonic() + LOG_PERIOD
         with tqdm(
-            total=rollouts, initial=len(self._outcomes), desc=name, unit="rollout", disable=not shown
+            total=None if self._limit == inf else self._limit,
+            initial=len(self._outcomes),
+            desc=name,
+            unit="rollout",
+            disable=not shown,
         ) as self._bar:
             try:
                 return self._batches()
@@ -126,30 +157,96 @@ class StudyRun:
 
     def _batches(self) -> tuple[str, str]:
         if self._completed < self._new_from:
+            self._obey(self._new_from)
             self._roll_out_queue()
         batch, silent = 0, 0
         while silent < _KNOWN_BATCHES:
+            if batch >= self._last_batch:
+                return REPLAYED, f"the {batch} batches of the other study are replayed"
+            points_by_hand = self._intervene(batch)
             before = len(self._outcomes)
-            if not self._one_batch(batch):
+            if not self._one_batch(batch, points_by_hand):
                 return self._end_of_solver()
-            if batch >= self._completed and self._after_batch(batch):
-                return STOPPED, "stop() was called"
+            if batch >= self._completed:
+                self._after_batch(batch)
             if batch >= self._new_from:
                 silent = 0 if len(self._outcomes) > before else silent + 1
             self._show_best()
             batch += 1
         return SOLVER, f"{self._solver.name} asks only for points that are known"
 
-    def _one_batch(self, batch: int) -> bool:
+    def _intervene(self, batch: int) -> list[Point]:
+        """Make the changes that have an effect on a batch; return the points to try in it."""
+        if batch >= self._completed:
+            waiting = self._obey(batch)
+            if waiting and batch >= self._new_from and not self._has_begun(batch):
+                begun = self._file.begin(waiting, batch=batch)
+                self._changes += begun
+                tried = [self._tried(intervention) for intervention in begun if intervention.kind == TRY]
+                # Whoever tried a point may have run its rollouts.
+                self._outcomes |= self._file.outcomes_of(tried)
+        changes = [intervention for intervention in self._changes if intervention.batch == batch]
+        if changes:
+            search = self._solver.search.after(changes)
+            # Once more than needed changes nothing: the best point may have been forbidden, or allowed again.
+            self._solver.change(search)
+            self._evaluator.restrict(search.allows, self._solver.evaluations, budget=search.budget)
+        return [self._tried(intervention) for intervention in changes if intervention.kind == TRY]
+
+    def _obey(self, batch: int) -> list[Intervention]:
+        """Wait as long as the study is paused; return the changes that wait for a batch.
+
+        Raises:
+            _RunEnd: Someone has stopped the study, or the time is over.
+        """
+        while True:
+            waiting = self._file.interventions(waiting=True)
+            controls = [intervention for intervention in waiting if intervention.kind in CONTROLS]
+            if waiting:
+                self._newest = StudySearch.of(self._file.meta).after(self._file.interventions())
+                self._set_limit()
+            if controls:
+                self._file.begin(controls, batch=batch)
+            for control in controls:
+                if control.kind == STOP:
+                    raise _RunEnd(STOPPED, f"{control.name} stopped it (intervention {control.number})")
+                _log.info("the study is %sd by %s", control.kind, control.name)
+            if not self._newest.paused:
+                return [intervention for intervention in waiting if intervention.kind not in CONTROLS]
+            self._end_at_deadline()
+            time.sleep(POLL_PERIOD)
+
+    def _has_begun(self, batch: int) -> bool:
+        """Return whether rollouts of a batch were finished by a run that was interrupted in it."""
+        if batch > self._new_from:
+            return False
+        tried = {self._tried(i) for i in self._file.interventions() if i.kind == TRY}
+        since = islice(self._outcomes, self._file.rollouts_before(), None)
+        return any(key not in self._evaluator.needed and key[0] not in tried for key in since)
+
+    def _tried(self, intervention: Intervention) -> Point:
+        values = intervention.payload["point"]
+        return tuple(values[parameter.address] for parameter in self._problem.parameters)
+
+    def _set_limit(self) -> None:
+        """Take the newest budget: it limits the rollouts at once, also in a batch that was interrupted."""
+        search = self._newest
+        budget = self._requested if search.budget_from is None else search.budget
+        self._limit = inf if budget is None else budget
+
+    @property
+    def _budget_text(self) -> str:
+        number = self._newest.budget_from
+        return f"the budget of {self._limit:g} rollouts" + ("" if number is None else f" (intervention {number})")
+
+    def _one_batch(self, batch: int, points_by_hand: Sequence[Point]) -> bool:
         """Evaluate the points given by hand, then those of the solver; return whether there were any."""
-        # A batch that was told before gets no new points by hand: it is repeated as it was.
-        points_by_hand = self._file.points_by_hand(batch, new=batch >= self._new_from)
         proposed: list[Point] = []
         try:
             # By hand first: a solver may ask for all that the budget allows.
-            by_hand = self._evaluate(points_by_hand)
-            proposed = [self._problem.point(point) for point in self._ask()]
-            evaluations = self._evaluate(proposed)
+            by_hand = self._evaluate(points_by_hand, tell=self._solver.tell_by_hand)
+            proposed = self._ask()
+            evaluations = self._evaluate(proposed, tell=self._solver.tell)
         except BaseException:
             # It is evaluated again in the next run. Until then, the complete points can be seen.
             so_far = ([self._evaluator.evaluation(point) for point in points] for points in (points_by_hand, proposed))
@@ -165,7 +262,7 @@ class StudyRun:
         The solver learns of these points where the study continues. Before that, it would ask for known points and, in
         the same batch, for more than the budget allows.
         """
-        points = [tuple(point.values()) for point in self._file.queue().values()]
+        points = [self._tried(i) for i in self._file.interventions(waiting=True) if i.kind == TRY]
         keys = [(point, condition) for point in points for condition in range(len(self._problem.conditions))]
         try:
             self._roll_out([key for key in dict.fromkeys(keys) if key not in self._outcomes])
@@ -173,13 +270,13 @@ class StudyRun:
             evaluations = [self._evaluator.evaluation(point) for point in points]
             self._record(self._new_from, evaluations, [], complete=False)
 
-    def _evaluate(self, points: Sequence[Point]) -> list[Evaluation]:
+    def _evaluate(self, points: Sequence[Point], *, tell: Callable[[Sequence[Evaluation]], None]) -> list[Evaluation]:
         """Evaluate points and tell the solver."""
         if not points:
             return []
         self._end_at_target(points)
         evaluations = self._evaluator.evaluate(points)
-        self._solver.tell([self._with_gradient(evaluation) for evaluation in evaluations])
+        tell([self._with_gradient(evaluation) for evaluation in evaluations])
         return evaluations
 
     def _ask(self) -> list[Point]:
@@ -192,7 +289,7 @@ class StudyRun:
     def _end_of_solver(self) -> tuple[str, str]:
         left, point = self._limit - len(self._outcomes), len(self._problem.conditions)
         rest = f" but for {left:g}, fewer than the {point} that a point takes" if 0 < left < point else ""
-        spent = f"the budget of {self._limit:g} rollouts is spent{rest}"
+        spent = f"{self._budget_text} is spent{rest}"
         if self._solver.success is False and left < point:
             return BUDGET, spent
         how = {True: "is finished", False: "has ended without success", None: "has ended"}[self._solver.success]
@@ -201,30 +298,39 @@ class StudyRun:
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
         now = keys[: max(0, int(min(self._limit - len(self._outcomes), len(keys))))]
-        points = [self._problem.values(point, condition=condition) for point, condition in now]
+        # Of a replayed study, what is finished is not simulated again.
+        for key in now:
+            if (outcome := self._finished_elsewhere.get(key)) is not None:
+                self._finish(key, outcome)
+                self._end_at_target([key[0]])
+        limited = len(now) < len(keys)
+        now = [key for key in now if key not in self._finished_elsewhere]
+        points = [self._problem.assigned(point, condition=condition) for point, condition in now]
         self._end_at_deadline()
         results = self._executor.run(self._task, points) if points else iter(())
         try:
             with Interruptible() as interruptible:
                 for index, result in results:
-                    point, condition = now[index]
-                    outcome = Outcome.of(result)
-                    self._outcomes[point, condition] = outcome
-                    self._file.add(point, condition, outcome)
-                    self._warn(outcome)
-                    if time.monotonic() >= self._next_log:
-                        self._next_log += LOG_PERIOD
-                        self._log_progress()
-                    assert self._bar is not None
-                    self._bar.update()
-                    self._end_at_target([point])
+                    self._finish(now[index], Outcome.of(result))
+                    self._end_at_target([now[index][0]])
                     self._end_at_deadline()
                     interruptible.raise_interrupt()
         finally:
             if points:
                 results.close()  # type: ignore[attr-defined]
-        if len(now) < len(keys):
-            raise _RunEnd(BUDGET, f"the budget of {self._limit:g} rollouts is spent")
+        if limited:
+            raise _RunEnd(BUDGET, f"{self._budget_text} is spent")
+
+    def _finish(self, key: RolloutKey, outcome: Outcome) -> None:
+        point, condition = key
+        self._outcomes[key] = outcome
+        self._file.add(point, condition, outcome)
+        self._warn(outcome)
+        if time.monotonic() >= self._next_log:
+            self._next_log += LOG_PERIOD
+            self._log_progress()
+        assert self._bar is not None
+        self._bar.update()
 
     def _warn(self, outcome: Outcome) -> None:
         """Log once in a run that the quality function fails."""
@@ -239,7 +345,7 @@ class StudyRun:
         _log.info("study (%s): %d%s rollouts%s", self._solver.method, len(self._outcomes), of, best_text)
 
     def _with_gradient(self, evaluation: Evaluation) -> Evaluation:
-        if self._gradients is None or evaluation.failed:
+        if self._gradients is None or not self._solver.wants_gradient or evaluation.failed:
             return evaluation
         point = evaluation.point
         if point not in self._slopes:

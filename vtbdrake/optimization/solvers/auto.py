@@ -75,6 +75,8 @@ class Auto(Solver):
         self._solver: Solver
         self._patience = math.inf
         self._limit = math.inf
+        # Whether one method performs the whole search.
+        self._alone = False
         # The start of a local search, whose integers stay.
         self._local_start: Point | None = None
         # The starts of all local searches.
@@ -95,6 +97,14 @@ class Auto(Solver):
         """Return the methods used so far, each with the number of evaluations asked for before it began."""
         return tuple(self._changes)
 
+    def change_budget(self, left: float) -> None:
+        super().change_budget(left)
+        if self._alone:
+            self._solver.change_budget(left)
+        elif self._patience < math.inf:
+            # A global method has all that is left; the others are limited by their plans.
+            self._solver.change_budget(self._left_but_polish())
+
     # -- the plan
 
     def _stages(self) -> Iterator[None]:
@@ -108,6 +118,7 @@ class Auto(Solver):
         return self._global_stages()
 
     def _one(self, method: str, solver: Solver) -> Iterator[None]:
+        self._alone = True
         self._begin(method, solver)
         yield
         self._end(bool(solver.success), solver.message)

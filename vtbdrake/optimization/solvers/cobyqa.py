@@ -28,6 +28,8 @@ class Cobyqa(BlockingSolver):
     Polytechnic University.
     """
 
+    plans_for_budget = True
+
     def __init__(self, search: Search, *, name: str, radius: float = 0.1, tolerance: float = 1e-6) -> None:
         search.require(name, continuous=True, one_objective=True, not_wide=True)
         if not 0.0 < tolerance < radius <= 0.5:

@@ -31,6 +31,7 @@ class Design(Solver):
     def __init__(self, search: Search, *, name: str, as_budgeted: bool = False) -> None:
         super().__init__(search, name=name)
         search.require(name, no_start=True)
+        self._as_budgeted = as_budgeted
         if not as_budgeted:
             self._budget = None
         self._points = self._generate()
@@ -45,6 +46,10 @@ class Design(Solver):
         if not points:
             self._spent()
         return points
+
+    def change_budget(self, left: float) -> None:
+        if self._as_budgeted:
+            super().change_budget(left)
 
     def _spent(self) -> None:
         self._end(True, "the design is complete")
@@ -112,6 +117,7 @@ class Sobol(Design):
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
         as_budgeted = points is None and search.budget is not None
         self._count = None if as_budgeted else _count(search, points)
+        self.plans_for_budget = points is None and not as_budgeted
         super().__init__(search, name=name, as_budgeted=as_budgeted)
 
     def _generate(self) -> Iterator[Point]:
@@ -133,6 +139,7 @@ class LatinHypercube(Design):
 
     def __init__(self, search: Search, *, name: str, points: int | None = None) -> None:
         self._count = _count(search, points)
+        self.plans_for_budget = points is None
         super().__init__(search, name=name, as_budgeted=points is None)
 
     def _generate(self) -> Iterator[Point]:

@@ -6,10 +6,10 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isinf, isnan
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -270,6 +270,7 @@ class Solver(ABC):
         wants_gradient: Whether the solver needs `Evaluation.gradient`.
         takes_start: Whether the solver starts at a point (`Search.start`).
         needs_parameters: Whether there must be a parameter to vary.
+        plans_for_budget: Whether another budget takes a new solver, because this one has planned for its own.
         success: Whether the solver ended by its own criterion (converged, or its design is complete); None before.
         message: How the solver ended.
     """
@@ -277,6 +278,7 @@ class Solver(ABC):
     wants_gradient: bool = False
     takes_start: bool = True
     needs_parameters: bool = True
+    plans_for_budget: bool = False
 
     def __init__(self, search: Search, *, name: str) -> None:
         self.name = name
@@ -286,6 +288,7 @@ class Solver(ABC):
         # The points asked for, until their evaluations are told.
         self._pending: list[Point] = []
         self._budget: float | None = search.budget
+        self._used = 0.0
         # The remaining points of the method's present batch, and the evaluations received for it.
         self._rest: list[Point] = []
         self._evaluated: list[Evaluation] = []
@@ -363,20 +366,37 @@ class Solver(ABC):
                 if len(numbers) != expected:
                     raise SolverError(f"an evaluation of this problem has {expected} {name}, not {len(numbers)}")
         self._pending = []
+        used = sum(evaluation.effort for evaluation in evaluations)
+        self._used += used
         if self._budget is not None:
-            self._budget += count - sum(evaluation.effort for evaluation in evaluations)
+            self._budget += count - used
         self._evaluated += evaluations[:count]
         self._by_hand += evaluations[count:]
         if not self._rest:
             evaluated, by_hand, self._evaluated, self._by_hand = self._evaluated, self._by_hand, [], []
             self._learn(evaluated, by_hand)
 
+    def change_budget(self, left: float) -> None:
+        """Let the solver ask for another number of evaluations from now on, between two batches."""
+        endless = left == math.inf
+        self.search = replace(self.search, budget=None if endless else max(1, math.ceil(self._used + left)))
+        self._budget = None if endless else left
+
     def close(self) -> None:
         """Release the resources of the solver; called after the last `ask`."""
         return
 
 
-def ask_within(solver: Solver, seconds: float) -> list[Point] | None:
+class Asker(Protocol):
+    """Anything that asks for points, as a solver does."""
+
+    @property
+    def name(self) -> str: ...
+
+    def ask(self) -> list[Point]: ...
+
+
+def ask_within(solver: Asker, seconds: float) -> list[Point] | None:
     """Return the points that a solver asks for; None if it has not answered after ``seconds``: it must be closed then.
 
     Raises:
