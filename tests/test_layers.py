@@ -74,9 +74,10 @@ TOP = {"visualization", "web", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
 # `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, and a testbed
-# is shown by `web`.
+# is shown by `web`, which lets `testing` save a course as a test.
 MAY_DELEGATE: dict[str, set[str]] = {
     "testbed": {"calibration", "deployment", "visualization", "web"},
+    "web": {"testing"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
 }
 

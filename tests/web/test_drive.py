@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,3 +172,43 @@ def test_bad_drives_are_refused(session: Session) -> None:
         Session(PendulumScenario(), problem=problem())
     session.reset()
     assert frame(session, lambda shown: shown.drive is None).time == 0.0
+
+
+def test_interventions_are_a_course_that_is_saved_as_a_test(session: Session, tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match="there is nothing to save: set something, or drive"):
+        session.save_test(tmp_path / "test_nothing.py")
+    session.advance(3)
+    session.write({COMMAND: 0.3})
+    session.write({COMMAND: 0.4})
+    session.advance(10)
+    session.write({COMMAND: -0.2})
+    session.advance(5)
+    course = session.course
+    assert course is not None and (course.start.time, course.steps) == (3 * STEP, 15)
+    assert list(course.writes) == [(0, {COMMAND: 0.4}), (10, {COMMAND: -0.2})]
+    session.save_test(tmp_path / "test_command.py", tolerance=1e-4)
+    namespace: dict[str, Any] = {"__file__": str(tmp_path / "test_command.py")}
+    exec((tmp_path / "test_command.py").read_text(), namespace)
+    namespace["test_command"]()
+    assert namespace["TASK"]["horizon"] == 1.0 and namespace["TOLERANCE"] == 1e-4
+    session.drive([COMMAND])
+    with pytest.raises(SessionError, match="saving has to wait"):
+        session.save_test(tmp_path / "test_drive.py")
+    session.advance(8)
+    driven = session.end_drive()
+    assert session.course is driven.course
+    session.reset()
+    assert session.course is None
+
+
+def test_without_a_problem_the_watched_values_are_expected(tmp_path: Path) -> None:
+    with Session(LimitedPendulumScenario()) as session:
+        session.watch("test", [ANGLE, "dps.torque"])
+        session.write({COMMAND: 0.3})
+        session.advance(20)
+        angle = read(session, ANGLE)
+        session.save_test(tmp_path / "test_angle.py")
+    namespace: dict[str, Any] = {"__file__": str(tmp_path / "test_angle.py")}
+    exec((tmp_path / "test_angle.py").read_text(), namespace)
+    assert namespace["EXPECTED"] == {ANGLE: pytest.approx(angle, rel=1e-9)}
+    namespace["test_angle"]()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -205,8 +206,8 @@ def test_closed_session_is_told(page: Page, running: View) -> None:
     assert "the session has ended" in page.inner_text("#vtb-messages")
 
 
-def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser) -> None:
-    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0)) as running:
+def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path) -> None:
+    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0), folder=tmp_path) as running:
         opened = browser.new_page(viewport={"width": 1280, "height": 800})
         opened.set_default_timeout(PATIENCE)
         # A gamepad that the test holds: Chromium asks for it in each poll.
@@ -233,4 +234,9 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser) -> None:
         opened.click("#vtb-drive-keep")
         opened.wait_for_selector("#vtb-drive-begin")
         assert -1.0 <= running.session.snapshot()["u.angle"] < -0.1
+        opened.click("#vtb-keep summary")
+        opened.fill("#vtb-test-name", "to_the_left")
+        opened.click("#vtb-save-test")
+        drawn(opened, "vtb.messages.textContent.includes('test_to_the_left.py')")
+        assert sorted(file.suffix for file in tmp_path.glob("test_to_the_left.*")) == [".py", ".vtb"]
         opened.close()

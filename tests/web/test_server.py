@@ -7,6 +7,7 @@ import random
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from tests.web.test_drive import LimitedPendulumScenario, problem
 from vtbdrake.web import View, view
 from vtbdrake.web.host import PortError
 from vtbdrake.web.relay import Newest
@@ -199,3 +201,29 @@ def test_slow_browser_ends_with_the_same_scene(seed: int) -> None:
         received.append(msgpack.unpackb(queue.get_nowait()))
     assert scene_after(received) == scene_after(sent)
     assert len(received) + queue.replaced == 300 and queue.replaced > 50
+
+
+def test_page_drives_and_a_page_that_is_gone_releases_its_keys(tmp_path: Path) -> None:
+    with view(LimitedPendulumScenario(), problem=problem(), folder=tmp_path) as running:
+        with page(running) as socket:
+            hello = receive(socket, "hello")
+            assert hello["quality"] == "magnitude"
+            assert [handle["address"] for handle in hello["handles"]] == ["u.angle", "T_act.torque.idle"]
+            assert command(socket, "end_drive", keep=True) == "nothing is driven: take over first"
+            assert command(socket, "drive", addresses=["u.angle"]) == ""
+            assert command(socket, "deflect", deflections={"u.angle": 1.0}) == ""
+            assert command(socket, "step", steps=8) == ""
+            assert "1 numbers from -1 to 1" in command(socket, "deflect", deflections={"u.angle": 2.0})
+        moved = 0.8 * 8 * running.session.config.step
+        with page(running) as socket:
+            while not receive(socket, "frame")["steers"]:
+                pass
+            assert command(socket, "step", steps=8) == ""
+            assert running.session.snapshot()["u.angle"] == pytest.approx(moved)
+            socket.send(json.dumps({"id": 2, "do": "end_drive", "keep": True}))
+            driven = receive(socket, "answer")["result"]
+            assert (driven["seconds"], driven["end"], driven["failed"]) == (0.125, "ended by hand", False)
+            assert command(socket, "save_test", name="left") == ""
+            assert "small letters, digits" in command(socket, "save_test", name="../left")
+            assert "is not overwritten" in command(socket, "save_test", name="left")
+            assert sorted(file.name for file in tmp_path.iterdir()) == ["test_left.py", "test_left.vtb"]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from math import isinf
-from pathlib import Path
 from typing import Any
 
 from vtbdrake.optimization.identity import dimensions
@@ -16,7 +14,7 @@ from vtbdrake.optimization.risk import RISKS, CVaR, Quantile, Risk
 from vtbdrake.rollout import Constraint, Quality, RecordedMotion
 from vtbdrake.rollout.named_function import is_named, named_function
 from vtbdrake.testbed import ScenarioError
-from vtbdrake.testbed.scenario_file import load_scenario, save_scenario
+from vtbdrake.testbed.scenario_file import scenario_of_text, scenario_text
 
 # Packages that are imported because a file names them: they are installed beside this module.
 _OWN = ("vtbdrake", "vtbdrake_diagrams", "builtins", "math", "numpy")
@@ -34,13 +32,10 @@ def statement(problem: Problem) -> dict[str, Any]:
     ``scenario`` is empty if no file can hold it. A function that no module has under its name (a lambda, one of a
     script or a notebook) is None.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "scenario.yaml"
-        try:
-            save_scenario(problem.scenario, file)
-            scenario = file.read_text("utf-8")
-        except (ScenarioError, TypeError, ValueError):
-            scenario = ""
+    try:
+        scenario = scenario_text(problem.scenario)
+    except (ScenarioError, TypeError, ValueError):
+        scenario = ""
     return {"scenario": scenario, "functions": [_name(m.f) for m in (*problem.objectives, *problem.constraints)]}
 
 
@@ -92,10 +87,7 @@ def _refuse_strangers(names: Sequence[str], trusted: Sequence[str]) -> None:
 
 
 def _stated(described: Mapping[str, Any], scenario_name: str, stated: Mapping[str, Any]) -> Problem:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "scenario.yaml"
-        file.write_text(stated["scenario"], "utf-8")
-        scenario = load_scenario(f"{scenario_name}@{file}")
+    scenario = scenario_of_text(scenario_name, stated["scenario"])
     functions = iter([named_function(name) for name in stated["functions"]])
     qualities = [
         Quality(next(functions), q["of"], reading=q["reading"], minimize=q["minimize"], upper=float(q["upper"]))

@@ -7,13 +7,11 @@ import platform
 import re
 import struct
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from itertools import accumulate, groupby
 from math import inf
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +19,9 @@ import numpy as np
 from vtbdrake.control.stepping import Change
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
-from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed, load_scenario
+from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError, VirtualTestbed
 from vtbdrake.testbed.addressed import record_differences
-from vtbdrake.testbed.scenario_file import is_imported
+from vtbdrake.testbed.scenario_file import is_imported, scenario_of_text
 
 VERSION = 3
 LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END = (
@@ -254,13 +252,10 @@ class LogHeader:
                 f"the log is of the scenario {name}, and importing its module runs its code: if you trust it, import "
                 f"it first, or name it on the command line (vtbdrake replay FILE --scenario {name})"
             )
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "scenario.yaml"
-            path.write_text(self.scenario)
-            try:
-                scenario = load_scenario(f"{name}@{path}")
-            except ScenarioError as error:
-                raise LogError(f"the scenario of the log, {name}, cannot be loaded in this version: {error}") from error
+        try:
+            scenario = scenario_of_text(name, self.scenario)
+        except ScenarioError as error:
+            raise LogError(f"the scenario of the log, {name}, cannot be loaded in this version: {error}") from error
         self.check_scenario(scenario)
         return scenario
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
 import time
 import zlib
 from collections.abc import Callable, Sequence
@@ -48,6 +47,7 @@ from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import read_group, stateful_leaves
 from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
+from vtbdrake.testbed.scenario_file import scenario_text
 
 _log = logging.getLogger(__name__)
 
@@ -325,14 +325,11 @@ def _header(runtime: Runtime) -> LogHeader:
 
 
 def _scenario_text(scenario: Scenario) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scenario.yaml"
-        try:
-            scenario.save(path)
-        except Exception as error:  # Drake's writer refuses types in many ways, failed assertions among them.
-            _log.warning("YAML cannot hold the scenario, so a replay needs it as an argument: %r", error)
-            return ""
-        return path.read_text()
+    try:
+        return scenario_text(scenario)
+    except Exception as error:  # Drake's writer refuses types in many ways, failed assertions among them.
+        _log.warning("YAML cannot hold the scenario, so a replay needs it as an argument: %r", error)
+        return ""
 
 
 class StateDigest:

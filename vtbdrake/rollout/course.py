@@ -60,11 +60,16 @@ class Course:
         Raises:
             ValueError: The snapshot is of another scenario, or a value cannot be set.
         """
+        return self.driven(task, testbed=testbed).end()
+
+    def driven(self, task: RolloutTask, *, testbed: VirtualTestbed | None = None) -> DrivenRollout:
+        """Compute the course again as `rollout` does, and return the rollout where it ends."""
         driven = DrivenRollout(task, self.start, step=self.step, testbed=testbed)
         writes = dict(self.writes)
         while driven.result is None and driven.steps != self.steps:
             driven.advance(writes.get(driven.steps, {}))
-        return driven.end()
+        driven.end()
+        return driven
 
     def to_dict(self) -> dict[str, Any]:
         """Return the course as plain data, from which `from_dict` makes an equal one."""
@@ -161,6 +166,14 @@ class DrivenRollout:
             self._writes.append((self.steps, {address: np.array(value) for address, value in values.items()}))
         self.steps += 1
         self._go(False)
+
+    def read(self, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
+        """Return values of variables in the present state, by address.
+
+        Raises:
+            AddressError: There is no such variable.
+        """
+        return self._runner.testbed.variables().read(self.context, addresses)
 
     def end(self) -> RolloutResult:
         """End the rollout here, unless it has ended, and return its result."""

@@ -7,6 +7,7 @@ import importlib
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from inspect import isabstract
@@ -63,6 +64,30 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
     scenario = _load_yaml(Path(file), name, key) if is_file else scenario_class(text)()
     scenario.validate()
     return scenario
+
+
+def scenario_of_text(name: str, text: str) -> Scenario:
+    """Return the scenario ``package.module:Class`` with the fields of a text that `scenario_text` has returned.
+
+    Raises:
+        ScenarioError: As in `load_scenario`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        path.write_text(text, "utf-8")
+        return load_scenario(f"{name}@{path}")
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """Return the text of the file that `save_scenario` writes.
+
+    Raises:
+        ScenarioError: A field is of a type that no file can hold.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        save_scenario(scenario, path)
+        return path.read_text("utf-8")
 
 
 def file_and_key(source: str) -> tuple[str, str]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import io
+import re
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
@@ -32,6 +34,7 @@ class Server:
 
     Args:
         session: The session.
+        folder: Where tests are saved.
         port: The port; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer it.
 
@@ -42,8 +45,8 @@ class Server:
         PortError: The port is taken.
     """
 
-    def __init__(self, session: Session, *, port: int = 0, hosts: Collection[str] = ()) -> None:
-        self._session = session
+    def __init__(self, session: Session, *, folder: Path = Path(), port: int = 0, hosts: Collection[str] = ()) -> None:
+        self._session, self._folder = session, folder
         self._steering: Page | None = None
         self._pages: list[Page] = []
         self._host = Host(
@@ -61,7 +64,7 @@ class Server:
         self._host.close()
 
     async def _serve_page(self, browser: WebSocket) -> None:
-        page = Page(self._session, browser)
+        page = Page(self._session, browser, self._folder)
         self._pages.append(page)
         if self._steering is None:
             self._steering = page
@@ -71,8 +74,8 @@ class Server:
             self._pages.remove(page)
             with suppress(SessionError):
                 if self._steering is page:
-                    self._steering = next(iter(self._pages), None)
                     await run_in_threadpool(self._session.deflect, {})  # Its keys are released.
+                    self._steering = next(iter(self._pages), None)
                 await run_in_threadpool(self._session.watch, page, ())
                 await run_in_threadpool(self._session.show, page, ())
 
@@ -104,8 +107,8 @@ class Server:
 class Page:
     """The connection to one page."""
 
-    def __init__(self, session: Session, browser: WebSocket) -> None:
-        self._session = session
+    def __init__(self, session: Session, browser: WebSocket, folder: Path) -> None:
+        self._session, self._folder = session, folder
         self._browser = browser
         self._watched: tuple[str, ...] = ()
         # Command -> what it does with the message; those of `_ANYBODY` do not steer.
@@ -129,6 +132,7 @@ class Page:
             "end_drive": self._end_drive,
             "layers": lambda message: session.show(self, message["layers"]),
             "landmarks": lambda message: session.landmarks(message["near"], int(message["count"])),
+            "save_test": self._save_test,
         }
 
     async def serve(self, server: Server) -> None:
@@ -178,6 +182,14 @@ class Page:
 
     def _end_drive(self, message: Mapping[str, Any]) -> dict[str, Any]:
         return self._session.end_drive(keep=bool(message["keep"])).summary()
+
+    def _save_test(self, message: Mapping[str, Any]) -> str:
+        name = str(message["name"])
+        if not re.fullmatch(r"[a-z0-9_]{1,80}", name):
+            raise SessionError(f"the name of a test has small letters, digits and _, not {name!r}")
+        path = self._folder / f"test_{name}.py"
+        self._session.save_test(path)
+        return str(path)
 
     def _watch(self, message: Mapping[str, Any]) -> None:
         self._session.watch(self, message["addresses"])

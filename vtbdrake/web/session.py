@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import queue
 import threading
 import time
@@ -13,6 +14,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import floor, inf, isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -26,6 +28,7 @@ from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
 from vtbdrake.web.drive import Driven, Driver, Handle, handles
 from vtbdrake.web.fork import CommandLimits, Differences, Fork
+from vtbdrake.web.interventions import Interventions
 from vtbdrake.web.layers import Layers
 
 if TYPE_CHECKING:
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
     from vtbdrake.optimization import Problem
+    from vtbdrake.rollout.course import Course
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
 
@@ -216,6 +220,7 @@ class Session:
         self.cameras: tuple[str, ...] = ()
         self.meshcat_url = ""
         self._start, self._values = start, dict(values or {})
+        self._interventions = Interventions(self.config.step)
         self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
         self._watched: dict[object, tuple[str, ...]] = {}
         self._shown: dict[object, tuple[str, ...]] = {}
@@ -328,6 +333,29 @@ class Session:
             SessionError: Nothing is driven.
         """
         return self._do(lambda: self._end_drive(keep))
+
+    @property
+    def course(self) -> Course | None:
+        """Return what was done last: the last drive that was ended, or what was set since; None if nothing was.
+
+        What is set one after another is one course, which begins at the first of it, and ends now.
+        """
+        return self._do(lambda: self._interventions.course(self._context.get_time()))
+
+    def save_test(self, path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> None:
+        """Save the last `course` as a test that pytest runs; it takes as long as the course.
+
+        The test expects the quality of the session's problem; without a problem, the values at the end of the course:
+        of the watched variables, or if there are none, of all that moves.
+
+        Args:
+            path: The file, test_NAME.py; the snapshot NAME.vtb comes beside it.
+            tolerance: The relative difference that the test allows.
+
+        Raises:
+            ValueError: Nothing has been set or driven, or a reason of `save_course`.
+        """
+        self._do(lambda: self._save_test(Path(path), tolerance))
 
     def cancel_comparison(self) -> None:
         """End the course without the last intervention."""
@@ -454,6 +482,7 @@ class Session:
         if self._start is None:
             self._simulator.Initialize()
         self._failure = ""
+        self._interventions.forget()
         self._history.clear()
         self._kept_at = -inf
 
@@ -671,7 +700,9 @@ class Session:
             self._end_preview()
             return
         before = self._testbed.fork(self._simulator) if compare else None
+        state = before or self._testbed.snapshot(self._context)
         self._testbed.write(self._context, values)
+        self._interventions.add(state, values)
         self._end_preview()
         if before is not None:
             self._begin_comparison(before)
@@ -696,6 +727,7 @@ class Session:
 
     def _go_on_from(self, snapshot: Snapshot) -> None:
         self._playing = False
+        self._interventions.forget()
         self._context = self._testbed.default_context()
         self._testbed.restore(self._context, snapshot)
         self._simulator = self._testbed.simulator(self._context, restored=True)
@@ -723,7 +755,19 @@ class Session:
         if not keep:
             self._end_comparison()
         self._go_on_from(snapshot)
+        self._interventions.forget(driven.course)
         return driven
+
+    def _save_test(self, path: Path, tolerance: float) -> None:
+        from vtbdrake.testing.saved_course import save_course
+
+        self._refuse_driven("saving")
+        course = self._interventions.course(self._context.get_time())
+        if course is None:
+            raise SessionError("there is nothing to save: set something, or drive")
+        task = None if self.problem is None else self.problem.task
+        watched = [a for a in self._readers if a in self._testbed.variables()]
+        save_course(path, course, self._testbed, task=task, addresses=watched, tolerance=tolerance)
 
     def _begin_preview(self, values: dict[str, Any]) -> None:
         fork = Fork(self._testbed, self._testbed.snapshot(self._context), values)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.lazy import extra_module
@@ -57,6 +59,7 @@ def view(
     values: Mapping[str, Any] | None = None,
     config: SessionConfig | None = None,
     problem: Problem | None = None,
+    folder: str | os.PathLike[str] = ".",
     port: int = 0,
     hosts: Collection[str] = (),
 ) -> View:
@@ -68,6 +71,7 @@ def view(
         values: Variables that are set first, by address.
         config: How it runs.
         problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
+        folder: Where the page saves tests.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
 
@@ -82,7 +86,7 @@ def view(
 
     session = Session(scenario, start=start, values=values, config=config, problem=problem)
     try:
-        return View(session, Server(session, port=port, hosts=hosts))
+        return View(session, Server(session, folder=Path(folder), port=port, hosts=hosts))
     except BaseException:
         session.close()
         raise
