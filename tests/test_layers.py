@@ -30,6 +30,7 @@ BELOW: dict[str, set[str]] = {
     "deployment": {"state", "testbed", "control", "lcm", "recording", "monitoring"},
     "station": {"state", "testbed", "control", "lcm", "monitoring", "deployment"},
     "components": {"state"},
+    "compiled": {"state", "testbed", "components"},
     "calibration": {
         "state",
         "testbed",
@@ -74,9 +75,9 @@ TOP = {"visualization", "web", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
 # `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, and a testbed
-# is shown by `web`, which lets `testing` save a course as a test.
+# is shown by `web`, which lets `testing` save a course as a test, and compiled by `compiled`.
 MAY_DELEGATE: dict[str, set[str]] = {
-    "testbed": {"calibration", "deployment", "visualization", "web"},
+    "testbed": {"calibration", "compiled", "deployment", "visualization", "web"},
     "web": {"testing"},
     **{layer: {"visualization"} for layer in ("rollout", "optimization", "reasoning", "calibration")},
 }

@@ -67,10 +67,10 @@ class SplineCommand(AddressedSystem):
             raise ValueError(f"SplineCommand: period is positive, in s, not {period}")
         if size < 1:
             raise ValueError(f"SplineCommand: a value has at least one entry, not {size}")
-        self._spline, self._size, self._repeat = spline, int(size), bool(repeat)
+        self.spline, self._size, self.repeat = spline, int(size), bool(repeat)
         # Computed here, since it takes longer than a cycle of a loop.
         _ = spline.pieces
-        self._after = None if after is None else _vector("after", after, self._size)
+        self.after = None if after is None else _vector("after", after, self._size)
         self._plan = self.DeclareVectorInputPort("plan", 1 + spline.knots * self._size)
         first = _vector("initial", initial, self._size)
         self._value = self.declare_discrete_state(value=Quantity(first if size > 1 else first.item(), unit))
@@ -78,18 +78,18 @@ class SplineCommand(AddressedSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        plan, spline = self._plan.Eval(context), self._spline
+        plan, spline = self._plan.Eval(context), self.spline
         if not isfinite(plan @ plan):
             raise ValueError(f"SplineCommand: the plan is [t_begin, knots] in finite numbers, not {plan.tolist()}")
         t = context.get_time() - float(plan[0])
         if t < -_ROUNDING:
             return
-        if self._repeat:
+        if self.repeat:
             # Rounded down a little before the end: the sample at the end is the first again.
             t = (t + _ROUNDING) % spline.duration - _ROUNDING
         value = self._value.mutable_array(state)
-        if t > spline.duration + _ROUNDING and self._after is not None:
-            value[:] = self._after
+        if t > spline.duration + _ROUNDING and self.after is not None:
+            value[:] = self.after
         else:
             spline.write_value(min(max(t, 0.0), spline.duration), plan[1:], value)
 

@@ -18,6 +18,7 @@ from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.rollout.recorded_motion import RecordedMotion
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.instants import sample_instants, sample_times
 from vtbdrake.testbed.scenario import check_is_scenario
 
 THRESHOLD = "threshold"
@@ -243,31 +244,16 @@ class RolloutTask:
 
     def sample_times(self) -> np.ndarray:
         """Return the sample times from 0 to t_m, in seconds: the multiples of the sample period, and t_m."""
-        times = np.arange(np.floor(self.horizon / self.sample_period * (1.0 + 1e-12)) + 1.0) * self.sample_period
-        rest = self.horizon - times[-1]
-        return np.append(times, self.horizon) if rest > 1e-9 * self.sample_period else times
+        return sample_times(self.horizon, self.sample_period)
 
     def instants(
         self, t0: float, timings: Sequence[tuple[float, float]], *, times: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the simulator's time at each sample: t0 + t, or that of the first event that coincides up to rounding.
-
-        Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
-        advanced to the one would take another step, of 1e-16 s, to the other. And the updates of the other would have
-        happened at some of the samples, which are to show the state before all updates of their instant.
+        """Return the simulator's time at each sample from t0 (s) on; see `sample_instants`.
 
         Args:
             t0: Time at which rollouts begin, in seconds.
             timings: (period, offset) of the testbed's periodic events, see `AddressedDiagram.event_timings`.
             times: Other times from t0 instead of the samples', in seconds; the first is 0.
         """
-        times = t0 + (self.sample_times() if times is None else times)
-        # Two ways to compute an instant may differ by some roundings.
-        close = 8.0 * np.spacing(np.maximum(np.abs(times), 1.0))
-        first = np.full(times.shape, np.inf)
-        for period, offset in timings:
-            events = offset + np.maximum(np.round((times - offset) / period), 0.0) * period
-            first = np.where(np.abs(events - times) <= close, np.minimum(first, events), first)
-        instants = np.where(np.isfinite(first), first, times)
-        instants[0] = t0
-        return instants
+        return sample_instants(self.sample_times() if times is None else times, t0, timings)

@@ -22,6 +22,7 @@ from vtbdrake.testbed.signal import SignalError
 from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
 if TYPE_CHECKING:
+    from vtbdrake.compiled import CompiledRollouts
     from vtbdrake.testbed.builder import VirtualTestbedBuilder
     from vtbdrake.testbed.scenario import Scenario
     from vtbdrake.testbed.signal import Interface
@@ -305,6 +306,54 @@ class VirtualTestbed(AddressedDiagram):
         for selectors, positions in ((self._sense, senses), (self._act, acts)):
             for name, position in positions.items():
                 selectors[name].set(context, position)
+
+    def compiled(
+        self,
+        *,
+        horizon: float,
+        sample_period: float = 0.05,
+        parameters: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+        context: Context | None = None,
+        compile: bool | None = None,
+        check: bool = True,
+        workers: int = 1,
+    ) -> CompiledRollouts:
+        """Turn the testbed, its DPS included, into one compiled function of a whole rollout.
+
+        Args:
+            horizon: The length of a rollout (s).
+            sample_period: The period of the samples (s), which are taken before the updates of their instant.
+            parameters: Addresses that will vary. State, commands and parameters of most systems can be varied without
+                being named; masses and others of the plant, and errors of sensors that are 0, have to be.
+            outputs: Addresses of variables or vector output ports to be recorded at the samples.
+            context: Where rollouts begin, and what is compiled in; s0 if left out. All switches are at sim.
+            compile: Whether to make machine code, which is kept for the next time; None does so if there is a C
+                compiler, else CasADi interprets the function.
+            check: Whether to compare rollouts with Drake's, step by step.
+            workers: The number of threads for large batches.
+
+        Raises:
+            UnsupportedTestbedError: Parts of the testbed cannot be compiled; all are named, with a remedy.
+            CompiledDifferenceError: A compiled rollout differs from Drake's.
+            ValueError: An address does not exist, or cannot be varied.
+            CompilerError: ``compile`` is True, and there is no C compiler, or it fails.
+        """
+        from vtbdrake.compiled import CompiledRollouts
+
+        return CompiledRollouts(
+            self.diagram,
+            self.variables(),
+            self.default_context() if context is None else context,
+            horizon=horizon,
+            sample_period=sample_period,
+            parameters=parameters,
+            outputs=outputs,
+            timings=self.event_timings(),
+            compile=compile,
+            check=check,
+            workers=workers,
+        )
 
     def view(self, context: Context | None = None, **options: Any) -> View:
         """Run a copy of this testbed in the background, with a web page where it is watched and steered.

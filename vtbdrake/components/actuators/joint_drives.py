@@ -104,7 +104,7 @@ class JointDrives(AddressedSystem):
             "coulomb_velocity": coulomb_velocity,
         }
         entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in by_joint.items()}
-        self._max_delay = max(int(delay), int(max_delay))
+        self.max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
         self._period, self._n = float(period), n
         self._command = self.DeclareVectorInputPort("command", n)
@@ -114,17 +114,17 @@ class JointDrives(AddressedSystem):
         self.DeclareStateOutputPort("torque", self._torque.index)
         # One group for all internal state: every group costs more than the arithmetic.
         memory = {"motor_torque": Quantity(before, "N m"), "reference": Quantity(before, "N m")}
-        if self._max_delay:
-            memory["in_transit"] = Quantity(np.tile(before, (self._max_delay, 1)), "N m")
+        if self.max_delay:
+            memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
         self._memory = self.declare_discrete_state(**memory)
         units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
         self._settings = self.declare_parameters(
             **{name: Quantity(value, units[name], (0.0, inf)) for name, value in entries.items()},
             time_constant=Quantity(time_constant, "s", (0.0, inf)),
-            delay=Quantity(delay, "period", (0.0, float(self._max_delay))),
+            delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
         velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
-        self._kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
+        self.kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
 
     @property
@@ -136,20 +136,20 @@ class JointDrives(AddressedSystem):
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""
         torque = np.asarray(command, dtype=float)
         context.SetDiscreteState(self._torque.index, torque)
-        context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self._max_delay))
+        context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self.max_delay))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         n = self._n
         settings, memory = self._settings.array(context), self._memory.mutable_array(state)
         delayed = u = self._command.Eval(context)
-        if self._max_delay:
+        if self.max_delay:
             in_transit = self._memory.vector.view(memory).in_transit
             if delay := round(self._settings.vector.view(settings).delay):
                 delayed = in_transit[delay - 1].copy()
             in_transit[1:] = in_transit[:-1]
             in_transit[0] = u
         # The torques, then what the motors and their references have become.
-        y = self._kernel.value((settings, memory[: 2 * n], delayed, self._state_port.Eval(context)))
+        y = self.kernel.value((settings, memory[: 2 * n], delayed, self._state_port.Eval(context)))
         self._torque.mutable_array(state)[:] = y[:n]
         memory[: 2 * n] = y[n:]
 

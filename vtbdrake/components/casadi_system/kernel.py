@@ -60,6 +60,11 @@ class Kernel:
         self._jacobian: Buffers | None = None
         self.value = evaluator(self._buffers(self._name, y))
 
+    def expression(self, arguments: Sequence[Expression]) -> Expression:
+        """Return y of expressions, which stand for the arguments."""
+        function = casadi.Function(self._name, self._arguments, [self._y])
+        return function.call(list(arguments), True, False)[0]
+
     def autodiff(self, blocks: Sequence[ArrayLike]) -> NDArray[np.object_]:
         """Return y of AutoDiffXd, by the chain rule dy = (dy/dz) dz with CasADi's dy/dz."""
         z = np.concatenate(blocks)

@@ -132,6 +132,12 @@ def CasadiSystem_(T: type) -> type:
             if model.update is not None:
                 self.DeclarePeriodicDiscreteUpdateEvent(model.period, 0.0, self._update(model.update))
 
+        @property
+        def model(self) -> Model:
+            """Return the functions of the system."""
+            model: Model = self._model
+            return model
+
         def _calc(self, result: Result) -> Callable[[Context, Any], None]:
             return Impl._handler(self, result, deliver=BasicVector_[T].set_value, updates=False)
 

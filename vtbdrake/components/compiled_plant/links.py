@@ -278,7 +278,7 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     if grounded and np.any(plant.gravity_field().gravity_vector()):
         instances = {plant.GetModelInstanceName(ModelInstanceIndex(body.model_instance())) for body in grounded}
         yield f"gravity is disabled for the model instances {', '.join(sorted(instances))}"
-    yield from _contacts(plant, context)
+    yield from contacts(plant, context)
 
 
 def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
@@ -290,7 +290,7 @@ def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
             yield f"the input port {port.get_name()} is connected or has a fixed value"
 
 
-def _contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     """Yield the pairs of bodies that may touch each other."""
     port = plant.get_geometry_query_input_port()
     if not plant.num_collision_geometries() or not port.HasValue(context):

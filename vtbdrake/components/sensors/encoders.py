@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 
 class _JointSensor(SampledSensor):
-    """Measures one entry of the plant's [q; v] for each of some joints."""
+    """Measures one entry of the plant's [q; v] for each of some joints.
+
+    Attributes:
+        entries: The places of what is measured in [q; v].
+    """
 
     def __init__(
         self,
@@ -34,12 +38,12 @@ class _JointSensor(SampledSensor):
     ) -> None:
         noise = {"noise": (len(entries), unit)}
         super().__init__(signal, default=default, period=period, unit=unit, noise=noise, stream=stream, errors=errors)
-        self._entries = np.array(entries, dtype=int)
+        self.entries = np.array(entries, dtype=int)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         x: NDArray[np.float64] = self._state_port.Eval(context)
-        return x.take(self._entries)
+        return x.take(self.entries)
 
 
 class JointEncoders(_JointSensor):

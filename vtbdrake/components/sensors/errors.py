@@ -92,6 +92,14 @@ class ErrorStage:
     It declares the parameters ``seed`` and the standard deviations of white noise. With an `ErrorModel` also ``bias``,
     ``drift``, ``quantization`` (one per entry), ``latency``, ``dropout``, ``outlier_probability`` and ``outlier_size``,
     and the state ``walk`` (the drift) and ``in_transit`` (the samples not yet shown, newest first).
+
+    Attributes:
+        parameters: The group of the parameters.
+        noise: Name of a standard deviation -> the number of entries that it applies to.
+        has_model: Whether there is an `ErrorModel`: without, there is white noise only.
+        memory: The group of the state, with an `ErrorModel`.
+        longest: The largest latency in periods, with an `ErrorModel`.
+        stream: Function that returns the random stream.
     """
 
     def __init__(
@@ -120,41 +128,39 @@ class ErrorStage:
         """
         n = default.size
         self._n, self._output, self._period = n, output, period
-        self._stream = random_stream(sensor, stream)
-        self._noise = {name: count for name, (count, _) in noise.items()}
-        self._more = model is not None
+        self.stream = random_stream(sensor, stream)
+        self.noise = {name: count for name, (count, _) in noise.items()}
+        self.has_model = model is not None
         seed, std = (0, 0.0) if model is None else (model.seed, model.noise)
         positive, probability = (0.0, inf), (0.0, 1.0)
         settings = {"seed": Quantity(seed, bounds=(0.0, 2.0**53))}
         settings |= {name: Quantity(std, noise_unit, positive) for name, (_, noise_unit) in noise.items()}
         if model is not None:
-            self._longest = max(int(model.latency), int(model.max_latency))
+            self.longest = max(int(model.latency), int(model.max_latency))
             settings |= {
                 "bias": Quantity(np.full(n, model.bias), unit),
                 "drift": Quantity(np.full(n, model.drift), f"({unit})/s^0.5", positive),
                 "quantization": Quantity(np.full(n, model.quantization), unit, positive),
-                "latency": Quantity(model.latency, "period", (0.0, float(self._longest))),
+                "latency": Quantity(model.latency, "period", (0.0, float(self.longest))),
                 "dropout": Quantity(model.dropout, bounds=probability),
                 "outlier_probability": Quantity(model.outlier_probability, bounds=probability),
                 "outlier_size": Quantity(model.outlier_size, unit, positive),
             }
-        self._parameters = sensor.declare_parameters(**settings)
+        self.parameters = sensor.declare_parameters(**settings)
         self._settings = sensor.declare_cache(
-            "error settings", self._calc_settings, {sensor.numeric_parameter_ticket(self._parameters.index)}
+            "error settings", self._calc_settings, {sensor.numeric_parameter_ticket(self.parameters.index)}
         )
         if model is not None:
             memory = {"walk": Quantity(np.zeros(n), unit)}
-            if self._longest:
-                memory["in_transit"] = Quantity(np.tile(default, (self._longest, 1)), unit)
-            self._memory = sensor.declare_discrete_state(**memory)
+            if self.longest:
+                memory["in_transit"] = Quantity(np.tile(default, (self.longest, 1)), unit)
+            self.memory = sensor.declare_discrete_state(**memory)
 
     def _calc_settings(self, context: Context) -> _Settings:
-        parameters = self._parameters.view(context)
-        deviations = [getattr(parameters, name) for name in self._noise]
-        settings = _Settings(
-            int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self._noise.values())))
-        )
-        if self._more:
+        parameters = self.parameters.view(context)
+        deviations = [getattr(parameters, name) for name in self.noise]
+        settings = _Settings(int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self.noise.values()))))
+        if self.has_model:
             settings = replace(
                 settings,
                 bias=_unless_zero(parameters.bias),
@@ -166,28 +172,28 @@ class ErrorStage:
                 outlier_size=parameters.outlier_size,
             )
         if settings.noise is not None or settings.drift is not None or settings.dropout or settings.outlier_probability:
-            settings = replace(settings, stream=self._stream())
+            settings = replace(settings, stream=self.stream())
         return settings
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
         """Let ``y`` be in transit, throughout."""
-        if self._more and self._longest:
-            self._memory.mutable(context.get_mutable_discrete_state()).in_transit = y
+        if self.has_model and self.longest:
+            self.memory.mutable(context.get_mutable_discrete_state()).in_transit = y
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
-        all_but_seed = self._parameters.array(context)[1:]
-        if not (np.count_nonzero(all_but_seed) or (self._more and self._remembers(context))):
+        all_but_seed = self.parameters.array(context)[1:]
+        if not (np.count_nonzero(all_but_seed) or (self.has_model and self._remembers(context))):
             return y
         settings: _Settings = self._settings(context)
         key = {"seed": settings.seed, "stream": settings.stream, "tick": round(context.get_time() / self._period)}
         if settings.noise is not None:
             y = y + settings.noise * normal_noise(y.size, **key)
-        return self._shown(context, state, y, settings, key) if self._more else y
+        return self._shown(context, state, y, settings, key) if self.has_model else y
 
     def _remembers(self, context: Context) -> bool:
         """Return whether samples may be in transit, or the random walk has left zero."""
-        return self._longest > 0 or any(self._memory.view(context).walk.tolist())
+        return self.longest > 0 or any(self.memory.view(context).walk.tolist())
 
     def _shown(
         self,
@@ -198,7 +204,7 @@ class ErrorStage:
         key: Mapping[str, int],
     ) -> NDArray[np.float64]:
         n, q = self._n, settings.quantization
-        memory = self._memory.mutable(state)
+        memory = self.memory.mutable(state)
         walk = memory.walk
         if settings.drift is not None:
             walk += settings.drift * normal_noise(n, channel=_DRIFT_CHANNEL, **key)
@@ -213,7 +219,7 @@ class ErrorStage:
         if q is not None:
             steps = np.where(q > 0.0, q, 1.0)
             y = np.where(q > 0.0, np.round(y / steps) * steps, y)
-        if self._longest:
+        if self.longest:
             in_transit, newest = memory.in_transit, y
             if settings.latency:
                 y = in_transit[settings.latency - 1].copy()

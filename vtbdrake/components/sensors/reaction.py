@@ -51,7 +51,7 @@ class ForceTorqueSensor(SampledSensor):
         stream: int | None = None,
         errors: ErrorModel | None = None,
     ) -> None:
-        (self._place,) = places(plant, [joint])
+        (self.place,) = places(plant, [joint])
         super().__init__(
             "wrench",
             default=np.zeros(6),
@@ -64,7 +64,7 @@ class ForceTorqueSensor(SampledSensor):
         self._port = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        F_CJc_Jc: SpatialForce = self._port.Eval(context)[self._place]
+        F_CJc_Jc: SpatialForce = self._port.Eval(context)[self.place]
         return -F_CJc_Jc.get_coeffs()
 
 
@@ -100,9 +100,9 @@ class JointTorqueSensors(SampledSensor):
                     f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute and "
                     "prismatic joints."
                 )
-        self._places = places(plant, joints)
+        self.places = places(plant, joints)
         # In Jc and in the frame of the parent, an axis has the same components. A torque is the power at unit rate.
-        self._motions = [_unit_velocity(joint) for joint in joints]
+        self.motions = [_unit_velocity(joint) for joint in joints]
         unit = ", ".join(dict.fromkeys("N" if joint.type_name() == "prismatic" else "N m" for joint in joints))
         super().__init__(
             "joint_torque",
@@ -117,7 +117,7 @@ class JointTorqueSensors(SampledSensor):
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         F_CJc_Jc = self._port.Eval(context)
-        return np.array([F_CJc_Jc[k].dot(motion) for k, motion in zip(self._places, self._motions, strict=True)])
+        return np.array([F_CJc_Jc[k].dot(motion) for k, motion in zip(self.places, self.motions, strict=True)])
 
 
 def _unit_velocity(joint: Joint) -> SpatialVelocity:

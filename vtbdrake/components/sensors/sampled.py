@@ -70,9 +70,9 @@ class SampledSensor(AddressedSystem):
                 raise ValueError(
                     f"{type(self).__name__} has no noise, but noise={errors.noise:g} is given: leave it out."
                 )
-        self._stage: ErrorStage | None = None
+        self.errors: ErrorStage | None = None
         if noise or errors is not None:
-            self._stage = ErrorStage(
+            self.errors = ErrorStage(
                 self,
                 errors,
                 noise=noise,
@@ -99,8 +99,8 @@ class SampledSensor(AddressedSystem):
             y: The last reading, shape (n,).
         """
         context.SetDiscreteState(self._output, y)
-        if self._stage is not None:
-            self._stage.resume(context, y)
+        if self.errors is not None:
+            self.errors.resume(context, y)
 
     def measurement(self, context: Context) -> NDArray[np.float64]:
         """Return what the sensor would measure now, without its errors, shape (n,)."""
@@ -112,8 +112,8 @@ class SampledSensor(AddressedSystem):
 
     def _sample(self, context: Context, state: DiscreteValues) -> None:
         y = self._measure(context, state)
-        if self._stage is not None:
-            y = self._stage.apply(context, state, y)
+        if self.errors is not None:
+            y = self.errors.apply(context, state, y)
         state.set_value(self._output, y)
 
 

@@ -1,0 +1,167 @@
+"""The cart-pole's testbed, compiled with its sensors and its DPS."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi
+import numpy as np
+import pytest
+
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.rollout import RolloutTask, SerialExecutor
+from vtbdrake.testbed import Scenario
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+
+HORIZON, SAMPLE_PERIOD = 1.0, 0.03
+OUTPUTS = ("plant.state", "dps.force", "dps.env.discrete_state_0", "sim.sys.cart_pole.pole_pin.position", "time")
+MASS, DAMPING, BIAS = (
+    "sim.sys.cart_pole.pole.mass",
+    "sim.sys.cart_pole.pole_pin.damping",
+    "sim.sense.joint_position.bias",
+)
+
+ERRORS = ErrorModel(
+    noise=0.01,
+    bias=0.1,
+    drift=0.02,
+    quantization=0.003,
+    latency=2,
+    dropout=0.2,
+    outlier_probability=0.2,
+    outlier_size=0.5,
+)
+SCENARIOS = {
+    "exact": CartPoleScenario(),
+    "mental": CartPoleScenario().mental(),
+    "errors": CartPoleScenario(position_errors=ERRORS, velocity_errors=replace(ERRORS, seed=1, latency=0)),
+}
+
+
+def plans(n: int) -> np.ndarray:
+    knots = np.random.default_rng(0).uniform(-60.0, 60.0, (n, 10))
+    return np.column_stack([np.zeros(n), knots])
+
+
+def compiled(scenario: Scenario, **options) -> CompiledRollouts:
+    arguments = {"horizon": HORIZON, "sample_period": SAMPLE_PERIOD, "outputs": OUTPUTS, "compile": False}
+    return scenario.build().compiled(**{**arguments, **options})
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_equals_rollouts_in_drake(name: str) -> None:
+    scenario = SCENARIOS[name]
+    batch = compiled(scenario, parameters=[MASS])({"u.plan": plans(3), MASS: [0.8, 1.0, 1.3]})
+    points = [{"u.plan": plan, MASS: mass} for plan, mass in zip(plans(3), (0.8, 1.0, 1.3), strict=True)]
+    task = RolloutTask(scenario, HORIZON, sample_period=SAMPLE_PERIOD, record=OUTPUTS)
+    with SerialExecutor() as executor:
+        for i, result in executor.run(task, points):
+            for address in OUTPUTS:
+                np.testing.assert_allclose(batch.outputs[address][i], result.record[address], rtol=1e-11, atol=1e-11)
+    assert batch.valid.all()
+
+
+def test_begins_in_any_context() -> None:
+    scenario = SCENARIOS["errors"]
+    testbed = scenario.build()
+    rollouts = testbed.compiled(horizon=0.4, sample_period=0.02, outputs=OUTPUTS, compile=False)
+    context = testbed.default_context()
+    testbed.write(context, {"u.plan": plans(1)[0]})
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(0.3)
+    batch = rollouts(context=context)
+    states = [testbed.read(context, "plant.state")]
+    for k in range(1, 21):
+        simulator.AdvanceTo((15 + k) * 0.02)
+        states.append(testbed.read(context, "plant.state"))
+    np.testing.assert_allclose(batch.outputs["plant.state"][0], states, rtol=1e-11, atol=1e-11)
+
+
+def test_threads_and_batches_change_nothing() -> None:
+    values = {"u.plan": plans(150)}
+    alone = compiled(SCENARIOS["mental"], workers=1)
+    threads = compiled(SCENARIOS["mental"], workers=3)
+    state = threads(values).outputs["plant.state"]
+    np.testing.assert_array_equal(state, alone(values).outputs["plant.state"])
+    single = alone({"u.plan": values["u.plan"][149]})
+    np.testing.assert_array_equal(state[149], single.outputs["plant.state"][0])
+
+
+def test_machine_code_gives_the_same_numbers() -> None:
+    values = {"u.plan": plans(4)}
+    by_machine = compiled(SCENARIOS["exact"], compile=True)(values).outputs["plant.state"]
+    np.testing.assert_array_equal(by_machine, compiled(SCENARIOS["exact"])(values).outputs["plant.state"])
+
+
+def test_slope_is_that_of_differences() -> None:
+    rollouts = compiled(SCENARIOS["mental"], outputs=["plant.state"])
+    z = casadi.MX.sym("z", rollouts.walker.size)
+    end, _ = rollouts.function(z, *rollouts.arguments())
+    slope = casadi.Function(
+        "slope", [z], [casadi.jacobian(end[rollouts.walker.place("sim.sys.cart_pole.pole_pin.position")], z)]
+    )
+    knots = rollouts.walker.place("u.plan")
+    z0 = rollouts.filled(rollouts.z_of(rollouts.walker.context), {"u.plan": plans(1)[0]})[0]
+    exact = slope(z0).full().ravel()[knots]
+
+    def angle(k: int, step: float) -> float:
+        plan = plans(1)[0]
+        plan[k] += step
+        return rollouts({"u.plan": plan}).outputs["plant.state"][0, -1, 1]
+
+    differences = [(angle(k, 1e-4) - angle(k, -1e-4)) / 2e-4 for k in range(1, 11)]
+    np.testing.assert_allclose(exact[1:], differences, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        (MASS, "compiled in: name it in parameters="),
+        ("sim.sys.cart_pole.pole_pin.locked", "no input of a compiled plant"),
+        ("T_sense.joint_position", "positions of the switches"),
+        ("sim.sys.cart_pole.pole.roll", "no input of a compiled plant"),
+    ],
+)
+def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
+    rollouts = compiled(SCENARIOS["exact"])
+    with pytest.raises(ValueError, match=reason):
+        rollouts({address: 1.0})
+
+
+def test_refuses_values_that_do_not_fit() -> None:
+    rollouts = compiled(SCENARIOS["exact"])
+    with pytest.raises(ValueError, match=r"shape \(11,\)"):
+        rollouts({"u.plan": np.zeros(10)})
+    with pytest.raises(ValueError, match=r"lies in \[-1e\+09"):
+        rollouts({"u.plan": np.full(11, 100.0)})
+    with pytest.raises(ValueError, match="3 values of u.plan, but 2"):
+        rollouts({BIAS: np.zeros((2, 2)), "u.plan": plans(3)})
+
+
+def test_errors_that_are_zero_are_named_to_be_varied() -> None:
+    noise = "sim.sense.joint_position.noise"
+    with pytest.raises(UnsupportedTestbedError, match="name it in parameters="):
+        compiled(SCENARIOS["exact"])({noise: 0.1})
+    batch = compiled(SCENARIOS["exact"], parameters=[noise])({noise: [0.0, 0.1], "u.plan": plans(1)[0]})
+    perceived = batch.outputs["dps.env.discrete_state_0"]
+    assert np.std(perceived[1, :, 0] - perceived[0, :, 0]) == pytest.approx(0.1, rel=0.4)
+
+
+def test_refuses_a_context_with_other_masses() -> None:
+    testbed = SCENARIOS["exact"].build()
+    rollouts = testbed.compiled(horizon=0.1, sample_period=0.05, compile=False)
+    context = testbed.default_context()
+    testbed.write(context, {DAMPING: 0.3})
+    with pytest.raises(UnsupportedTestbedError, match="plant differs from what was compiled"):
+        rollouts(context=context)
+
+
+def test_refuses_the_real_side() -> None:
+    testbed = SCENARIOS["exact"].build()
+    context = testbed.default_context()
+    testbed.diagram.GetInputPort("real.sense.joint_position").FixValue(context, np.zeros(2))
+    testbed.switch(context, sense={"joint_position": "real"})
+    rollouts = testbed.compiled(horizon=0.1, sample_period=0.05, compile=False)
+    with pytest.raises(UnsupportedTestbedError, match="switches differs from what was compiled"):
+        rollouts(context=context)

@@ -1,0 +1,163 @@
+"""What cannot be compiled is refused by name, and what is compiled wrongly is noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, System
+from pydrake.systems.primitives import Adder, ConstantVectorSource, Gain, Integrator, ZeroOrderHold
+
+from vtbdrake.compiled import (
+    EQUATIONS,
+    At,
+    CompiledDifferenceError,
+    CompiledRollouts,
+    Equations,
+    UnsupportedTestbedError,
+)
+from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.state.systems import collect
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+
+
+class Squares(AddressedSystem):
+    """A system in Python: x becomes x^2 + 1 / 10."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._x = self.declare_discrete_state(x=Quantity(0.5))
+        self.DeclareStateOutputPort("x", self._x.index)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, self._update)
+
+    def _update(self, context: Context, state) -> None:
+        self._x.mutable_array(state)[0] = self._x.array(context)[0] ** 2 + 0.1
+
+
+class SquaresEquations(Equations):
+    def output(self, port: str, at: At):
+        return at.state(0)
+
+    def update(self, at: At):
+        return {0: at.state(0) ** 2 + 0.1}
+
+
+class WrongEquations(SquaresEquations):
+    def update(self, at: At):
+        return {0: at.state(0) ** 2 + 0.1000001}
+
+
+def alone(*systems: System) -> Diagram:
+    builder = DiagramBuilder()
+    for k, system in enumerate(systems):
+        builder.AddNamedSystem(f"part{k}", system)
+        if k:
+            builder.Connect(systems[k - 1].get_output_port(), system.get_input_port())
+    return builder.Build()
+
+
+def compiled(diagram: Diagram, outputs: tuple[str, ...] = (), **options) -> CompiledRollouts:
+    context = diagram.CreateDefaultContext()
+    return CompiledRollouts(
+        diagram,
+        collect(diagram),
+        context,
+        horizon=1.0,
+        sample_period=0.1,
+        outputs=outputs,
+        **{"compile": False, **options},
+    )
+
+
+@pytest.mark.parametrize(
+    ("diagram", "reason"),
+    [
+        (lambda: alone(Squares()), "part0: Squares is a LeafSystem in Python: write its equation as a casadi.Function"),
+        (lambda: alone(ConstantVectorSource([1.0]), Integrator(1)), "part1: Integrator has continuous state"),
+    ],
+)
+def test_names_the_system(diagram: Callable[[], Diagram], reason: str) -> None:
+    with pytest.raises(UnsupportedTestbedError, match=reason):
+        compiled(diagram())
+
+
+def test_names_contact() -> None:
+    with pytest.raises(UnsupportedTestbedError, match=r"plant: MultibodyPlant has contact.*slab and tool can collide"):
+        ManipulatorScenario(wall=True).build().compiled(horizon=0.1, compile=False)
+
+
+def test_unconnected_inputs_are_named() -> None:
+    with pytest.raises(UnsupportedTestbedError, match="part0: nothing is connected to the input port u"):
+        compiled(alone(ZeroOrderHold(0.1, 1)))
+
+
+class Loop(LeafSystem):
+    """Claims that its output does not depend on its input, which Drake believes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareVectorInputPort("u", 1)
+        self.DeclareVectorOutputPort("y", 1, lambda c, y: None, prerequisites_of_calc={self.nothing_ticket()})
+
+
+class LoopEquations(Equations):
+    def output(self, port: str, at: At):
+        return at.input("u")
+
+
+def test_algebraic_loops_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Loop, LoopEquations)
+    builder = DiagramBuilder()
+    loop, gain = builder.AddNamedSystem("loop", Loop()), builder.AddNamedSystem("gain", Gain(2.0, 1))
+    builder.Connect(loop.get_output_port(), gain.get_input_port())
+    builder.Connect(gain.get_output_port(), loop.get_input_port())
+    with pytest.raises(UnsupportedTestbedError, match="algebraic loop.*gain -> loop -> gain"):
+        compiled(builder.Build(), outputs=("gain.y0",))
+
+
+def test_equations_can_be_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Squares, SquaresEquations)
+    x = compiled(alone(Squares()), outputs=("part0.x",))().outputs["part0.x"][0]
+    assert x[1] == 0.5**2 + 0.1
+    assert x.shape == (11,)
+
+
+def test_wrong_equations_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Squares, WrongEquations)
+    with pytest.raises(CompiledDifferenceError, match=r"state of part0 differs .* by 1e-07 at t = 0.1 s"):
+        compiled(alone(Squares()))
+    compiled(alone(Squares()), check=False)
+
+
+class Started(Squares):
+    """Sets its state when a simulation begins."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareInitializationDiscreteUpdateEvent(lambda context, state: state.set_value(0, [0.2]))
+
+
+def test_initialization_events_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Started, SquaresEquations)
+    with pytest.raises(UnsupportedTestbedError, match="part0 is changed by an initialization event"):
+        compiled(alone(Started()))
+
+
+def test_without_a_compiler_it_is_interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    diagram = alone(ConstantVectorSource([0.3]), ZeroOrderHold(0.1, 1), Gain(3.0, 1))
+    batch = compiled(diagram, outputs=("part2.y0",), compile=None)()
+    np.testing.assert_array_equal(batch.outputs["part2.y0"][0].ravel(), [0.0] + 10 * [3.0 * 0.3])
+
+
+def test_sums_of_what_is_compiled_need_no_state() -> None:
+    builder = DiagramBuilder()
+    source, adder = (
+        builder.AddNamedSystem("source", ConstantVectorSource([1.0])),
+        builder.AddNamedSystem("sum", Adder(2, 1)),
+    )
+    builder.Connect(source.get_output_port(), adder.get_input_port(0))
+    builder.Connect(source.get_output_port(), adder.get_input_port(1))
+    rollouts = compiled(builder.Build(), outputs=("sum.sum",))
+    np.testing.assert_array_equal(rollouts({"source.value": [[2.0], [3.0]]}).outputs["sum.sum"][:, -1, 0], [4.0, 6.0])

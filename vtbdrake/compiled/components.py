@@ -1,0 +1,255 @@
+"""The equations of this package's own systems, but for the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from math import inf, sqrt
+from typing import Any
+
+import casadi
+import numpy as np
+from pydrake.systems.framework import Context, System
+
+from vtbdrake.arrays import Array
+from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Fixed, refusal
+from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, Model, Result
+from vtbdrake.components.sensors import errors as sensor_errors
+from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
+
+# As a SplineCommand rounds.
+_ROUNDING = 1e-9
+
+
+class CasadiEquations(Equations):
+    """A `CasadiSystem`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        self._model: Model = system.model
+
+    def output(self, port: str, at: At) -> Expression:
+        return self._value(self._model.outputs[port], at)
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        model = self._model
+        if model.update is None:
+            return {}
+        ends = np.cumsum([0, *(model.size(name) for name in model.state)]).tolist()
+        return dict(enumerate(casadi.vertsplit(self._value(model.update, at), ends)))
+
+    def _value(self, result: Result, at: At) -> Expression:
+        arguments = []
+        for block in result.blocks:
+            if block.source == PARAMETER:
+                ends = np.cumsum([0, *(self._model.size(name) for name in block.names)]).tolist()
+                arguments += casadi.vertsplit(at.parameter(0), ends)
+            elif block.source == STATE:
+                arguments.append(at.state(self._model.state_index(block.names[0])))
+            else:
+                arguments.append(at.input(block.names[0]) if block.source == INPUT else at.time)
+        try:
+            return casadi.densify(result.kernel.expression(arguments))
+        except RuntimeError as error:
+            raise refusal(
+                self.system, f"is no function of scalar operations ({str(error).splitlines()[-1]}): keep it in Drake"
+            ) from None
+
+
+class SplineEquations(Equations):
+    """A `SplineCommand`."""
+
+    def output(self, port: str, at: At) -> Expression:
+        return at.state(0)
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        system: Any = self.system
+        spline, plan, before = system.spline, at.input("plan"), at.state(0)
+        late = at.time - plan[0]
+        t = late
+        if system.repeat:
+            t = casadi.fmod(t + _ROUNDING, spline.duration) - _ROUNDING
+        within = casadi.fmin(casadi.fmax(t, 0.0), spline.duration)
+        value = _spline_value(spline, within, casadi.reshape(plan[1:], before.numel(), spline.knots).T)
+        if system.after is not None:
+            value = casadi.if_else(t > spline.duration + _ROUNDING, casadi.SX(system.after), value)
+        value = casadi.if_else(late < -_ROUNDING, before, value)
+        # The system raises.
+        return {0: casadi.if_else(casadi.sumsqr(plan) < inf, value, casadi.SX.nan(value.numel(), 1))}
+
+
+def _spline_value(spline: Any, t: Expression, knots: Expression) -> Expression:
+    """Return the value at ``t``, shape (m, 1), of knots of shape (n, m)."""
+    pieces = spline.pieces
+    i = casadi.fmin(casadi.floor(t / spline.step + _ROUNDING), len(pieces) - 1)
+    s = casadi.fmax(t - i * spline.step, 0.0)
+    powers = [casadi.SX(1.0), s, s * s, s * s * s]
+    value = casadi.SX(knots.shape[1], 1)
+    for k in range(pieces.shape[1]):
+        if pieces[:, k].any():
+            at_pieces = casadi.sparsify(casadi.SX(casadi.DM(pieces[:, k]))) @ knots
+            selected = sum(casadi.if_else(i == piece, at_pieces[piece, :].T, 0.0) for piece in range(len(pieces)))
+            value += powers[k] * selected
+    return value
+
+
+class SensorEquations(Equations):
+    """A `SampledSensor`: what it measures is said by ``measure``, its `ErrorModel` is the same for all.
+
+    A sensor's memory for the next measurement is not covered, and its standard deviations, drift, quantization,
+    drop-out and outliers are left out where they are 0.
+    """
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str], measure: Callable[[At], Expression]):
+        super().__init__(system, context, varied)
+        self._measure = measure
+        self._errors: sensor_errors.ErrorStage | None = system.errors
+        self._present: dict[str, bool] = {}
+        if self._errors is None:
+            return
+        values = self._errors.parameters.view(context)
+        names = [*self._errors.noise]
+        if self._errors.has_model:
+            names += ["drift", "quantization", "dropout", "outlier_probability"]
+            self._latency = round(values.latency)
+        self._present = {name: name in varied or bool(np.any(getattr(values, name))) for name in names}
+        if "outlier_size" in varied and "outlier_probability" in self._present:
+            self._present["outlier_probability"] = True
+        n = context.get_discrete_state(0).size()
+        if any(self._present[name] for name in self._errors.noise):
+            self.draws["noise"] = self._draw(n, partial(normal_noise, n, channel=0))
+        if self._present.get("drift"):
+            self.draws["drift"] = self._draw(n, partial(normal_noise, n, channel=1))
+        if self._present.get("dropout"):
+            self.draws["dropout"] = self._draw(1, partial(_uniform, channel=2))
+        if self._present.get("outlier_probability"):
+            self.draws["outlier"] = self._draw(1, partial(_uniform, channel=3))
+            self.draws["outlier_size"] = self._draw(n, partial(normal_noise, n, channel=4))
+
+    def fixed(self) -> Iterator[Fixed]:
+        if self._errors is None:
+            return
+        vector, group = self._errors.parameters.vector, int(self._errors.parameters.index)
+        for name, present in self._present.items():
+            if not present:
+                yield Fixed(group, vector.slice_of(name), "it is 0, and left out: name it in parameters=")
+        if self._errors.has_model:
+            yield Fixed(group, vector.slice_of("latency"), "a latency is compiled in")
+
+    def output(self, port: str, at: At) -> Expression:
+        return at.state(0)
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        y, errors = self._measure(at), self._errors
+        if errors is None:
+            return {0: y}
+        vector = errors.parameters.vector
+        parameters = at.parameter(int(errors.parameters.index))
+
+        def value(name: str) -> Expression:
+            return parameters[vector.slice_of(name)]
+
+        if "noise" in self.draws:
+            deviations = casadi.vertcat(*(casadi.repmat(value(name), count) for name, count in errors.noise.items()))
+            y = y + deviations * at.draw("noise")
+        return self._shown(at, y, value) if errors.has_model else {0: y}
+
+    def _shown(self, at: At, y: Expression, value: Callable[[str], Expression]) -> dict[int | str, Expression]:
+        errors, present, n = self._errors, self._present, y.numel()
+        assert errors is not None and self.timing is not None
+        group = int(errors.memory.index)
+        memory = at.state(group)
+        walk = memory[:n]
+        if present["drift"]:
+            walk = walk + sqrt(self.timing.period) * value("drift") * at.draw("drift")
+        if present["outlier_probability"]:
+            size = value("outlier_size") * at.draw("outlier_size")
+            y = y + casadi.if_else(at.draw("outlier") < value("outlier_probability"), size, 0.0)
+        y = y + value("bias") + walk
+        if present["quantization"]:
+            q = value("quantization")
+            y = casadi.if_else(q > 0.0, _rounded(y / casadi.if_else(q > 0.0, q, 1.0)) * q, y)
+        remembered = [walk]
+        if errors.longest:
+            in_transit, newest = memory[n:], y
+            if self._latency:
+                y = in_transit[(self._latency - 1) * n : self._latency * n]
+            remembered += [newest, in_transit[:-n]]
+        if present["dropout"]:
+            y = casadi.if_else(at.draw("dropout") < value("dropout"), at.state(0), y)
+        return {0: y, group: casadi.vertcat(*remembered)}
+
+    def _draw(self, size: int, noise: Callable[..., Array]) -> Draw:
+        errors, timing = self._errors, self.timing
+        assert errors is not None and timing is not None
+        place = int(errors.parameters.index), errors.parameters.vector.slice_of("seed").start
+
+        def numbers(seed: int, time: float) -> Array:
+            return noise(seed=seed, stream=errors.stream(), tick=round(time / timing.period))
+
+        return Draw(size, place, numbers)
+
+
+def _uniform(*, channel: int, **key: int) -> Array:
+    return np.array([uniform_noise(channel=channel, **key)])
+
+
+def _rounded(x: Expression) -> Expression:
+    """Return the nearest whole number, of two the even one, as numpy does."""
+    below = casadi.floor(x)
+    rest, is_odd = x - below, below - 2.0 * casadi.floor(below / 2.0)
+    up = casadi.logic_or(rest > 0.5, casadi.logic_and(rest == 0.5, is_odd == 1.0))
+    return below + up
+
+
+class JointSensorEquations(SensorEquations):
+    """`JointEncoders` and `JointTachometers`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        entries = system.entries.tolist()
+        super().__init__(system, context, varied, lambda at: at.input("state")[entries])
+
+
+class DriveEquations(Equations):
+    """`JointDrives`, whose delay is compiled in."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        self._delay = round(float(context.get_numeric_parameter(0).value()[-1]))
+
+    def fixed(self) -> Iterator[Fixed]:
+        yield Fixed(0, slice(-1, None), "a delay is compiled in")
+
+    def output(self, port: str, at: At) -> Expression:
+        return at.state(0)
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        system: Any = self.system
+        delayed = u = at.input("command")
+        n, memory = u.numel(), at.state(1)
+        in_transit = memory[2 * n :]
+        if self._delay:
+            delayed = in_transit[(self._delay - 1) * n : self._delay * n]
+        y = system.kernel.expression([at.parameter(0), memory[: 2 * n], delayed, at.input("state")])
+        shifted = casadi.vertcat(u, in_transit[:-n]) if system.max_delay else casadi.SX(0, 1)
+        return {0: y[:n], 1: casadi.vertcat(y[n:], shifted)}
+
+
+class BoardEquations(Equations):
+    """The board of the switches and commands: its positions are compiled in, its constants are state."""
+
+    def __init__(self, system: System, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        positions = self.compiled_in(context)
+        names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
+        self._positions = dict(zip(names, positions, strict=False))
+        self._groups = {name: i for i, name in enumerate(names[len(positions) :])}
+
+    def output(self, port: str, at: At) -> Expression:
+        return self._positions[port] if port in self._positions else at.state(self._groups[port])
+
+    def compiled_in(self, context: Context) -> list[int]:
+        return [int(context.get_abstract_state(i).get_value()) for i in range(context.num_abstract_states())]
+
+    def refused(self, name: str) -> str:
+        return "the positions of the switches are compiled in"

@@ -1,0 +1,121 @@
+"""The equations of a discrete MultibodyPlant without contact."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import casadi
+import numpy as np
+from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.framework import Context
+
+from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refusal, zeros
+from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
+from vtbdrake.components.compiled_plant.links import contacts
+from vtbdrake.state.multibody import multibody_variables
+from vtbdrake.state.variables import A, Variable
+
+# What may act on a plant beside its actuation.
+_ACTING = ("applied_generalized_force",)
+_NOT_ACTING = ("geometry_query",)
+
+OVERRUN = "overrun"
+"""The largest overrun of the joints' stops since the begin, which are left out; see `PlantDynamics.overrun`."""
+
+
+class PlantEquations(Equations):
+    """A discrete plant that SAP steps, whose bodies cannot touch, with its ports of state and reaction forces."""
+
+    def __init__(self, system: MultibodyPlant, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        if system.time_step() <= 0.0:
+            raise refusal(system, "is continuous: give it a time_step")
+        if system.get_discrete_contact_solver() != DiscreteContactSolver.kSap:
+            raise refusal(system, "uses the solver TAMSI: set discrete_contact_approximation to 'sap'")
+        touching = list(contacts(system, context))
+        if touching:
+            raise refusal(system, f"has contact, which is not compiled: {'; '.join(touching)}")
+        self._plant = system
+        # Without connections: what is connected is read from the Diagram.
+        bare = system.CreateDefaultContext()
+        bare.SetTimeStateAndParametersFrom(context)
+        self._inputs = {v.address: int(np.prod(v.shape)) for v in _inputs(system)}
+        try:
+            self._model = PlantDynamics(system, bare, inputs=sorted(varied & self._inputs.keys()))
+        except (UnsupportedPlantError, ValueError) as error:
+            raise refusal(system, f"is refused: {error}") from None
+        self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
+        self.memory = {OVERRUN: -np.inf}
+        self.extras = {address: self._inputs[address] for address in self._model.inputs}
+
+    def output(self, port: str, at: At) -> Expression:
+        x = at.state(0)
+        if port == "state":
+            return x
+        for instance in _instances(self._plant):
+            if port == f"{self._plant.GetModelInstanceName(instance)}_state":
+                return _part_of_state(self._plant, instance, x)
+        raise refusal(self._plant, f"has the output port {port}, which is not compiled")
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        model, period = self._model, self._plant.time_step()
+        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
+        q_next, v_next = model.step(q, v, self._torque(at), period)
+        beyond = model.overrun(q, v_next, period)
+        x_next, beyond = model.substituted(
+            [casadi.densify(casadi.vertcat(q_next, v_next)), beyond],
+            {address: at.extra(address) for address in self.extras},
+        )
+        return {0: x_next, OVERRUN: casadi.fmax(at.memory(OVERRUN), beyond)}
+
+    def compiled_in(self, context: Context) -> bytes:
+        groups = (context.get_numeric_parameter(i).value() for i in range(context.num_numeric_parameter_groups()))
+        joints = (self._plant.get_joint(index) for index in self._plant.GetJointIndices())
+        return np.concatenate([*groups, [joint.is_locked(context) for joint in joints]]).tobytes()
+
+    def refused(self, name: str) -> str:
+        if name in self._inputs:
+            return "it is compiled in: name it in parameters="
+        return "it is no input of a compiled plant"
+
+    def _torque(self, at: At) -> Expression:
+        """Return the generalized force of everything that is connected to the plant."""
+        tau = self._model.actuation(self._actuation(at))
+        if at.is_connected("applied_generalized_force"):
+            tau += at.input("applied_generalized_force")
+        for i in range(self._plant.num_input_ports()):
+            name = self._plant.get_input_port(i).get_name()
+            if at.is_connected(name) and not (name.endswith("actuation") or name in (*_ACTING, *_NOT_ACTING)):
+                raise refusal(self._plant, f"has the input port {name} connected, which is not compiled")
+        return tau
+
+    def _actuation(self, at: At) -> Expression:
+        if at.is_connected("actuation"):
+            return at.input("actuation")
+        u = zeros(self._model.nu)
+        for instance in _instances(self._plant):
+            port = f"{self._plant.GetModelInstanceName(instance)}_actuation"
+            indices = self._plant.GetJointActuatorIndices(instance)
+            if len(indices) and at.is_connected(port):
+                starts = [self._plant.get_joint_actuator(index).input_start() for index in indices]
+                u[starts] = at.input(port)
+        return u
+
+
+def _inputs(plant: MultibodyPlant) -> Iterator[Variable]:
+    """Yield the variables of a plant that can be inputs of its compiled step, with their addresses within it."""
+    for variable in multibody_variables(plant, prefix=lambda instance: ""):
+        if variable.kind == A and not variable.hidden:
+            yield variable
+
+
+def _instances(plant: MultibodyPlant) -> Iterator[ModelInstanceIndex]:
+    return (ModelInstanceIndex(i) for i in range(plant.num_model_instances()))
+
+
+def _part_of_state(plant: MultibodyPlant, instance: ModelInstanceIndex, x: Expression) -> Expression:
+    nq, nv = plant.num_positions(), plant.num_velocities()
+    q = plant.GetPositionsFromArray(instance, np.arange(nq, dtype=float)).astype(int).tolist()
+    v = plant.GetVelocitiesFromArray(instance, np.arange(nv, dtype=float)).astype(int).tolist()
+    return casadi.vertcat(x[q], x[[nq + i for i in v]])

@@ -1,0 +1,420 @@
+"""Many rollouts of a compiled Diagram in one call."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from vtbdrake.arrays import Array
+from vtbdrake.compiled.equations import UnsupportedTestbedError
+from vtbdrake.compiled.plant import OVERRUN
+from vtbdrake.compiled.schedule import Instant, schedule
+from vtbdrake.compiled.walker import MEMORY, Walker
+from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
+from vtbdrake.state import Variables
+from vtbdrake.testbed.instants import sample_instants, sample_times
+
+_log = logging.getLogger(__name__)
+
+# Steps that are called one after the other before they become a function of their own.
+_UNROLLED = 16
+_LARGEST_CHUNK = 128
+
+Pattern = tuple[bool, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class CompiledBatch:
+    """The results of n rollouts.
+
+    Attributes:
+        times: The sample times from the begin, shape (m,), in seconds.
+        outputs: The recorded values by address, each of shape (n, m, ...).
+        final: The vectors z of state and parameters at the end, shape (n, nz).
+        valid: Which rollouts are those of the Diagram, shape (n,): all state is finite, and no joint has reached a
+            stop, which the compiled plant does not have.
+    """
+
+    times: Array
+    outputs: Mapping[str, Array]
+    final: Array
+    valid: NDArray[np.bool_]
+
+
+class CompiledRollouts:
+    """A Diagram as one function for a whole rollout; see `VirtualTestbed.compiled`.
+
+    A rollout is the one that Drake's Simulator makes: the same updates in the same order. Several threads may call it
+    at once.
+
+    Attributes:
+        walker: The Diagram as expressions.
+        parameters: The addresses that a call can vary; others that lie in the compiled state can be, too.
+        outputs: The addresses that are recorded.
+        times: The sample times from the begin (s), shape (m,).
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        variables: Variables,
+        context: Context,
+        *,
+        horizon: float,
+        sample_period: float,
+        parameters: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+        measures: Mapping[str, tuple[casadi.Function, Sequence[str]]] | None = None,
+        timings: Sequence[tuple[float, float]] | None = None,
+        compile: bool | None = None,
+        check: bool = True,
+        workers: int = 1,
+    ) -> None:
+        """Compile a Diagram; the errors are those of `VirtualTestbed.compiled`.
+
+        Args:
+            diagram: The Diagram.
+            variables: Its variables.
+            context: A root context: the begin of a rollout, and what is compiled in.
+            horizon: The length of a rollout (s).
+            sample_period: The period of the samples (s).
+            parameters: Addresses that will vary.
+            outputs: Addresses to be recorded.
+            compile: Whether to make machine code; None: if there is a C compiler.
+            check: Whether to compare rollouts with Drake's.
+            workers: The number of threads for large batches.
+            measures: Functions of outputs that are recorded as well: name -> (function, addresses of its arguments).
+            timings: (period, offset) of all periodic events; by default those of the compiled systems.
+        """
+        self.walker = Walker(diagram, context.Clone(), variables, parameters)
+        self.parameters, self.outputs = tuple(parameters), tuple(outputs)
+        for address in parameters:
+            self.walker.place(address)
+        self.times = sample_times(horizon, sample_period)
+        by_default = [(timing.period, timing.offset) for timing in self.walker.timings]
+        self._timings = by_default if timings is None else list(timings)
+        self._measures = dict(measures or {})
+        self._translate = TRANSLATIONS[compile]
+        self._workers = workers
+        self._z0 = self.walker.read(self.walker.context)
+        self._overruns = [
+            b.entries.start for b in self.walker.blocks.values() if b.kind == MEMORY and b.name == OVERRUN
+        ]
+        self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
+        self._w = casadi.SX.sym("w", max(1, self.walker.noise))
+        self._recorded = self._recorded_values()
+        self._shapes = self._output_shapes(diagram, variables)
+        self._steps: dict[Pattern, casadi.Function] = {}
+        self._programs: dict[tuple[int, tuple[Pattern, ...]], _Program] = {}
+        self._last_schedule: tuple[float, list[Instant]] = np.nan, []
+        self._last_noise: tuple[object, Array] = None, np.zeros(0)
+        self._lock = threading.Lock()
+        self._refuse_initialization()
+        self._program(self.schedule_at(context.get_time()))
+        if check:
+            from vtbdrake.compiled.check import check_rollouts
+
+            check_rollouts(self, self.walker.context)
+
+    def __call__(
+        self, values: Mapping[str, ArrayLike] | None = None, *, context: Context | None = None
+    ) -> CompiledBatch:
+        """Make n rollouts.
+
+        Args:
+            values: Address -> values that are set at the begin: of all rollouts, in the variable's shape, or of each,
+                with n in front.
+            context: The root context from which the rollouts begin, by default the one that was compiled.
+
+        Raises:
+            ValueError: An address cannot be varied, or a value has another shape, is not finite or out of bounds.
+            UnsupportedTestbedError: The context differs from the compiled one in what is compiled in.
+        """
+        start = self.walker.context if context is None else context
+        return self.from_z(self.filled(self.z_of(start), values or {}), start.get_time())
+
+    def z_of(self, context: Context) -> Array:
+        """Return the vector of state and parameters of a root context, shape (nz,)."""
+        if context is self.walker.context:
+            return self._z0.copy()
+        self.walker.check(context)
+        return self.walker.read(context)
+
+    def filled(self, z: Array, values: Mapping[str, ArrayLike]) -> Array:
+        """Return n copies of z with values by address, shape (n, nz); see `__call__`."""
+        places = []
+        count = 1
+        for address, value in values.items():
+            variable = self.walker.variables[address]
+            array = np.asarray(value, dtype=float)
+            many = array.ndim == len(variable.shape) + 1
+            if array.shape[many:] != variable.shape:
+                raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
+            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.bounds)
+            if not (np.isfinite(array).all() and (array >= lower).all() and (array <= upper).all()):
+                raise ValueError(f"{address} is finite and lies in {variable.bounds_text()}")
+            if many and count not in (1, len(array)):
+                raise ValueError(f"there are {len(array)} values of {address}, but {count} of others")
+            count = len(array) if many else count
+            places.append((self.walker.place(address), array.reshape(len(array) if many else 1, -1)))
+        batch = np.tile(z, (count, 1))
+        for entries, array in places:
+            batch[:, entries] = array
+        return batch
+
+    def from_z(self, z: Array, t0: float) -> CompiledBatch:
+        """Make the rollouts that begin at the vectors z, shape (n, nz), and the time t0 (s)."""
+        fixed = self.walker.fixed
+        for entries, path, why in fixed:
+            if not (z[:, entries] == self._z0[entries]).all():
+                raise UnsupportedTestbedError(f"{path} differs from what was compiled: {why}")
+        instants = self.schedule_at(t0)
+        program = self._program(instants)
+        chunks = list(_chunks(len(z)))
+        noise = self._noise(z, instants, program.count)
+
+        def run(chunk: slice) -> tuple[Array, Array]:
+            return program.run(z[chunk], None if noise is None else noise[chunk], instants)
+
+        if self._workers > 1 and len(chunks) > 1:
+            with ThreadPoolExecutor(self._workers) as pool:
+                results = list(pool.map(run, chunks))
+        else:
+            results = [run(chunk) for chunk in chunks]
+        final = np.concatenate([result[0] for result in results])
+        recorded = np.concatenate([result[1] for result in results])
+        valid = self.walker.is_finite(final) & (final[:, self._overruns] <= 0.0).all(axis=1)
+        outputs = {}
+        start = 0
+        for name, shape in self._shapes.items():
+            size = int(np.prod(shape, dtype=int))
+            outputs[name] = recorded[:, :, start : start + size].reshape(*recorded.shape[:2], *shape)
+            start += size
+        return CompiledBatch(self.times, outputs, final, valid)
+
+    def advanced(self, z: Array, instant: Instant) -> Array:
+        """Return z, shape (nz,), after what happens at an instant; it is interpreted."""
+        w = np.zeros(self._w.numel())
+        self.walker.draw_numbers(self.walker.seeds(z[np.newaxis])[0], instant.time, instant.updates, w)
+        following: Array = self.step(instant.pattern)(z, instant.time, w)[0].full().ravel()
+        return following
+
+    def is_beyond(self, z: Array) -> bool:
+        """Return whether a joint has reached a stop since the begin of the rollout that is at z."""
+        return bool((z[self._overruns] > 0.0).any())
+
+    def read(self, address: str, context: Context) -> Any:
+        """Return the value of an output in a root context."""
+        return self.walker.reader(address)(context)
+
+    @property
+    def function(self) -> casadi.Function:
+        """Return the function of one rollout for CasADi's solvers: (z, instants, w) -> (z at the end, recorded).
+
+        It is interpreted, and has derivatives. z is made by `filled`, its entries are told by ``walker.place``; the
+        other arguments are returned by `arguments`. The recorded values have a column per instant.
+        """
+        return self._program(self.schedule_at(self.walker.context.get_time())).function
+
+    def arguments(self) -> tuple[Array, Array]:
+        """Return what `function` takes beside z: the instants, shape (2, count), and the random numbers of s0."""
+        instants = self.schedule_at(self.walker.context.get_time())
+        program = self._program(instants)
+        noise = self._noise(self._z0[np.newaxis], instants, program.count)
+        return program.plan(instants).T, np.zeros((self._w.numel(), program.count)) if noise is None else noise[0].T
+
+    # -- how it is done
+
+    def _refuse_initialization(self) -> None:
+        probe = self.walker.context.Clone()
+        simulator = Simulator(self.walker.diagram, probe)
+        simulator.Initialize()
+        z = self.walker.read(probe)
+        for block in self.walker.blocks.values():
+            if not np.array_equal(z[block.entries], self._z0[block.entries], equal_nan=True):
+                raise UnsupportedTestbedError(
+                    f"{block.path} is changed by an initialization event, which is not compiled: keep this testbed in "
+                    "Drake, or compile it in a context that is initialized"
+                )
+
+    def _recorded_values(self) -> casadi.SX:
+        values = {address: self.walker.output(address, self._z, self._time) for address in self._addresses()}
+        recorded = [values[address] for address in self.outputs]
+        for function, of in self._measures.values():
+            recorded.append(casadi.densify(function(*(values[address] for address in of))))
+        return casadi.vertcat(casadi.SX(0, 1), *recorded)
+
+    def _addresses(self) -> list[str]:
+        return list(dict.fromkeys([*self.outputs, *(a for _, of in self._measures.values() for a in of)]))
+
+    def _output_shapes(self, diagram: Diagram, variables: Variables) -> dict[str, tuple[int, ...]]:
+        shapes: dict[str, tuple[int, ...]] = {}
+        for address in self.outputs:
+            if address in variables:
+                shapes[address] = variables[address].shape
+            else:
+                shapes[address] = (self.walker.output(address, self._z, self._time).numel(),)
+        return shapes | dict.fromkeys(self._measures, ())
+
+    def schedule_at(self, t0: float) -> list[Instant]:
+        """Return what happens in a rollout that begins at t0 (s)."""
+        t_last, instants = self._last_schedule
+        if t_last != t0:
+            instants = schedule(self.walker.timings, sample_instants(self.times, t0, self._timings))
+            self._last_schedule = t0, instants
+        return instants
+
+    def step(self, pattern: Pattern) -> casadi.Function:
+        """Return the function (z, time, w) -> (z, recorded) of what happens at an instant."""
+        if pattern not in self._steps:
+            is_sample, due = pattern
+            recorded = self._recorded if is_sample else casadi.SX.zeros(self._recorded.numel(), 1)
+            following = self.walker.update(self._z, self._time, due, self._w)
+            name = "_".join(["sampled" if is_sample else "instant", *map(str, due)])
+            results: list[Any] = [casadi.densify(following), recorded]
+            self._steps[pattern] = casadi.Function(name, [self._z, self._time, self._w], results, {"cse": True})
+        return self._steps[pattern]
+
+    def _program(self, instants: Sequence[Instant]) -> _Program:
+        with self._lock:
+            patterns = tuple(dict.fromkeys(instant.pattern for instant in instants))
+            needed = len(instants)
+            for (count, covered), program in self._programs.items():
+                if needed <= count <= 1.25 * needed + 4 and set(patterns) <= set(covered):
+                    return program
+            count = needed if len(patterns) == 1 else needed + len(self.walker.timings)
+            program = _Program([self.step(pattern) for pattern in patterns], patterns, count, self._translate)
+            self._programs[count, patterns] = program
+            return program
+
+    def _noise(self, z: Array, instants: Sequence[Instant], count: int) -> Array | None:
+        """Return the random numbers of all rollouts and instants, shape (n, count, noise)."""
+        if not self.walker.noise:
+            return None
+        seeds, inverse = np.unique(self.walker.seeds(z), axis=0, return_inverse=True)
+        key = seeds.tobytes(), instants[0].time, count
+        last = self._last_noise
+        if last[0] != key:
+            noise = np.zeros((len(seeds), count, self._w.numel()))
+            for k, instant in enumerate(instants):
+                for of_seeds, row in zip(seeds, noise[:, k], strict=True):
+                    self.walker.draw_numbers(of_seeds, instant.time, instant.updates, row)
+            last = self._last_noise = key, noise
+        numbers: Array = last[1][inverse.ravel()]
+        return numbers
+
+
+class _Program:
+    """The rollout over a number of instants as machine code."""
+
+    def __init__(
+        self,
+        steps: Sequence[casadi.Function],
+        patterns: Sequence[Pattern],
+        count: int,
+        translate: Callable[[casadi.Function], casadi.Function],
+    ) -> None:
+        self.count = count
+        self._numbers = {pattern: float(k) for k, pattern in enumerate(patterns)}
+        self._noise = steps[0].size1_in(2)
+        self.function = _rollout(steps, count)
+        z, instants, w = self.function.mx_in()
+        packed = casadi.Function(
+            "rollout", [z, instants, w], [casadi.vertcat(*map(casadi.vec, self.function(z, instants, w)))]
+        )
+        self._packed = translate(packed)
+        self._buffers: dict[int, Buffers] = {}
+        self._lock = threading.Lock()
+
+    def plan(self, instants: Sequence[Instant]) -> Array:
+        """Return [number of the step, time] of each instant, shape (count, 2); the rest is idle."""
+        plan = np.full((self.count, 2), -1.0)
+        plan[: len(instants), 0] = [self._numbers[instant.pattern] for instant in instants]
+        plan[: len(instants), 1] = [instant.time for instant in instants]
+        return plan
+
+    def run(self, z: Array, noise: Array | None, instants: Sequence[Instant]) -> tuple[Array, Array]:
+        """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny)."""
+        n, nz = z.shape
+        with self._lock:
+            if n not in self._buffers:
+                self._buffers[n] = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
+        arguments, evaluate, result = self._buffers[n].parts
+        plan = self.plan(instants)
+        arguments[: n * nz] = z.ravel()
+        arguments[n * nz : n * (nz + plan.size)].reshape(n, -1)[:] = plan.ravel()
+        if noise is not None:
+            arguments[n * (nz + plan.size) :] = noise.ravel()
+        evaluate()
+        # The thread's next call overwrites the result.
+        rows = result.reshape(n, -1)
+        recorded = rows[:, nz:].reshape(n, self.count, -1)
+        sampled = [k for k, instant in enumerate(instants) if instant.is_sample]
+        return rows[:, :nz].copy(), recorded[:, sampled]
+
+
+def _rollout(steps: Sequence[casadi.Function], count: int) -> casadi.Function:
+    """Return the function (z, instants, w) -> (z, recorded) of ``count`` instants.
+
+    A column of ``instants`` is [number of the step, time]; where there is no such step, nothing happens.
+    """
+    z, time, w = steps[0].sx_in()
+    idle = casadi.Function("idle", [z, time, w], [z, casadi.SX.zeros(steps[0].size1_out(1), 1)])
+    number, when, state, random = (
+        casadi.MX.sym(name, size) for name, size in (("k", 1), ("t", 1), ("z", z.numel()), ("w", w.numel()))
+    )
+    either = casadi.Function.conditional("either", list(steps), idle)
+    results: Any = either(number, state, when, random)
+    step = casadi.Function("step", [state, casadi.vertcat(number, when), random], list(results))
+    return _repeated(step, count)
+
+
+def _repeated(step: casadi.Function, count: int) -> casadi.Function:
+    """Return the function of ``count`` instants: blocks of blocks of steps, so that its code stays short."""
+    blocks = {1: step}
+    while max(blocks) * _UNROLLED < count:
+        size = max(blocks)
+        blocks[size * _UNROLLED] = _chained([blocks[size]] * _UNROLLED, [size] * _UNROLLED)
+    sizes: list[int] = []
+    for size in sorted(blocks, reverse=True):
+        sizes += [size] * ((count - sum(sizes)) // size)
+    return _chained([blocks[size] for size in sizes], sizes)
+
+
+def _chained(functions: Sequence[casadi.Function], sizes: Sequence[int]) -> casadi.Function:
+    """Return the function of the instants of several functions, one after the other."""
+    total = sum(sizes)
+    begin, instants, w = (
+        casadi.MX.sym(name, rows, columns)
+        for name, rows, columns in (
+            ("z", functions[0].size1_in(0), 1),
+            ("instants", 2, total),
+            ("w", functions[0].size1_in(2), total),
+        )
+    )
+    ends = np.cumsum([0, *sizes]).tolist()
+    z, recorded = begin, []
+    parts = zip(functions, casadi.horzsplit(instants, ends), casadi.horzsplit(w, ends), strict=True)
+    for function, when, random in parts:
+        z, y = function(z, when, random)
+        recorded.append(y)
+    return casadi.Function(f"rollout_{total}", [begin, instants, w], [z, casadi.horzcat(*recorded)])
+
+
+def _chunks(n: int) -> Any:
+    """Yield slices of n rollouts in powers of two, so that few sizes occur."""
+    start = 0
+    while start < n:
+        size = min(_LARGEST_CHUNK, 1 << ((n - start).bit_length() - 1))
+        yield slice(start, start + size)
+        start += size

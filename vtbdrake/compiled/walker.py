@@ -1,0 +1,458 @@
+"""Walks over a Diagram: its leaf systems, connections, state and parameters as expressions of CasADi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    InputPortIndex,
+    OutputPort,
+    OutputPortIndex,
+    PortDataType,
+    System,
+)
+
+from vtbdrake.arrays import Array
+from vtbdrake.compiled.equations import At, Draw, Equations, Expression, UnsupportedTestbedError
+from vtbdrake.compiled.registry import equations_of
+from vtbdrake.state import AddressError, Variables
+from vtbdrake.state.declarations import DISCRETE, PARAMETER
+from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, read_group, write_group
+from vtbdrake.state.variables import Place
+
+MEMORY, EXTRA = "memory", "extra"
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of the vector z, in which all state and parameters of a Diagram lie.
+
+    Attributes:
+        path: Path of the system.
+        kind: ``discrete`` or ``parameter`` for a group of its context, ``memory`` or ``extra``, see `Equations`.
+        name: Number of the group, or the name.
+        entries: Where it lies in z.
+    """
+
+    path: str
+    kind: str
+    name: int | str
+    entries: slice
+
+
+class Walker:
+    """A Diagram as expressions of z, the vector of all its discrete state and parameters, and of the time.
+
+    Attributes:
+        diagram: The Diagram.
+        context: The root context with what is compiled in.
+        timings: The different timings of its updates.
+        blocks: The parts of z, by path of the system, kind and name.
+        size: The number of entries of z.
+        equations: The equations of the systems that have some, by path.
+        uncovered: Why other systems have none, by path.
+        draws: The random numbers of the updates, with their entries in w: (path, name, draw, entries).
+        noise: The number of entries of w.
+        fixed: Entries of z whose values are compiled in, with the address and the reason: (entries, path, reason).
+    """
+
+    def __init__(self, diagram: Diagram, context: Context, variables: Variables, varied: Sequence[str]) -> None:
+        """Read a Diagram.
+
+        Args:
+            diagram: The Diagram.
+            context: A root context, with what is compiled in.
+            variables: Its variables.
+            varied: Addresses of variables that will be varied.
+
+        Raises:
+            UnsupportedTestbedError: Parts of the Diagram cannot be compiled; all are named.
+            ValueError: An address does not exist.
+        """
+        self.diagram, self.variables = diagram, variables
+        self.context = context
+        self._sources = dict(_connections(diagram))
+        self._paths = {system: path for path, system in leaves(diagram)}
+        self._systems = {path: system for system, path in self._paths.items()}
+        self.equations: dict[str, Equations] = {}
+        self.uncovered: dict[str, str] = {}
+        whole = [variables[address].address.partition("[")[0] for address in varied]
+        refused = []
+        for path, system in self._systems.items():
+            try:
+                names = frozenset(filter(None, (self._within(path, address) for address in whole)))
+                self.equations[path] = self._equations_of(path, system, names)
+            except UnsupportedTestbedError as error:
+                self.uncovered[path] = str(error)
+                if _has_state(system):
+                    refused.append(f"{path}: {error}")
+        if refused:
+            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
+        timed = [equations.timing for equations in self.equations.values() if equations.timing is not None]
+        self.timings = tuple(dict.fromkeys(timed))
+        self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
+        self.size = max((block.entries.stop for block in self.blocks.values()), default=0)
+        self.draws = tuple(self._reserved())
+        self.noise = self.draws[-1][-1].stop if self.draws else 0
+        self.fixed = tuple(self._fixed())
+        self._compiled_in = self._read_compiled_in(context)
+
+    # -- z
+
+    def read(self, context: Context) -> Array:
+        """Return z of a root context, shape (size,); the memory is as at the begin."""
+        z = np.empty(self.size)
+        for block in self.blocks.values():
+            if block.kind == MEMORY:
+                z[block.entries] = self.equations[block.path].memory[str(block.name)]
+            elif block.kind == EXTRA:
+                z[block.entries] = np.ravel(self.variables[self._address(block)].get(context))
+            else:
+                own = self._systems[block.path].GetMyContextFromRoot(context)
+                z[block.entries] = read_group(own, block.kind, int(block.name))
+        return z
+
+    def write(self, z: Array, context: Context) -> None:
+        """Set a root context to z."""
+        for block in self.blocks.values():
+            if block.kind == EXTRA:
+                variable = self.variables[self._address(block)]
+                variable.set(context, z[block.entries].reshape(variable.shape))
+            elif block.kind != MEMORY:
+                own = self._systems[block.path].GetMyMutableContextFromRoot(context)
+                write_group(own, block.kind, int(block.name), z[block.entries])
+
+    def check(self, context: Context) -> None:
+        """Check that a root context differs from the compiled one only in z, and there not in what is compiled in.
+
+        Raises:
+            UnsupportedTestbedError: It differs.
+        """
+        for path, value in self._read_compiled_in(context).items():
+            if value != self._compiled_in[path]:
+                raise UnsupportedTestbedError(
+                    f"{path} differs from what was compiled, such as a mass, a locked joint or the position of a "
+                    "switch: compile the testbed in this context"
+                )
+
+    def place(self, address: str) -> slice:
+        """Return where the value of a variable lies in z.
+
+        Raises:
+            ValueError: It does not lie there, or is compiled in; the reason is named.
+        """
+        variable = self.variables[address]
+        place = variable.place
+        size = int(np.prod(variable.shape, dtype=int))
+        if place is not None:
+            entries = self._entries(place, size)
+            if entries is not None:
+                return entries
+        base, _, entry = address.partition("[")
+        for block in self.blocks.values():
+            if block.kind == EXTRA and self._address(block) == base:
+                start = block.entries.start + int(entry.rstrip("]") or 0)
+                return slice(start, start + size)
+        raise ValueError(f"{address} cannot be varied in the compiled testbed: {self._reason(address)}")
+
+    def is_finite(self, z: Array) -> Any:
+        """Return whether all state of each z is finite, shape (n,)."""
+        finite = np.ones(len(z), dtype=bool)
+        for block in self.blocks.values():
+            if block.kind == DISCRETE and block.path != "switches":
+                finite &= np.isfinite(z[:, block.entries]).all(axis=1)
+        return finite
+
+    # -- expressions
+
+    def update(self, z: Expression, time: Expression, due: Sequence[int], w: Expression | None) -> Expression:
+        """Return z after the updates of an instant: the unrestricted ones, then the discrete ones."""
+        for unrestricted in (True, False):
+            at = Evaluation(self, z, time, w)
+            following = casadi.SX(z)
+            for path, equations in self.equations.items():
+                timing = equations.timing
+                if timing is None or timing.unrestricted != unrestricted or self.timings.index(timing) not in due:
+                    continue
+                for name, value in at.update(path).items():
+                    kind = DISCRETE if isinstance(name, int) else MEMORY
+                    following[self.blocks[path, kind, name].entries] = value
+            z = following
+        return z
+
+    def output(self, address: str, z: Expression, time: Expression) -> Expression:
+        """Return the value of a variable or of a vector output port, as an expression, shape (n, 1)."""
+        if address == "time":
+            return time
+        if address in self.variables:
+            return z[self.place(address)]
+        system, port = self._port(address)
+        if port.get_data_type() != PortDataType.kVectorValued:
+            raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
+        leaf, number = _writer(system, port.get_index())
+        evaluation = Evaluation(self, z, time, None)
+        return casadi.densify(evaluation.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
+
+    def reader(self, address: str) -> Callable[[Context], Any]:
+        """Return a function that reads an output of `output` from a root context."""
+        if address in self.variables:
+            return self.variables[address].get
+        system, port = self._port(address)
+        return lambda context: port.Eval(context if system is self.diagram else system.GetMyContextFromRoot(context))
+
+    def _port(self, address: str) -> tuple[System, OutputPort]:
+        path, _, name = address.rpartition(".")
+        system: System = self.diagram
+        try:
+            for part in path.split(".") if path else ():
+                system = system.GetSubsystemByName(part)
+            return system, system.GetOutputPort(name)
+        except (RuntimeError, AttributeError):
+            raise AddressError(f"there is no variable and no port {address!r}") from None
+
+    def source(self, path: str, number: int) -> tuple[str, str] | None:
+        """Return (path, name) of the output port that is connected to an input port of a leaf system, if any."""
+        source = self._sources.get((self._systems[path], number))
+        if source is None:
+            return None
+        system, port = source
+        return self._paths[system], system.get_output_port(port).get_name()
+
+    def fixed_input(self, path: str, number: int) -> Expression | None:
+        """Return the value that is fixed at an input port to which nothing is connected, if any."""
+        system = self._systems[path]
+        own = system.GetMyContextFromRoot(self.context)
+        port = system.get_input_port(number)
+        if port.get_data_type() != PortDataType.kVectorValued or not port.HasValue(own):
+            return None
+        return casadi.SX(casadi.DM(port.Eval(own)))
+
+    # -- how it is done
+
+    def _equations_of(self, path: str, system: System, names: frozenset[str]) -> Equations:
+        own = system.GetMyContextFromRoot(self.context)
+        if own.num_continuous_states():
+            raise UnsupportedTestbedError(
+                f"{class_name(system)} has continuous state: give it a time step, or write its update as a "
+                "casadi.Function"
+            )
+        if is_scene_graph(system):
+            raise UnsupportedTestbedError("geometry is not compiled")
+        return equations_of(system, own, names)
+
+    def _within(self, path: str, address: str) -> str:
+        """Return the name of a variable within the system at a path, or nothing."""
+        prefixes = [path, "sim.sys", "sim.env"] if is_plant(self._systems[path]) else [path]
+        return next((address[len(p) + 1 :] for p in prefixes if address.startswith(f"{p}.")), "")
+
+    def _address(self, block: Block) -> str:
+        candidates = (f"{prefix}.{block.name}" for prefix in (block.path, "sim.sys", "sim.env"))
+        return next(address for address in candidates if address in self.variables)
+
+    def _reason(self, address: str) -> str:
+        base = address.partition("[")[0]
+        for path, equations in self.equations.items():
+            if name := self._within(path, base):
+                return equations.refused(name)
+        for path, why in self.uncovered.items():
+            if self._within(path, base):
+                return why
+        if base.startswith("T_"):
+            return "the positions of the switches are compiled in"
+        return "it is computed from others"
+
+    def _entries(self, place: Place, size: int) -> slice | None:
+        path = self._paths.get(place.system, "")
+        block = self.blocks.get((path, place.group, place.index))
+        if block is None:
+            return None
+        start = block.entries.start + place.start
+        return slice(start, start + size)
+
+    def _layout(self) -> Iterator[Block]:
+        start = 0
+        for path, equations in self.equations.items():
+            own = equations.system.GetMyContextFromRoot(self.context)
+            sizes: list[tuple[str, int | str, int]] = [
+                (DISCRETE, i, own.get_discrete_state(i).size()) for i in range(own.num_discrete_state_groups())
+            ]
+            if not is_plant(equations.system):
+                count = own.num_numeric_parameter_groups()
+                sizes += [(PARAMETER, i, own.get_numeric_parameter(i).size()) for i in range(count)]
+            sizes += [(MEMORY, name, 1) for name in equations.memory]
+            sizes += [(EXTRA, name, size) for name, size in equations.extras.items()]
+            for kind, name, size in sizes:
+                yield Block(path, kind, name, slice(start, start + size))
+                start += size
+
+    def _fixed(self) -> Iterator[tuple[slice, str, str]]:
+        for path, equations in self.equations.items():
+            for fixed in equations.fixed():
+                block = self.blocks[path, PARAMETER, fixed.group]
+                indices = range(block.entries.stop - block.entries.start)[fixed.entries]
+                yield slice(block.entries.start + indices.start, block.entries.start + indices.stop), path, fixed.reason
+
+    def _read_compiled_in(self, context: Context) -> dict[str, Any]:
+        probe = context.Clone()
+        for block in self.blocks.values():
+            if block.kind == EXTRA:  # These may differ.
+                address = self._address(block)
+                self.variables[address].set(probe, self.variables[address].get(self.context))
+        systems = {path: equations.system for path, equations in self.equations.items()}
+        return {
+            path: equations.compiled_in(systems[path].GetMyContextFromRoot(probe))
+            for path, equations in self.equations.items()
+        }
+
+    def _reserved(self) -> Iterator[tuple[str, str, Draw, slice]]:
+        start = 0
+        for path, equations in self.equations.items():
+            for name, draw in equations.draws.items():
+                yield path, name, draw, slice(start, start + draw.size)
+                start += draw.size
+
+    def seeds(self, z: Array) -> Array:
+        """Return the seeds of all draws in vectors z, shape (n, size), as an array of shape (n, draws)."""
+        starts = [
+            self.blocks[path, PARAMETER, draw.seed[0]].entries.start + draw.seed[1] for path, _, draw, _ in self.draws
+        ]
+        return z[:, starts]
+
+    def draw_numbers(self, seeds: Array, time: float, due: Sequence[int], w: Array) -> None:
+        """Write the random numbers of the updates of an instant into w, shape (noise,).
+
+        Args:
+            seeds: The seeds of the draws, shape (draws,).
+            time: The time (s).
+            due: The timings of the updates.
+            w: Where the numbers go.
+        """
+        for seed, (path, _, draw, entries) in zip(seeds.tolist(), self.draws, strict=True):
+            timing = self.equations[path].timing
+            if timing is not None and self.timings.index(timing) in due:
+                w[entries] = draw.numbers(int(seed), time)
+
+
+class Evaluation:
+    """The outputs of all systems at one instant, each computed once.
+
+    Args:
+        walker: The Diagram.
+        z: Its state and parameters.
+        time: The time.
+        w: The random numbers of this instant; None where nothing is updated.
+    """
+
+    def __init__(self, walker: Walker, z: Expression, time: Expression, w: Expression | None) -> None:
+        self.walker, self.z, self.time, self.w = walker, z, time, w
+        self._values: dict[tuple[str, str], Expression] = {}
+        self._under_way: list[tuple[str, str]] = []
+
+    def update(self, path: str) -> dict[int | str, Expression]:
+        """Return what an update of the system at a path returns."""
+        return self.walker.equations[path].update(_Reading(self, path))
+
+    def output(self, path: str, port: str) -> Expression:
+        """Return the value of an output port of a leaf system.
+
+        Raises:
+            UnsupportedTestbedError: The system cannot be compiled, or is part of an algebraic loop.
+        """
+        key = path, port
+        if key in self._under_way:
+            loop = " -> ".join(p for p, _ in [*self._under_way[self._under_way.index(key) :], key])
+            raise UnsupportedTestbedError(f"the testbed has an algebraic loop, which is not compiled: {loop}")
+        if key not in self._values:
+            if path not in self.walker.equations:
+                raise UnsupportedTestbedError(f"{path}: {self.walker.uncovered[path]}")
+            self._under_way.append(key)
+            self._values[key] = self.walker.equations[path].output(port, _Reading(self, path))
+            self._under_way.pop()
+        return self._values[key]
+
+
+class _Reading(At):
+    """What the system at a path reads in an evaluation."""
+
+    def __init__(self, evaluation: Evaluation, path: str) -> None:
+        self._evaluation, self._path = evaluation, path
+        self.time = evaluation.time
+
+    def input(self, port: int | str) -> Expression:
+        walker, number = self._evaluation.walker, self._number(port)
+        source = walker.source(self._path, number)
+        if source is not None:
+            return self._evaluation.output(*source)
+        value = walker.fixed_input(self._path, number)
+        if value is None:
+            name = walker.equations[self._path].system.get_input_port(number).get_name()
+            raise UnsupportedTestbedError(f"{self._path}: nothing is connected to the input port {name}")
+        return value
+
+    def is_connected(self, port: int | str) -> bool:
+        walker, number = self._evaluation.walker, self._number(port)
+        return walker.source(self._path, number) is not None or walker.fixed_input(self._path, number) is not None
+
+    def state(self, group: int) -> Expression:
+        return self._entries(DISCRETE, group)
+
+    def parameter(self, group: int) -> Expression:
+        return self._entries(PARAMETER, group)
+
+    def memory(self, name: str) -> Expression:
+        return self._entries(MEMORY, name)
+
+    def extra(self, name: str) -> Expression:
+        return self._entries(EXTRA, name)
+
+    def draw(self, name: str) -> Expression:
+        assert self._evaluation.w is not None
+        draws = self._evaluation.walker.draws
+        return self._evaluation.w[next(e for path, n, _, e in draws if (path, n) == (self._path, name))]
+
+    def _entries(self, kind: str, name: int | str) -> Expression:
+        return self._evaluation.z[self._evaluation.walker.blocks[self._path, kind, name].entries]
+
+    def _number(self, port: int | str) -> int:
+        if isinstance(port, int):
+            return port
+        return int(self._evaluation.walker.equations[self._path].system.GetInputPort(port).get_index())
+
+
+def _has_state(system: System) -> bool:
+    """Return whether a system has state of its own, so that a compiled Diagram without it would be another one."""
+    if is_scene_graph(system):
+        return False
+    context = system.CreateDefaultContext()
+    return bool(context.num_continuous_states() or context.num_discrete_state_groups() or context.num_abstract_states())
+
+
+def _connections(diagram: Diagram) -> Iterator[tuple[tuple[System, int], tuple[System, int]]]:
+    """Yield ((reader, number of its input port), (writer, number of its output port)) of all leaf systems."""
+    for (reader, input_port), (writer, output_port) in diagram.connection_map().items():
+        source = _writer(writer, output_port)
+        for leaf in _readers(reader, input_port):
+            yield leaf, source
+    for system in diagram.GetSystems():
+        if isinstance(system, Diagram):
+            yield from _connections(system)
+
+
+def _writer(system: System, port: OutputPortIndex) -> tuple[System, int]:
+    while isinstance(system, Diagram):
+        system, port = system.get_output_port_locator(port)
+    return system, int(port)
+
+
+def _readers(system: System, port: InputPortIndex) -> Iterator[tuple[System, int]]:
+    if not isinstance(system, Diagram):
+        yield system, int(port)
+        return
+    for inner, inner_port in system.GetInputPortLocators(port):
+        yield from _readers(inner, inner_port)
