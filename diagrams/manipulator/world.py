@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, RoleAssign, SceneGraph
@@ -15,6 +17,9 @@ from pydrake.systems.framework import Context
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINT_NAMES, Arm
 from vtbdrake_diagrams.manipulator.model import ARM_SDF
+
+if TYPE_CHECKING:
+    from vtbdrake_diagrams.manipulator.compiled import PushEquations
 
 BALL_STIFFNESS = 1e8
 """The stiffness of the ball at the tip, in N/m [A], much larger than that of any wall."""
@@ -79,8 +84,8 @@ class Push(AddressedSystem):
     def __init__(self, plant: MultibodyPlant, frame: str) -> None:
         super().__init__()
         pushed = plant.GetFrameByName(frame)
-        self._body = pushed.body().index()
-        self._p_BoBq_B = pushed.GetFixedPoseInBodyFrame().translation()
+        self.body = pushed.body().index()
+        self.p_BoBq_B = pushed.GetFixedPoseInBodyFrame().translation()
         self._push = self.declare_parameters(wrench=Quantity(np.zeros(6), "N m, N"))
         self.DeclareAbstractOutputPort(
             "spatial_force",
@@ -89,10 +94,16 @@ class Push(AddressedSystem):
             prerequisites_of_calc={self.numeric_parameter_ticket(self._push.index)},
         )
 
+    def equations(self, context: Context, varied: frozenset[str]) -> PushEquations:
+        """Return the equations for a compiled testbed."""
+        from vtbdrake_diagrams.manipulator.compiled import PushEquations
+
+        return PushEquations(self, context, varied)
+
     def _calc(self, context: Context, output: Value) -> None:  # type: ignore[valid-type]
         force = ExternallyAppliedSpatialForce()
-        force.body_index = self._body
-        force.p_BoBq_B = self._p_BoBq_B
+        force.body_index = self.body
+        force.p_BoBq_B = self.p_BoBq_B
         values = self._push.view(context).wrench
         force.F_Bq_W = SpatialForce(tau=values[:3], f=values[3:])
         output.set_value([force])  # type: ignore[attr-defined]

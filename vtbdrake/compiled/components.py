@@ -210,6 +210,26 @@ class JointSensorEquations(SensorEquations):
         super().__init__(system, context, varied, lambda at: at.input("state")[entries])
 
 
+class JointTorqueEquations(SensorEquations):
+    """`JointTorqueSensors`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        motions = [motion.get_coeffs().reshape(1, -1) for motion in system.motions]
+
+        def measure(at: At) -> Expression:
+            reaction = at.input("reaction_forces")
+            return casadi.vertcat(*(casadi.DM(m) @ reaction(k) for k, m in zip(system.places, motions, strict=True)))
+
+        super().__init__(system, context, varied, measure)
+
+
+class ForceTorqueEquations(SensorEquations):
+    """`ForceTorqueSensor`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied, lambda at: -at.input("reaction_forces")(system.place))
+
+
 class DriveEquations(Equations):
     """`JointDrives`, whose delay is compiled in."""
 

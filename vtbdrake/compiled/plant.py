@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import casadi
 import numpy as np
@@ -11,13 +11,13 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
 from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refusal, zeros
-from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
+from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
 from vtbdrake.components.compiled_plant.links import contacts
 from vtbdrake.state.multibody import multibody_variables
 from vtbdrake.state.variables import A, Variable
 
 # What may act on a plant beside its actuation.
-_ACTING = ("applied_generalized_force",)
+_ACTING = ("applied_generalized_force", "applied_spatial_force")
 _NOT_ACTING = ("geometry_query",)
 
 OVERRUN = "overrun"
@@ -56,7 +56,22 @@ class PlantEquations(Equations):
         for instance in _instances(self._plant):
             if port == f"{self._plant.GetModelInstanceName(instance)}_state":
                 return _part_of_state(self._plant, instance, x)
+        if port == "reaction_forces" and not self._plant.has_sampled_output_ports():
+            return self._reactions(at)
         raise refusal(self._plant, f"has the output port {port}, which is not compiled")
+
+    def _reactions(self, at: At) -> Callable[[int], Expression]:
+        """Return the reaction forces of the present step, by the place of the joint among those of the plant."""
+        model, plant = self._model, self._plant
+        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
+        vdot = model.acceleration(q, v, self._torque(at), period=plant.time_step())
+        reaction = model.reactions(q, v, vdot, self._applied(at))
+
+        def at_place(place: int) -> Expression:
+            (F,) = self._substituted([casadi.densify(reaction(plant.get_joint(plant.GetJointIndices()[place])))], at)
+            return F
+
+        return at_place
 
     def update(self, at: At) -> dict[int | str, Expression]:
         model, period = self._model, self._plant.time_step()
@@ -79,11 +94,20 @@ class PlantEquations(Equations):
             return "it is compiled in: name it in parameters="
         return "it is no input of a compiled plant"
 
+    def _substituted(self, results: Sequence[Expression], at: At) -> list[Expression]:
+        return self._model.substituted(results, {address: at.extra(address) for address in self.extras})
+
+    def _applied(self, at: At) -> list[AppliedForce]:
+        """Return the forces in the world that act on bodies."""
+        port = "applied_spatial_force"
+        return list(at.input(port)) if at.is_connected(port) else []
+
     def _torque(self, at: At) -> Expression:
         """Return the generalized force of everything that is connected to the plant."""
         tau = self._model.actuation(self._actuation(at))
         if at.is_connected("applied_generalized_force"):
             tau += at.input("applied_generalized_force")
+        tau += self._model.generalized(at.state(0)[: self._model.nq], self._applied(at))
         for i in range(self._plant.num_input_ports()):
             name = self._plant.get_input_port(i).get_name()
             if at.is_connected(name) and not (name.endswith("actuation") or name in (*_ACTING, *_NOT_ACTING)):

@@ -10,7 +10,9 @@ from vtbdrake.compiled.components import (
     BoardEquations,
     CasadiEquations,
     DriveEquations,
+    ForceTorqueEquations,
     JointSensorEquations,
+    JointTorqueEquations,
     SplineEquations,
 )
 from vtbdrake.compiled.drake_systems import PortSwitchEquations, SymbolicEquations
@@ -18,7 +20,7 @@ from vtbdrake.compiled.equations import REMEDY, Equations, refusal
 from vtbdrake.compiled.plant import PlantEquations
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.casadi_system import CasadiSystem
-from vtbdrake.components.sensors import JointEncoders, JointTachometers
+from vtbdrake.components.sensors import ForceTorqueSensor, JointEncoders, JointTachometers, JointTorqueSensors
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.state.systems import is_python
 from vtbdrake.testbed.switch import SwitchBoard
@@ -26,16 +28,19 @@ from vtbdrake.testbed.switch import SwitchBoard
 EQUATIONS: dict[type, type[Equations]] = {
     CasadiSystem: CasadiEquations,
     JointDrives: DriveEquations,
+    ForceTorqueSensor: ForceTorqueEquations,
     JointEncoders: JointSensorEquations,
     JointTachometers: JointSensorEquations,
+    JointTorqueSensors: JointTorqueEquations,
     MultibodyPlant: PlantEquations,
     PortSwitch: PortSwitchEquations,
     SplineCommand: SplineEquations,
     SwitchBoard: BoardEquations,
 }
-"""The equations of each class of systems, to which yours can be added: ``EQUATIONS[MySystem] = MyEquations``.
+"""The equations of each class of systems, to which others can be added: ``EQUATIONS[TheirSystem] = MyEquations``.
 
-A class that is not here, and none of whose bases is, is compiled if Drake converts it to symbolic expressions.
+A system of your own may rather have a method ``equations(context, varied)`` that returns them. A class that is not
+here, and none of whose bases is, is compiled if Drake converts it to symbolic expressions.
 """
 
 
@@ -45,6 +50,9 @@ def equations_of(system: System, context: Context, varied: frozenset[str]) -> Eq
     Raises:
         UnsupportedTestbedError: There are none.
     """
+    if hasattr(system, "equations"):
+        equations: Equations = system.equations(context, varied)
+        return equations
     for kind in type(system).__mro__:
         if kind in EQUATIONS:
             return EQUATIONS[kind](system, context, varied)

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 _UNROLLED = 16
 _LARGEST_CHUNK = 128
 
-Pattern = tuple[bool, tuple[int, ...]]
+_NO_UPDATE = -1.0
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,9 @@ class CompiledRollouts:
         self._w = casadi.SX.sym("w", max(1, self.walker.noise))
         self._recorded = self._recorded_values()
         self._shapes = self._output_shapes(diagram, variables)
-        self._steps: dict[Pattern, casadi.Function] = {}
-        self._programs: dict[tuple[int, tuple[Pattern, ...]], _Program] = {}
+        self._updates: dict[tuple[int, ...], casadi.Function] = {}
+        self._record = casadi.Function("record", [self._z, self._time], [self._recorded], {"cse": True})
+        self._programs: dict[tuple[int, tuple[tuple[int, ...], ...]], _Program] = {}
         self._last_schedule: tuple[float, list[Instant]] = np.nan, []
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
         self._lock = threading.Lock()
@@ -206,7 +207,9 @@ class CompiledRollouts:
         """Return z, shape (nz,), after what happens at an instant; it is interpreted."""
         w = np.zeros(self._w.numel())
         self.walker.draw_numbers(self.walker.seeds(z[np.newaxis])[0], instant.time, instant.updates, w)
-        following: Array = self.step(instant.pattern)(z, instant.time, w)[0].full().ravel()
+        if not instant.updates:
+            return z
+        following: Array = self._update(instant.updates)(z, instant.time, w).full().ravel()
         return following
 
     def is_beyond(self, z: Array) -> bool:
@@ -227,7 +230,7 @@ class CompiledRollouts:
         return self._program(self.schedule_at(self.walker.context.get_time())).function
 
     def arguments(self) -> tuple[Array, Array]:
-        """Return what `function` takes beside z: the instants, shape (2, count), and the random numbers of s0."""
+        """Return what `function` takes beside z: the instants, shape (3, count), and the random numbers of s0."""
         instants = self.schedule_at(self.walker.context.get_time())
         program = self._program(instants)
         noise = self._noise(self._z0[np.newaxis], instants, program.count)
@@ -274,27 +277,25 @@ class CompiledRollouts:
             self._last_schedule = t0, instants
         return instants
 
-    def step(self, pattern: Pattern) -> casadi.Function:
-        """Return the function (z, time, w) -> (z, recorded) of what happens at an instant."""
-        if pattern not in self._steps:
-            is_sample, due = pattern
-            recorded = self._recorded if is_sample else casadi.SX.zeros(self._recorded.numel(), 1)
-            following = self.walker.update(self._z, self._time, due, self._w)
-            name = "_".join(["sampled" if is_sample else "instant", *map(str, due)])
-            results: list[Any] = [casadi.densify(following), recorded]
-            self._steps[pattern] = casadi.Function(name, [self._z, self._time, self._w], results, {"cse": True})
-        return self._steps[pattern]
+    def _update(self, due: tuple[int, ...]) -> casadi.Function:
+        """Return the function (z, time, w) -> z of the updates of an instant."""
+        if due not in self._updates:
+            following = casadi.densify(self.walker.update(self._z, self._time, due, self._w))
+            name = "_".join(["update", *map(str, due)])
+            self._updates[due] = casadi.Function(name, [self._z, self._time, self._w], [following], {"cse": True})
+        return self._updates[due]
 
     def _program(self, instants: Sequence[Instant]) -> _Program:
         with self._lock:
-            patterns = tuple(dict.fromkeys(instant.pattern for instant in instants))
+            dues = tuple(dict.fromkeys(instant.updates for instant in instants if instant.updates))
             needed = len(instants)
             for (count, covered), program in self._programs.items():
-                if needed <= count <= 1.25 * needed + 4 and set(patterns) <= set(covered):
+                if needed <= count <= 1.25 * needed + 4 and set(dues) <= set(covered):
                     return program
-            count = needed if len(patterns) == 1 else needed + len(self.walker.timings)
-            program = _Program([self.step(pattern) for pattern in patterns], patterns, count, self._translate)
-            self._programs[count, patterns] = program
+            count = needed + len(self.walker.timings)
+            updates = {due: self._update(due) for due in dues}
+            program = _Program(updates, self._record, self._w.numel(), count, self._translate)
+            self._programs[count, dues] = program
             return program
 
     def _noise(self, z: Array, instants: Sequence[Instant], count: int) -> Array | None:
@@ -319,28 +320,27 @@ class _Program:
 
     def __init__(
         self,
-        steps: Sequence[casadi.Function],
-        patterns: Sequence[Pattern],
+        updates: Mapping[tuple[int, ...], casadi.Function],
+        record: casadi.Function,
+        noise: int,
         count: int,
         translate: Callable[[casadi.Function], casadi.Function],
     ) -> None:
         self.count = count
-        self._numbers = {pattern: float(k) for k, pattern in enumerate(patterns)}
-        self._noise = steps[0].size1_in(2)
-        self.function = _rollout(steps, count)
-        z, instants, w = self.function.mx_in()
-        packed = casadi.Function(
-            "rollout", [z, instants, w], [casadi.vertcat(*map(casadi.vec, self.function(z, instants, w)))]
-        )
+        self._numbers = {due: float(k) for k, due in enumerate(updates)}
+        self.function = _rollout(list(updates.values()), record, noise, count)
+        arguments = self.function.mx_in()
+        results: Any = self.function(*arguments)
+        packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
         self._packed = translate(packed)
         self._buffers: dict[int, Buffers] = {}
         self._lock = threading.Lock()
 
     def plan(self, instants: Sequence[Instant]) -> Array:
-        """Return [number of the step, time] of each instant, shape (count, 2); the rest is idle."""
-        plan = np.full((self.count, 2), -1.0)
-        plan[: len(instants), 0] = [self._numbers[instant.pattern] for instant in instants]
-        plan[: len(instants), 1] = [instant.time for instant in instants]
+        """Return [time, number of the update, whether to record] of each instant, shape (count, 3)."""
+        plan = np.tile([0.0, _NO_UPDATE, 0.0], (self.count, 1))
+        numbers = self._numbers
+        plan[: len(instants)] = [(i.time, numbers.get(i.updates, _NO_UPDATE), i.is_sample) for i in instants]
         return plan
 
     def run(self, z: Array, noise: Array | None, instants: Sequence[Instant]) -> tuple[Array, Array]:
@@ -363,20 +363,22 @@ class _Program:
         return rows[:, :nz].copy(), recorded[:, sampled]
 
 
-def _rollout(steps: Sequence[casadi.Function], count: int) -> casadi.Function:
+def _rollout(updates: Sequence[casadi.Function], record: casadi.Function, noise: int, count: int) -> casadi.Function:
     """Return the function (z, instants, w) -> (z, recorded) of ``count`` instants.
 
-    A column of ``instants`` is [number of the step, time]; where there is no such step, nothing happens.
+    A column of ``instants`` is [time, number of the update, whether to record]; there is no update of number -1.
     """
-    z, time, w = steps[0].sx_in()
-    idle = casadi.Function("idle", [z, time, w], [z, casadi.SX.zeros(steps[0].size1_out(1), 1)])
-    number, when, state, random = (
-        casadi.MX.sym(name, size) for name, size in (("k", 1), ("t", 1), ("z", z.numel()), ("w", w.numel()))
+    z, time = record.sx_in()
+    w = casadi.SX.sym("w", noise)
+    keep = casadi.Function("keep", [z, time, w], [z])
+    nothing = casadi.Function("nothing", [z, time], [casadi.SX.zeros(record.numel_out(0), 1)])
+    update = casadi.Function.conditional("update", list(updates) or [keep], keep)
+    sample = casadi.Function.if_else("sample", record, nothing)
+    state, instant, random = (
+        casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 3), ("w", noise))
     )
-    either = casadi.Function.conditional("either", list(steps), idle)
-    results: Any = either(number, state, when, random)
-    step = casadi.Function("step", [state, casadi.vertcat(number, when), random], list(results))
-    return _repeated(step, count)
+    results: Any = [update(instant[1], state, instant[0], random), sample(instant[2], state, instant[0])]
+    return _repeated(casadi.Function("step", [state, instant, random], results), count)
 
 
 def _repeated(step: casadi.Function, count: int) -> casadi.Function:
@@ -398,7 +400,7 @@ def _chained(functions: Sequence[casadi.Function], sizes: Sequence[int]) -> casa
         casadi.MX.sym(name, rows, columns)
         for name, rows, columns in (
             ("z", functions[0].size1_in(0), 1),
-            ("instants", 2, total),
+            ("instants", 3, total),
             ("w", functions[0].size1_in(2), total),
         )
     )

@@ -26,11 +26,6 @@ class Instant:
     is_sample: bool
     updates: tuple[int, ...]
 
-    @property
-    def pattern(self) -> tuple[bool, tuple[int, ...]]:
-        """Return what happens, without the time."""
-        return self.is_sample, self.updates
-
 
 def schedule(timings: Sequence[Timing], samples: Array) -> list[Instant]:
     """Return what a Simulator does that begins at the first sample, and is advanced from each sample to the next.

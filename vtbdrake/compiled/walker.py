@@ -114,8 +114,8 @@ class Walker:
             elif block.kind == EXTRA:
                 z[block.entries] = np.ravel(self.variables[self._address(block)].get(context))
             else:
-                own = self._systems[block.path].GetMyContextFromRoot(context)
-                z[block.entries] = read_group(own, block.kind, int(block.name))
+                leaf_context = self._systems[block.path].GetMyContextFromRoot(context)
+                z[block.entries] = read_group(leaf_context, block.kind, int(block.name))
         return z
 
     def write(self, z: Array, context: Context) -> None:
@@ -125,8 +125,8 @@ class Walker:
                 variable = self.variables[self._address(block)]
                 variable.set(context, z[block.entries].reshape(variable.shape))
             elif block.kind != MEMORY:
-                own = self._systems[block.path].GetMyMutableContextFromRoot(context)
-                write_group(own, block.kind, int(block.name), z[block.entries])
+                leaf_context = self._systems[block.path].GetMyMutableContextFromRoot(context)
+                write_group(leaf_context, block.kind, int(block.name), z[block.entries])
 
     def check(self, context: Context) -> None:
         """Check that a root context differs from the compiled one only in z, and there not in what is compiled in.
@@ -227,24 +227,24 @@ class Walker:
     def fixed_input(self, path: str, number: int) -> Expression | None:
         """Return the value that is fixed at an input port to which nothing is connected, if any."""
         system = self._systems[path]
-        own = system.GetMyContextFromRoot(self.context)
+        leaf_context = system.GetMyContextFromRoot(self.context)
         port = system.get_input_port(number)
-        if port.get_data_type() != PortDataType.kVectorValued or not port.HasValue(own):
+        if port.get_data_type() != PortDataType.kVectorValued or not port.HasValue(leaf_context):
             return None
-        return casadi.SX(casadi.DM(port.Eval(own)))
+        return casadi.SX(casadi.DM(port.Eval(leaf_context)))
 
     # -- how it is done
 
     def _equations_of(self, path: str, system: System, names: frozenset[str]) -> Equations:
-        own = system.GetMyContextFromRoot(self.context)
-        if own.num_continuous_states():
+        leaf_context = system.GetMyContextFromRoot(self.context)
+        if leaf_context.num_continuous_states():
             raise UnsupportedTestbedError(
                 f"{class_name(system)} has continuous state: give it a time step, or write its update as a "
                 "casadi.Function"
             )
         if is_scene_graph(system):
             raise UnsupportedTestbedError("geometry is not compiled")
-        return equations_of(system, own, names)
+        return equations_of(system, leaf_context, names)
 
     def _within(self, path: str, address: str) -> str:
         """Return the name of a variable within the system at a path, or nothing."""
@@ -278,13 +278,14 @@ class Walker:
     def _layout(self) -> Iterator[Block]:
         start = 0
         for path, equations in self.equations.items():
-            own = equations.system.GetMyContextFromRoot(self.context)
+            leaf_context = equations.system.GetMyContextFromRoot(self.context)
             sizes: list[tuple[str, int | str, int]] = [
-                (DISCRETE, i, own.get_discrete_state(i).size()) for i in range(own.num_discrete_state_groups())
+                (DISCRETE, i, leaf_context.get_discrete_state(i).size())
+                for i in range(leaf_context.num_discrete_state_groups())
             ]
             if not is_plant(equations.system):
-                count = own.num_numeric_parameter_groups()
-                sizes += [(PARAMETER, i, own.get_numeric_parameter(i).size()) for i in range(count)]
+                count = leaf_context.num_numeric_parameter_groups()
+                sizes += [(PARAMETER, i, leaf_context.get_numeric_parameter(i).size()) for i in range(count)]
             sizes += [(MEMORY, name, 1) for name in equations.memory]
             sizes += [(EXTRA, name, size) for name, size in equations.extras.items()]
             for kind, name, size in sizes:

@@ -1,6 +1,12 @@
 """A MultibodyPlant without contact as compiled functions: its dynamics, its steps, many rollouts in one call."""
 
-from vtbdrake.components.compiled_plant.dynamics import FrameMotion, PlantDynamics, plant_dynamics, plant_step
+from vtbdrake.components.compiled_plant.dynamics import (
+    AppliedForce,
+    FrameMotion,
+    PlantDynamics,
+    plant_dynamics,
+    plant_step,
+)
 from vtbdrake.components.compiled_plant.links import UnsupportedPlantError
 from vtbdrake.components.compiled_plant.momentum import (
     BaseMotion,
@@ -14,6 +20,7 @@ from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBa
 from vtbdrake.components.compiled_plant.world import compiled_world
 
 __all__ = [
+    "AppliedForce",
     "BaseMotion",
     "BaseReaction",
     "FrameMotion",

@@ -8,13 +8,13 @@ crf(V). The world accelerates with -g, so that weight needs no force.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi
 import numpy as np
 from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
-from pydrake.multibody.tree import Frame
+from pydrake.multibody.tree import Frame, Joint
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.casadi_system.kernel import clamp
@@ -96,6 +96,21 @@ class FrameMotion:
     J: Expression
 
 
+@dataclass(frozen=True)
+class AppliedForce:
+    """A force on a body, as Drake's ExternallyAppliedSpatialForce.
+
+    Attributes:
+        body: Index of the body B.
+        p_BoBq_B: Where it acts, shape (3, 1).
+        F_Bq_W: [torque; force] in the world, shape (6, 1).
+    """
+
+    body: int
+    p_BoBq_B: Expression
+    F_Bq_W: Expression
+
+
 class PlantDynamics:
     """A plant as CasADi expressions. All quantities are the plant's own: q, v and tau in its order and units.
 
@@ -113,6 +128,7 @@ class PlantDynamics:
         self._links = tree.links
         self._symbols = tree.symbols
         self._mounts = tree.mounts
+        self._inertias, self._welds = tree.inertias, tree.welds
         self._context = context
         self._gravity = constant(np.concatenate([np.zeros(3), plant.gravity_field().gravity_vector()]))
         self._actuation = constant(plant.MakeActuationMatrix())
@@ -273,8 +289,10 @@ class PlantDynamics:
 
     def frame(self, frame: Frame, q: Expression) -> FrameMotion:
         """Return pose and Jacobian of a frame of the plant."""
+        return self._motion_on_link(*self._on_link(frame), q)
+
+    def _motion_on_link(self, k: int, X_MF: Pose, q: Expression) -> FrameMotion:
         poses = self._poses(q)
-        k, X_MF = self._on_link(frame)
         R, p = X_MF if k < 0 else times(poses[k], X_MF)
         J = casadi.SX(6, self.nv)
         while k >= 0:
@@ -300,6 +318,89 @@ class PlantDynamics:
         # A spatial acceleration is that of a point fixed in space; F's origin moves through it with the link.
         linear = accelerations[k][3:] + omega @ moves[k].V[3:] + skew(alpha) @ p_MF + omega @ (omega @ p_MF)
         return casadi.vertcat(R @ alpha, R @ linear)
+
+    # -- forces
+
+    def generalized(self, q: Expression, forces: Sequence[AppliedForce]) -> Expression:
+        """Return tau of forces in the world that act on bodies."""
+        tau = casadi.SX(self.nv, 1)
+        for force in forces:
+            motion = self._motion_on_link(*self._mounts[force.body], q)
+            torque, push = force.F_Bq_W[:3], force.F_Bq_W[3:]
+            about_Bo = torque + casadi.cross(motion.R @ force.p_BoBq_B, push)
+            tau += motion.J.T @ casadi.vertcat(about_Bo, push)
+        return tau
+
+    def reactions(
+        self, q: Expression, v: Expression, vdot: Expression, forces: Sequence[AppliedForce]
+    ) -> Callable[[Joint], Expression]:
+        """Return a function of a joint that returns its reaction force F_CJc_Jc, [torque; force], shape (6, 1).
+
+        It is what Drake's ``reaction_forces`` holds: all that the joint exerts on its child C, about the origin of the
+        joint's frame Jc on the child, in Jc.
+
+        Args:
+            q: Positions.
+            v: Velocities.
+            vdot: Accelerations.
+            forces: What else acts on the bodies.
+        """
+        moves = self._moves(q, v)
+        poses = self._poses(q)
+        accelerations: list[Expression] = []
+        for link, move in zip(self._links, moves, strict=True):
+            A = move.X @ self._of_parent(accelerations, link, -self._gravity)
+            accelerations.append(A + move.bias + move.S @ vdot[link.v])
+
+        def needed(body: int) -> Expression:
+            """Return the force, on the link of a body, that the body needs in its motion beside what acts on it."""
+            k, X_MB = self._mounts[body]
+            if k < 0:
+                return casadi.SX(6, 1)
+            inertia, V = self._inertias[body], moves[k].V
+            F = inertia @ accelerations[k] + _crf(V) @ (inertia @ V)
+            R_MW = poses[k][0].T
+            for force in forces:
+                if force.body == body:
+                    push = R_MW @ force.F_Bq_W[3:]
+                    arm = X_MB[1] + X_MB[0] @ force.p_BoBq_B
+                    F -= casadi.vertcat(R_MW @ force.F_Bq_W[:3] + casadi.cross(arm, push), push)
+            return F
+
+        def carried(bodies: set[int]) -> Expression:
+            """Return what bodies of one link need, with all links that hang on them, in the frame of the link."""
+            F = casadi.SX(6, 1)
+            for body in sorted(bodies):
+                F += needed(body)
+            for k, link in enumerate(self._links):
+                if link.carrier in bodies:
+                    F += moves[k].X.T @ carried(self._on(k))
+            return F
+
+        def reaction(joint: Joint) -> Expression:
+            child = int(joint.child_body().index())
+            k, (R, p) = self._on_link(joint.frame_on_child())
+            moved = [i for i, link in enumerate(self._links) if link.joint == int(joint.index())]
+            F = carried(self._on(moved[0]) if moved else self._behind(child))
+            if k < 0:
+                raise UnsupportedPlantError(
+                    f"the reaction force of {joint.name()}, which does not move, is not compiled"
+                )
+            return casadi.vertcat(R.T @ (F[:3] - casadi.cross(p, F[3:])), R.T @ F[3:])
+
+        return reaction
+
+    def _on(self, k: int) -> set[int]:
+        """Return the bodies of a link."""
+        return {body for body, (link, _) in self._mounts.items() if link == k}
+
+    def _behind(self, body: int) -> set[int]:
+        """Return a body that is welded to another one, and all that are welded to it."""
+        behind = {body}
+        for welded, carrier in self._welds.items():  # Carriers come first.
+            if carrier in behind:
+                behind.add(welded)
+        return behind
 
     # -- recursions
 

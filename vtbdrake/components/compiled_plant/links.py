@@ -34,7 +34,9 @@ class Link:
     The frame of the link is M, the frame of the joint on its side; F is the joint's frame on the other side.
 
     Attributes:
+        joint: Index of the joint.
         parent: Number of the link that carries the joint; -1 is the world.
+        carrier: Index of the body that carries the joint.
         kind: Type name of the joint.
         axis: Axis of the joint, in F and in M, shape (3, 1).
         q: Places of its positions among those of the plant.
@@ -45,7 +47,9 @@ class Link:
         reflected_inertia: Reflected inertia of the joint's actuator, shape (nv, 1).
     """
 
+    joint: int
     parent: int
+    carrier: int
     kind: str
     axis: Expression
     q: slice
@@ -63,12 +67,16 @@ class LinkTree:
     Attributes:
         links: One for each joint that moves.
         mounts: Number of the link that a body B belongs to, and X_MB, by the index of the body. The world's is -1.
+        inertias: M_BMo_M of each body, by its index, shape (6, 6).
+        welds: Index of the body that carries a welded one, by its index.
         symbols: The inputs, by address.
         values: What the Context holds for them, by address, flat.
     """
 
     links: tuple[Link, ...]
     mounts: dict[int, tuple[int, Pose]]
+    inertias: dict[int, Expression]
+    welds: dict[int, int]
     symbols: dict[str, Expression]
     values: dict[str, NDArray[np.float64]]
 
@@ -105,6 +113,8 @@ class _Reader:
         self._offered: set[str] = set()
         self._mounts: dict[int, tuple[int, Pose]] = {}
         self._links: list[Link] = []
+        self._inertias: dict[int, Expression] = {}
+        self._welds: dict[int, int] = {}
 
     def tree(self) -> LinkTree:
         reflected = self._reflected_inertias()
@@ -120,7 +130,7 @@ class _Reader:
         self._check_inputs()
         symbols = {address: self._symbols[address] for address in self._inputs}
         values = {address: self._values[address] for address in self._inputs}
-        return LinkTree(tuple(self._links), self._mounts, symbols, values)
+        return LinkTree(tuple(self._links), self._mounts, self._inertias, self._welds, symbols, values)
 
     def _mount(self, joint: Joint, reflected: dict[int, Expression], *, reverse: bool) -> None:
         """Add the body that a joint carries; its child, or its parent in ``reverse``."""
@@ -136,6 +146,7 @@ class _Reader:
             X_FM = joint.X_FM()
             X_PB = times(times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM)), X_MB)
             self._mounts[int(body.index())] = parent, X_PB
+            self._welds[int(body.index())] = int(inner.body().index())
             inertia = self._inertia(body, X_PB)
             if parent >= 0:
                 link = self._links[parent]
@@ -154,7 +165,9 @@ class _Reader:
         self._mounts[int(body.index())] = len(self._links), X_MB
         self._links.append(
             Link(
+                joint=int(joint.index()),
                 parent=parent,
+                carrier=int(inner.body().index()),
                 kind=kind,
                 # Seen from its child, a joint turns or slides the other way.
                 axis=constant(-axis if reverse else axis),
@@ -187,7 +200,8 @@ class _Reader:
         R, p = X_MB
         I_cm = R @ I_cm @ R.T
         c = skew(p + R @ com)
-        return symmetric(casadi.blockcat([[I_cm - mass * (c @ c), mass * c], [mass * c.T, mass * casadi.SX.eye(3)]]))
+        blocks = [[I_cm - mass * (c @ c), mass * c], [mass * c.T, mass * casadi.SX.eye(3)]]
+        return self._inertias.setdefault(int(body.index()), symmetric(casadi.blockcat(blocks)))
 
     def _frame_pose(self, frame: Frame) -> Pose:
         """Return X_BF of a frame F on the body B."""
