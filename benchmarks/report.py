@@ -42,6 +42,7 @@ BENCHMARKS: Registry = {
     "recording_cost": "benchmarks.recording:recording_cost",
     "replay_rtf": "benchmarks.recording:replay_rtf",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
+    "calibration_time": "benchmarks.calibration:calibration_time",
     "domain_query": "benchmarks.domain_query:domain_query",
     "dps_alone_start": "benchmarks.dps_alone:dps_alone_start",
     "study_overhead_threads": "benchmarks.study:study_overhead_threads",
