@@ -22,6 +22,7 @@ from vtbdrake.cli.options import (
     settings,
 )
 from vtbdrake.cli.output import emit, json_option, say, table, write_csv
+from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, on_error_option, problem_options
 
 if TYPE_CHECKING:
@@ -31,6 +32,13 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
 
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+_trust_option = option(
+    "--trust MODULE",
+    "A module, or a package of modules, that may be imported because FILE names it, which runs its code. Those of "
+    "vtbdrake need not be named. May be repeated.",
+    name="trusted",
+    multiple=True,
+)
 _point = click.argument(
     "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
 )
@@ -260,3 +268,51 @@ def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> 
             raise click.BadParameter(f"the study has {len(trials)} trials, counted from 0, and no trial {trial}")
         opened.set_attribute(*attribute, point=None if trial is None else trials[trial].parameters)
         emit(settings([attribute]))
+
+
+@study.command("open")
+@_file
+@_trust_option
+@page_options
+@browser_option
+@json_option
+def open_page(file: Path, trusted: tuple[str, ...], page: dict[str, Any], browser: bool) -> None:
+    """Watch and steer a study in a web browser, until Ctrl-C.
+
+    The study in FILE may be run by another process meanwhile, or by none. The page is served on this machine alone, and
+    its address has a token.
+
+    \b
+    Example:
+      vtbdrake study open gait.db
+    """
+    from vtbdrake.web import view_study
+
+    with view_study(file, trusted=trusted, **page) as opened:
+        serve(opened.url, browser=browser)
+
+
+@study.command("continue")
+@_file
+@_trust_option
+@grouped(
+    "running",
+    option("--rollouts N", "End when the study has N rollouts.  [default: its budget]", type=click.IntRange(min=1)),
+    option("--seconds S", "End after S seconds of wall time.", type=float),
+)
+@executor_options
+@json_option
+def go_on(file: Path, trusted: tuple[str, ...], running: dict[str, Any]) -> None:
+    """Go on with a study whose problem FILE states."""
+    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.statement import restated
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    with Study.open(file) as opened:
+        record = opened.record
+    if running["rollouts"] is None and running["seconds"] is None:
+        running["rollouts"] = record.get("budget")
+    with restated(record, trusted=trusted).study(file) as resumed:
+        resumed.run(**running)
+        say(resumed.summary())
+        emit({**_described(resumed), "reason": resumed.reason})

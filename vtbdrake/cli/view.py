@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-import webbrowser
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vtbdrake.cli.options import Setting, option, scenario_argument, set_option, settings, start_option
-from vtbdrake.cli.output import json_option, show
+from vtbdrake.cli.output import json_option
+from vtbdrake.cli.page import browser_option, page_options, serve
 
 if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
@@ -21,17 +19,15 @@ if TYPE_CHECKING:
 @scenario_argument
 @set_option
 @start_option
-@option("--port N", "The port on this machine; 0: any that is free.", type=click.IntRange(0, 65535), default=0)
-@option("--host NAME:PORT", "A name under which a proxy offers the page. May be repeated.", name="hosts", multiple=True)
+@page_options
 @option("--play", "Let time run at once.", is_flag=True)
-@option("--browser/--no-browser", "Open the page in a browser.", name="browser", default=True)
+@browser_option
 @json_option
 def view(
     scenario: Scenario,
     values: tuple[Setting, ...],
     start: Snapshot | None,
-    port: int,
-    hosts: tuple[str, ...],
+    page: dict[str, Any],
     play: bool,
     browser: bool,
 ) -> None:
@@ -45,13 +41,7 @@ def view(
     """
     from vtbdrake.web import view as open_view
 
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    with open_view(scenario, start=start, values=settings(values), port=port, hosts=hosts) as running:
-        show(running.url, {"url": running.url})
+    with open_view(scenario, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()
-        if browser:
-            webbrowser.open(running.url)
-        ended.wait()
+        serve(running.url, browser=browser)

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
+from math import isnan
 from typing import Any
 
 from vtbdrake.failures import safe_text
 from vtbdrake.optimization.solvers.solver import Point, PointValues
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.task import FAILED
+
+# How a point came out beside `FAILED`: it keeps the constraints, it breaks one, or racing dropped it.
+FEASIBLE, BROKEN, DROPPED = "feasible", "broken", "dropped"
 
 # (point, number of the condition)
 RolloutKey = tuple[Point, int]
@@ -63,6 +67,16 @@ class Trial(PointValues):
     def point(self) -> Point:
         """Return the values of the parameters, in their order."""
         return tuple(self.parameters.values())
+
+    @property
+    def kind(self) -> str:
+        """Return how the point came out: `FEASIBLE`, `BROKEN`, `DROPPED` or `FAILED`."""
+        # The bound of a dropped point may be infinite; only a failed simulation gives NaN.
+        if any(isnan(value) for value in self.values):
+            return FAILED
+        if not self.exact:
+            return DROPPED
+        return FEASIBLE if self.feasible else BROKEN
 
     @property
     def value(self) -> float:

@@ -79,8 +79,8 @@ def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Probl
 def _refuse_strangers(names: Sequence[str], trusted: Sequence[str]) -> None:
     for name in names:
         module = name.partition(":")[0]
-        known = module in sys.modules and module != "__main__"
-        if not known and not any(module == t or module.startswith(f"{t}.") for t in (*_OWN, *trusted)):
+        imported = module in sys.modules and module != "__main__"
+        if not imported and not any(module == t or module.startswith(f"{t}.") for t in (*_OWN, *trusted)):
             raise StatementError(
                 f"the file names {name}, and importing its module runs its code: name the module, if you trust it"
             )

@@ -6,7 +6,7 @@ import getpass
 import logging
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor as FuturesExecutor
 from datetime import datetime
 from pathlib import Path
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
 
     from vtbdrake.optimization.problem import Problem
+    from vtbdrake.web import StudyView
 
 _log = logging.getLogger(__name__)
 
@@ -717,6 +718,22 @@ class Study:
         return f"best: {self.names[0]} = {best.value:g} at {point_text(self.parameters, best.point, self.units)}"
 
     # -- pictures and exports
+
+    def view(self, *, port: int = 0, hosts: Collection[str] = ()) -> StudyView:
+        """Open the page of the study, where it is watched while it runs, here or elsewhere; see docs/study_page.md.
+
+        Args:
+            port: The port of the page on the loopback interface; 0 for any that is free.
+            hosts: Host names (with port) under which proxies offer the page.
+
+        Raises:
+            PortError: The port is taken.
+            ModuleNotFoundError: The extra ``web`` is not installed.
+        """
+        from vtbdrake.web import view_study
+
+        # A connection of its own: reading must not wait for a transaction of this one.
+        return view_study(self.path or self._file, problem=self._problem, port=port, hosts=hosts)
 
     def plot_history(self) -> Figure:
         """Plot the values of the trials in their order, and the best so far."""

@@ -395,8 +395,8 @@ class StudyFile:
         returned each time, as they will be recorded again.
         """
         mark, rows, numbers = self._rows_since("trials", mark)
-        first, told = self._get("first_position", 0), self._get("told", 0)
-        final = [row["position"] < first or row["batch"] < told for row in rows]
+        first, complete = self._get("first_position", 0), self.completed_batches()
+        final = [row["position"] < first or row["batch"] < complete for row in rows]
         settled = final.index(False) if False in final else len(final)
         after = _mark(numbers[settled - 1], rows[settled - 1], mark.count + settled) if settled else mark
         return mark.count, self._trials(rows, first=mark.count), after

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import isnan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from matplotlib.tri import Triangulation
 
 from vtbdrake.optimization import Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.records import BROKEN, DROPPED, FEASIBLE
 from vtbdrake.visualization.plots import FAILED, Picture, draw_mesh, finish, label, mark_best
 
 if TYPE_CHECKING:
@@ -48,9 +48,9 @@ class Points:
         Raises:
             ValueError: The study has no points.
         """
-        sorted_: dict[str, list[Trial]] = {"feasible": [], "broken": [], "dropped": [], "failed": []}
+        sorted_: dict[str, list[Trial]] = {FEASIBLE: [], BROKEN: [], DROPPED: [], "failed": []}
         for trial in study.trials:
-            sorted_[_kind(trial)].append(trial)
+            sorted_[trial.kind].append(trial)
         if not any(sorted_.values()):
             raise ValueError("the study has no judged points yet, so that there is nothing to draw: run it first")
         return cls(**{kind: tuple(trials) for kind, trials in sorted_.items()})
@@ -82,15 +82,6 @@ class Points:
         """Return the best point in one quality; None if no point keeps the constraints."""
         sign = study.signs[quality]
         return max(self.feasible, key=lambda trial: sign * trial.values[quality], default=None)
-
-
-def _kind(trial: Trial) -> str:
-    # The bound of a dropped point may be infinite; only a failed simulation gives NaN.
-    if any(isnan(value) for value in trial.values):
-        return "failed"
-    if not trial.exact:
-        return "dropped"
-    return "feasible" if trial.feasible else "broken"
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:

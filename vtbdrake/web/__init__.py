@@ -1,4 +1,4 @@
-"""The live page: a running testbed is watched and steered in a web browser."""
+"""The live pages: a running testbed, or a study, is watched and steered in a web browser."""
 
 from vtbdrake.lazy import lazy_names
 

@@ -98,11 +98,7 @@ class Bayesian(Solver):
         if not any(evaluation.usable for evaluation in remembered):
             drawn = (self.search.point(u) for u in self._rng.random((SPREAD, self.search.size)))
             return list(dict.fromkeys(point for point in drawn if point not in self._evaluations))[: self._batch]
-        units = np.array([self.search.unit(evaluation.point) for evaluation in remembered])
-        targets = self._targets(remembered)
-        X = self._encoded(units)
-        for model, target in zip(self._models, targets.T, strict=True):
-            model.fit(X, target)
+        units, X, targets = self._fit(remembered)
         counted = np.array([evaluation.counts for evaluation in remembered])
         centres = units[self._best_first(remembered, targets)[: 4 * BEST]]
         points: list[Point] = []
@@ -115,6 +111,37 @@ class Bayesian(Solver):
             for model in self._models if len(points) < self._batch else ():
                 model.believe(self._encoded(u[np.newaxis]))
         return points
+
+    def _fit(self, evaluations: Sequence[Evaluation]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the models; return the places of the evaluations, the kernel's input there, and the targets."""
+        units = np.array([self.search.unit(evaluation.point) for evaluation in evaluations])
+        targets = self._targets(evaluations)
+        X = self._encoded(units)
+        for model, target in zip(self._models, targets.T, strict=True):
+            model.fit(X, target)
+        return units, X, targets
+
+    def mean(self, units: np.ndarray) -> np.ndarray:
+        """Return the values that the models expect in places of the unit cube, (k, n) -> (k, objectives).
+
+        A mean is that of the transformed values, transformed back: rather a median. It lies between the worst and the
+        best value so far. Without any value it is NaN.
+        """
+        from threadpoolctl import threadpool_limits
+
+        remembered = self._remembered()
+        usable = np.array([evaluation.usable for evaluation in remembered], dtype=bool)
+        if not usable.any():
+            return np.full((len(units), self.search.objectives), np.nan)
+        with threadpool_limits(1, user_api="blas"):
+            _, _, targets = self._fit(remembered)
+            places = self._encoded(self._snapped(units))
+            columns = []
+            for k, model in enumerate(self._models[: self.search.objectives]):
+                values = np.array([evaluation.values[k] for evaluation in remembered])[usable]
+                order = np.argsort(targets[usable, k], kind="stable")
+                columns.append(np.interp(model.predict(places)[0], targets[usable, k][order], values[order]))
+        return np.column_stack(columns)
 
     def _best_count(self, available: int) -> int:
         return min(BEST if self.search.objectives == 1 else 4 * BEST, available)

@@ -1,0 +1,42 @@
+"""A study of the cart-pole, for the tests of its page."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from vtbdrake.optimization import Parameter, Problem
+from vtbdrake.rollout import Constraint, Quality
+from vtbdrake.rollout.named_function import magnitude
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+
+ROOT = Path(__file__).resolve().parents[2]
+ANGLE = "sim.sys.cart_pole.pole_pin.position"
+RATE = "sim.sys.cart_pole.pole_pin.velocity"
+PLACE = "sim.sys.cart_pole.cart_slider.position"
+HORIZON = 1.0
+
+
+def cart_pole_problem(**more: Any) -> Problem:
+    """From which angle and with which speed of the pole does the cart get farthest?"""
+    settings: dict[str, Any] = {
+        "scenario": CartPoleScenario(),
+        "parameters": [Parameter(ANGLE, 0.5, 3.0), Parameter(RATE, -3.0, 3.0)],
+        "quality": Quality(magnitude, PLACE),
+        "constraints": [Constraint(magnitude, RATE, at_most=8.0)],
+        "horizon": HORIZON,
+    }
+    return Problem(**{**settings, **more})
+
+
+def run_elsewhere(path: Path, *, rollouts: int) -> subprocess.Popen[bytes]:
+    """Begin the study, or go on with it, in a process of its own."""
+    code = f"""
+from pathlib import Path
+from tests.web.studies import cart_pole_problem
+with cart_pole_problem().study({str(path)!r}, solver="CMA-ES") as study:
+    study.run(rollouts={rollouts}, executor="serial", progress=False)
+"""
+    return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)

@@ -1,0 +1,127 @@
+"""The page of a study in a real browser: what is in its pictures, and what a person can do there."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+
+from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.web.studies import ANGLE, PLACE, cart_pole_problem, run_elsewhere
+from tests.web.test_page import GREEN, drawn, share
+from vtbdrake.optimization import Parameter
+from vtbdrake.rollout import Quality
+from vtbdrake.rollout.named_function import magnitude
+from vtbdrake.web import StudyView, view_study
+
+PURPLE = np.array([204, 51, 153])  # the ghost of the point at the pointer
+
+pytestmark = [pytest.mark.slow, needs_chromium]
+
+
+@contextmanager
+def page_of(browser: Browser, view: StudyView) -> Iterator[Page]:
+    opened = browser.new_page(viewport={"width": 1000, "height": 700})
+    opened.set_default_timeout(PATIENCE)
+    failures: list[str] = []
+    opened.on("pageerror", lambda error: failures.append(str(error)))
+    opened.goto(view.url)
+    opened.wait_for_selector("body[data-page=open][data-trials]", state="attached")
+    yield opened
+    opened.close()
+    assert not failures
+
+
+def scene(page: Page) -> np.ndarray:
+    """The rollouts, between head and bar, shape (height, width, 3)."""
+    return screenshot(page, clip={"x": 505, "y": 120, "width": 490, "height": 520})
+
+
+def place_of(page: Page, chart: str, trial: int) -> tuple[float, float]:
+    """Where a trial lies on the screen."""
+    x, y = page.evaluate(f"(k) => [vtb.{chart}.x(vtb.{chart}.data.x[k]), vtb.{chart}.y(vtb.{chart}.data.y[k])]", trial)
+    box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
+    assert box is not None
+    return box["x"] + x, box["y"] + y
+
+
+def test_landscape_can_be_entered(browser: Browser, tmp_path: Path) -> None:
+    problem = cart_pole_problem()
+    with problem.study(tmp_path / "a.db", solver="sobol", seed=2) as study:
+        study.run(rollouts=16, executor="serial", progress=False)
+        best, trials = study.best, study.trials
+    far = max(range(16), key=lambda k: abs(trials[k].point[0] - best.point[0]))
+    with view_study(tmp_path / "a.db") as view, page_of(browser, view) as page:
+        assert page.title() == "a.db: study"
+        drawn(page, f"document.body.dataset.best === '{best.number}' && document.body.dataset.model === '16'")
+        assert page.inner_text("[data-fact=best]").endswith(f"{best.value:.5g}")
+        landscape = screenshot(page, clip={"x": 90, "y": 150, "width": 380, "height": 240})
+        assert len(np.unique(landscape.reshape(-1, 3), axis=0)) > 50  # the model's shades
+        before = scene(page)
+        assert len(np.unique(before.reshape(-1, 3), axis=0)) > 100 and share(before, PURPLE) < 1e-3
+        # The pointer at a trial shows its ghost, at the slider's time.
+        page.mouse.move(*place_of(page, "landscape", far))
+        drawn(page, f"document.body.dataset.pointed === '{far}'")
+        assert f"trial {far}: magnitude = {trials[far].value:.5g}" in page.inner_text("#vtb-pointed")
+        pointed = scene(page)
+        assert share(pointed, PURPLE) > 0.005
+        page.evaluate("vtb.setTime(0.6)")
+        drawn(page, "document.body.dataset.time === '0.6'")
+        later = scene(page)
+        assert share(later, PURPLE) > 0.005
+        assert np.mean(np.abs(later - pointed).max(axis=2) > 30) > 0.005
+        page.mouse.move(5, 5)
+        page.wait_for_selector("#vtb-key-pointed", state="hidden")
+        # A click tries a point.
+        page.click("#vtb-tab-try")
+        page.check("#vtb-try-click")
+        box = page.locator("#vtb-landscape").bounding_box()
+        assert box is not None
+        page.mouse.click(box["x"] + 0.6 * box["width"], box["y"] + 0.4 * box["height"])
+        drawn(page, "document.body.dataset.tried === '1'")
+        value = problem.rollout(page.evaluate("vtb.tried.point")).value
+        assert f"magnitude = {value:.5g}" in page.inner_text("#vtb-tried")
+        assert share(scene(page), GREEN) > 5e-4 > share(before, GREEN)
+        page.click("#vtb-add")
+        page.wait_for_selector("[data-fact=waiting]")
+
+
+def test_running_study_is_watched_until_its_process_dies(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    cart_pole_problem().study(path, solver="CMA-ES").close()
+    with view_study(path) as view, page_of(browser, view) as page:
+        assert page.inner_text("[data-fact=state]").endswith("not begun")
+        runner = run_elsewhere(path, rollouts=5000)
+        drawn(page, "document.body.dataset.state === 'running' && Number(document.body.dataset.trials) > 20")
+        drawn(page, f"Number(document.body.dataset.trials) > {page.evaluate('vtb.trials.count')}")
+        assert " of 5000" in page.inner_text("[data-fact=rollouts]")
+        runner.send_signal(signal.SIGKILL)
+        runner.wait()
+        page.wait_for_selector("#vtb-resume")
+        assert "its process has died" in page.inner_text("[data-fact=state]")
+        assert "study continue" in page.inner_text("[data-kind=died]")
+
+
+def test_pareto_front_and_parallel_axes(browser: Browser) -> None:
+    problem = cart_pole_problem(
+        parameters=[Parameter(ANGLE, 0.5, 3.0), Parameter("sim.sys.cart_pole.pole.mass", 0.1, 1.0, log=True),
+                    Parameter("sim.sys.cart_pole.cart.mass", 5.0, 20.0)],
+        quality=[Quality(magnitude, PLACE), Quality(magnitude, ANGLE, minimize=True)],
+        constraints=[],
+    )  # fmt: skip
+    study = problem.study(solver="random", seed=1)
+    study.run(rollouts=30, executor="serial", progress=False)
+    with study.view() as view, page_of(browser, view) as page:
+        page.click("#vtb-view-pareto")
+        assert set(page.evaluate("vtb.front")) == {trial.number for trial in study.pareto()}
+        end = page.evaluate("vtb.front[0]")
+        page.mouse.move(*place_of(page, "pareto", end))
+        drawn(page, f"document.body.dataset.pointed === '{end}'")
+        page.click("#vtb-view-parallel")
+        picture = screenshot(page, clip={"x": 20, "y": 130, "width": 460, "height": 250})
+        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

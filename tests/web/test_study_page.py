@@ -1,0 +1,234 @@
+"""The page of a study: what its server tells, and what it does."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection
+
+from tests.folders import open_folder, that_cannot_be_written
+from tests.optimization.studies import pendulum_problem
+from tests.web.studies import ANGLE, HORIZON, RATE, cart_pole_problem, run_elsewhere
+from tests.web.test_server import PATIENCE, ask, base, cookie, page
+from vtbdrake.optimization import Choice, Parameter, Study, StudyError
+from vtbdrake.rollout import Quality
+from vtbdrake.web import StudyView, view_study
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("study") / "cart.db"
+    with cart_pole_problem().study(path, solver="sobol", seed=2) as study:
+        study.run(rollouts=16, executor="serial", progress=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def opened(finished: Path) -> Iterator[StudyView]:
+    with view_study(finished) as view:
+        yield view
+
+
+class Reader:
+    """The page's end of the socket: it keeps the trials as the page does."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket, self.number = socket, 0
+        self.hello: dict[str, Any] = {}
+        self.status: dict[str, Any] = {}
+        self.trials: list[tuple[Any, ...]] = []
+
+    def read(self) -> dict[str, Any]:
+        message: dict[str, Any] = json.loads(self.socket.recv(PATIENCE))
+        if message["type"] == "trials":
+            rows = zip(*message["points"], *message["values"], message["kinds"], strict=True)
+            self.trials[message["first"] :] = rows
+        elif message["type"] in ("hello", "status"):
+            setattr(self, message["type"], message)
+        return message
+
+    def until(self, state: str, trials: int) -> Reader:
+        while self.status.get("state") != state or len(self.trials) < trials:
+            self.read()
+        return self
+
+    def ask(self, command: str, **fields: Any) -> Any:
+        self.number += 1
+        self.socket.send(json.dumps({"id": self.number, "do": command, **fields}))
+        while (answer := self.read()).get("id") != self.number:
+            pass
+        if answer["error"]:
+            raise StudyError(answer["error"])
+        return answer["result"]
+
+
+def rows(study: Study) -> list[tuple[Any, ...]]:
+    return [(*trial.point, *trial.values, trial.kind) for trial in study.trials]
+
+
+def test_page_has_what_the_study_has(opened: StudyView, finished: Path) -> None:
+    status, text, _ = ask(base(opened), cookie(opened))
+    assert status == 200 and 'src="page/study.js"' in text
+    with page(opened) as socket, Study.open(finished) as study:
+        reader = Reader(socket).until("ended", 16)
+        assert reader.trials == rows(study)
+        assert {kind for *_, kind in reader.trials} == {"feasible", "broken"}
+        assert [p["address"] for p in reader.hello["parameters"]] == [ANGLE, RATE]
+        assert reader.hello["parameters"][0] == {
+            "address": ANGLE, "unit": "rad", "lower": 0.5, "upper": 3.0, "log": False, "integer": False
+        }  # fmt: skip
+        assert reader.hello["simulates"] and not reader.hello["changes"] and "study continue" in reader.hello["command"]
+        status = {key: reader.status[key] for key in ("rollouts", "budget", "reason", "solver", "failures", "ends")}
+        assert status == {
+            "rollouts": 16, "budget": 16, "reason": "solver", "solver": "sobol", "failures": [], "ends": {"horizon": 16}
+        }  # fmt: skip
+
+
+def test_shown_and_tried_points_are_those_of_the_problem(opened: StudyView) -> None:
+    problem = cart_pole_problem()
+    with page(opened) as socket:
+        reader = Reader(socket).until("ended", 16)
+        for number in (0, 5):
+            shown = reader.ask("show", role="pointed", trial=number)
+            rollout = problem.rollout(reader.trials[number][:2])
+            assert (shown["t_star"], shown["duration"], shown["message"]) == (rollout.t_star, HORIZON, "")
+        reader.ask("time", time=0.5)
+        reader.ask("hide", role="pointed")
+        tried = reader.ask("try", point=[2.0, 1.0])
+        rollout = problem.rollout([2.0, 1.0])
+        assert (tried["values"], tried["violations"]) == ([rollout.value], list(rollout.measures))
+        assert tried["kind"] == ("feasible" if rollout.measures[0] <= 0.0 else "broken")
+        for point, message in (([9.0, 0.0], "lies outside its range"), ([1.0], "shorter"), (["x", 0.0], "a number")):
+            with pytest.raises(StudyError, match=message):
+                reader.ask("try", point=point)
+        for fields, message in (
+            ({"trial": 99}, "no trial 99"),
+            ({"point": [1.0, 0.0], "condition": 1}, "no condition"),
+        ):
+            with pytest.raises(StudyError, match=message):
+                reader.ask("show", role="pointed", **fields)
+
+
+def test_model_is_near_the_quality_between_the_trials(tmp_path: Path) -> None:
+    problem = cart_pole_problem(constraints=[])
+    with problem.study(tmp_path / "a.db", solver="sobol") as study:
+        study.run(rollouts=64, executor="serial", progress=False)
+    with view_study(tmp_path / "a.db") as view, page(view) as socket:
+        grid = Reader(socket).until("ended", 64).ask("model", x=ANGLE, y=RATE, quality=0, trial=0)
+    columns, lines = range(2, 24, 7), range(2, 24, 7)
+    true = np.array([[problem.rollout([grid["x"][i], grid["y"][j]]).value for i in columns] for j in lines])
+    mean = np.array(grid["mean"])[np.ix_(lines, columns)]
+    assert np.abs(mean - true).max() < 0.25 * np.ptp(true)
+    assert (grid["trials"], len(grid["x"]), len(grid["mean"])) == (64, 24, 24)
+
+
+def test_options_and_several_qualities_and_failures_reach_the_page(tmp_path: Path) -> None:
+    def late(theta: float) -> float:
+        return abs(theta) if theta > -0.5 else math.nan
+
+    parameters = [Parameter("sim.sys.Pendulum.theta.position", -1.5, 1.5), Choice("scenario.stiffness", [0.0, 2.0])]
+    angle = parameters[0].address
+    qualities = [Quality(late, angle, reading="end"), Quality(abs, angle, minimize=True)]
+    study = pendulum_problem(parameters=parameters, quality=qualities).study(solver="random")
+    study.run(rollouts=20, executor="serial", progress=False)
+    with study.view() as view, page(view) as socket:
+        reader = Reader(socket).until("ended", 20)
+        assert reader.hello["parameters"][1]["options"] == ["0.0", "2.0"] and reader.hello["command"] == ""
+        for trial, (theta, option, *values, kind) in zip(study.trials, reader.trials, strict=True):
+            assert trial.point == (theta, [0.0, 2.0][option])
+            assert values == [None if math.isnan(value) else value for value in trial.values] and kind == trial.kind
+        ((message, count, first),) = reader.status["failures"][:1]
+        failed = [k for k, trial in enumerate(study.trials) if trial.failed]
+        assert "late" in message and first == min(failed) and 0 < count <= len(failed) < 20
+        tried = reader.ask("try", point=[-1.4, 0])
+        assert tried["kind"] == "failed" and "late" in tried["message"]
+        reader.ask("add", point=[0.5, 1])
+        assert list(study.queue.values()) == [{angle: 0.5, "scenario.stiffness": 2.0}]
+
+
+def test_study_in_memory_is_watched_while_it_runs() -> None:
+    study = cart_pole_problem().study(solver="random")
+    with study.view() as view, page(view) as socket:
+        reader = Reader(socket).until("new", 0)
+        run = threading.Thread(target=study.run, kwargs={"rollouts": 30, "executor": "serial", "progress": False})
+        run.start()
+        reader.until("ended", 30)
+        run.join()
+        assert reader.trials == rows(study)
+
+
+@pytest.mark.slow
+def test_dead_runner_is_told_and_another_process_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    runner = run_elsewhere(path, rollouts=2000)
+    while not path.exists() or not path.with_name("a.db-lock").exists():
+        assert runner.poll() is None
+    with view_study(path) as view, page(view) as socket:
+        reader = Reader(socket).until("running", 20)
+        assert 0.0 < reader.status["left"] < 3600.0 and reader.status["budget"] == 2000
+        with pytest.raises(StudyError, match="is running"):
+            reader.ask("run")
+        runner.send_signal(signal.SIGKILL)
+        runner.wait()
+        done = len(reader.until("died", 20).trials)
+        reader.ask("run")
+        reader.until("running", done + 20)
+        with Study.open(path) as study:
+            study_rows = rows(study)[:done]
+        assert reader.trials[:done] == study_rows
+        assert view.runner is not None
+        view.runner.kill()
+        view.runner.wait()
+        reader.until("died", done + 20)
+
+
+def test_file_whose_modules_are_not_trusted_is_shown_without_rollouts(tmp_path: Path) -> None:
+    with cart_pole_problem(quality=Quality(lambda place: abs(place), "sim.sys.cart_pole.cart_slider.position")).study(
+        tmp_path / "a.db", solver="sobol"
+    ) as study:
+        study.run(rollouts=4, executor="serial", progress=False)
+    with view_study(tmp_path / "a.db") as view, page(view) as socket:
+        reader = Reader(socket).until("ended", 4)
+        assert "the function f is one of a script" in reader.hello["obstacle"] and not reader.hello["simulates"]
+        with pytest.raises(StudyError, match="points cannot be simulated here: the function f"):
+            reader.ask("try", point=[1.0, 0.0])
+        with pytest.raises(StudyError, match="only the program that began the study can resume it"):
+            reader.ask("run")
+
+
+def test_study_on_a_read_only_disk_is_shown_and_refuses_changes() -> None:
+    with open_folder() as folder:
+        path = folder / "a.db"
+        with cart_pole_problem().study(path, solver="sobol") as study:
+            study.run(rollouts=4, executor="serial", progress=False)
+        with that_cannot_be_written(folder), view_study(path) as view, page(view) as socket:
+            reader = Reader(socket).until("ended", 4)
+            with pytest.raises(StudyError, match="the permissions of the file and its folder"):
+                reader.ask("add", point=[1.0, 0.0])
+            assert reader.ask("try", point=[1.0, 0.0])["values"]
+
+
+def test_file_that_is_no_study_is_refused(tmp_path: Path, finished: Path) -> None:
+    text = tmp_path / "text.db"
+    text.write_text("no study " * 100)
+    other = tmp_path / "other.db"
+    other.write_bytes(finished.read_bytes())
+    with sqlite3.connect(other) as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    for path, message in (
+        (tmp_path / "missing.db", "there is no study file"),
+        (text, "cannot be read"),
+        (other, "is a study of version 99"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            view_study(path)

@@ -1,0 +1,221 @@
+"""What a page shows of a study: its trials as columns, and where it stands; read from its file as it changes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import islice
+from math import isfinite
+from typing import Any
+
+from vtbdrake.failures import one_line
+from vtbdrake.optimization import Choice, Study, StudyError, Trial
+from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.study_file import Mark, StudyFile
+from vtbdrake.rollout.task import FAILED
+
+_POLL = 0.1  # s
+_SIGN_OF_LIFE = 1.0  # s between two looks at whether a process runs the study
+_RATE_OVER = 60  # rollouts over which their rate is measured
+_FAILURES = 40  # different reasons that are listed
+_TEXT = 300  # letters of a reason
+_REVISIONS = 1000  # that are remembered, for pages that lag behind
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where a study stands.
+
+    Attributes:
+        state: ``new``, ``running``, ``ended`` or ``died``: its process has ended without a word.
+        reason: Why the last run ended.
+        message: Why the file cannot be read any more; empty while it can.
+        rollouts: Finished rollouts.
+        ends: Their number by the way in which they ended.
+        rate: Rollouts per second, at present.
+        failures: Reasons of failures: message, number, and the number of the first trial; the most frequent first.
+    """
+
+    state: str
+    reason: str
+    message: str
+    rollouts: int
+    ends: dict[str, int]
+    rate: float | None
+    failures: tuple[tuple[str, int, int | None], ...]
+
+
+class StudyFeed:
+    """Reads a study while another process, or this one, runs it.
+
+    Args:
+        file: The file of the study.
+
+    Attributes:
+        trials: The trials in the order in which they were recorded.
+        status: Where the study stands.
+        revision: Counts the changes.
+    """
+
+    def __init__(self, file: StudyFile) -> None:
+        self._file = file
+        study = Study(file)
+        self._parameters = study.parameters
+        self.trials: list[Trial] = []
+        self.revision = 0
+        self._trial_mark, self._outcome_mark = Mark(), Mark()
+        self._failure_of: dict[Point, str] = {}
+        self._first_trial: dict[str, int] = {}
+        self._failures: Counter[str] = Counter()
+        self._ends: Counter[str] = Counter()
+        self._finished: deque[datetime] = deque(maxlen=_RATE_OVER)
+        # Since each revision, so many trials have stayed as they were.
+        self._stayed: dict[int, int] = {}
+        self._oldest = 0  # revision; what was before it is forgotten
+        self._changed = threading.Condition()
+        self._closed = threading.Event()
+        self._version: tuple[int, int] | None = None
+        self._message = ""
+        self._read()
+        self.status = self._look()
+        self._thread = threading.Thread(target=self._watch, name="vtbdrake study feed", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the reading."""
+        self._closed.set()
+        self._thread.join()
+        with self._changed:
+            self._changed.notify_all()
+
+    def wait(self, revision: int, timeout: float) -> int:
+        """Return the present revision, as soon as it is another one than ``revision``, or after ``timeout`` seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed.is_set() or self.revision != revision, timeout)
+            return self.revision
+
+    def columns(self, first: int, revision: int) -> dict[str, Any]:
+        """Return the trials that a page of ``revision``, which has the first ones, does not have yet, as columns.
+
+        Attributes of the answer: ``first``, how many of the page's trials stay; ``points``, one list per parameter (of
+        a choice the number of the option); ``values``, one per quality, None where there is none; ``kinds``,
+        ``methods``, ``batches``, and by their places behind the first ones ``by_hand`` and ``reasons`` of failures.
+        """
+        with self._changed:
+            lost = revision < self._oldest
+            stay = 0 if lost else min([first, *(count for number, count in self._stayed.items() if number > revision)])
+            new = self.trials[stay:]
+            now = self.revision
+        return {"type": "trials", "first": stay, "revision": now, **self._as_columns(new)}
+
+    def _as_columns(self, trials: Sequence[Trial]) -> dict[str, Any]:
+        columns: list[list[Any]] = [[trial.parameters[p.address] for trial in trials] for p in self._parameters]
+        for k, parameter in enumerate(self._parameters):
+            if isinstance(parameter, Choice):
+                columns[k] = [parameter.options.index(parameter.as_value(value)) for value in columns[k]]
+        count = len(trials[0].values) if trials else 0
+        failures = {k: self._failure_of.get(t.point, "")[:_TEXT] for k, t in enumerate(trials) if t.kind == FAILED}
+        return {
+            "points": columns,
+            "values": [[_finite(trial.values[k]) for trial in trials] for k in range(count)],
+            "kinds": [trial.kind for trial in trials],
+            "methods": [trial.method for trial in trials],
+            "batches": [trial.batch for trial in trials],
+            "by_hand": [k for k, trial in enumerate(trials) if trial.origin == "user"],
+            "reasons": failures,
+        }
+
+    # -- in the thread of the feed
+
+    def _watch(self) -> None:
+        next_look = 0.0
+        while not self._closed.wait(_POLL):
+            changed = self._read_if_changed()
+            now = time.monotonic()
+            if not changed and now < next_look:
+                continue
+            next_look = now + _SIGN_OF_LIFE
+            status = self._look()
+            with self._changed:
+                if changed or status != self.status:
+                    self.status = status
+                    self.revision += 1
+                    self._changed.notify_all()
+
+    def _read_if_changed(self) -> bool:
+        try:
+            if self._file.version() == self._version:
+                return False
+            self._read()
+            self._message = ""
+        except StudyError as error:  # It may come back: a disk that was full, a folder that was away.
+            message = one_line(error)
+            changed, self._message = message != self._message, message
+            return changed
+        return True
+
+    def _read(self) -> None:
+        version = self._file.version()
+        earlier, outcomes, outcome_mark = self._file.outcomes_since(self._outcome_mark)
+        stay, trials, trial_mark = self._file.trials_since(self._trial_mark)
+        with self._changed:
+            if earlier == 0:
+                self._ends.clear()
+                self._failures.clear()
+                self._failure_of.clear()
+            for (point, _), outcome, finished in outcomes:
+                self._ends[outcome.end] += 1
+                self._finished.append(finished)
+                if outcome.failed:
+                    self._failures[outcome.message] += 1
+                    self._failure_of.setdefault(point, outcome.message)
+            if self.trials[stay:] != trials:
+                self._stayed[self.revision + 1] = stay + _equal(self.trials[stay:], trials)
+                if len(self._stayed) > _REVISIONS:
+                    self._oldest = next(iter(self._stayed))
+                    del self._stayed[self._oldest]
+            self.trials[stay:] = trials
+            self._first_trial = {m: k for m, k in self._first_trial.items() if k < stay}
+            for number, trial in enumerate(islice(self.trials, stay, None), stay):
+                if trial.kind == FAILED:
+                    self._first_trial.setdefault(self._failure_of.get(trial.point, ""), number)
+            self._trial_mark, self._outcome_mark, self._version = trial_mark, outcome_mark, version
+
+    def _look(self) -> Status:
+        try:
+            sessions, running = self._file.sessions(), self._file.is_running
+        except StudyError as error:
+            self._message, sessions, running = one_line(error), [], False
+        last = sessions[-1] if sessions else None
+        if running:
+            state = "running"
+        elif last is None:
+            state = "new"
+        else:
+            state = "died" if last["ended"] is None else "ended"
+        failures = [(m[:_TEXT], count, self._first_trial.get(m)) for m, count in self._failures.most_common(_FAILURES)]
+        reason = str(last["reason"] or "") if last is not None else ""
+        ends = dict(self._ends)
+        rate = self._rate() if running else None
+        return Status(state, reason, self._message, sum(ends.values()), ends, rate, tuple(failures))
+
+    def _rate(self) -> float | None:
+        if len(self._finished) < 2:
+            return None
+        since = (self._finished[-1] - self._finished[0]).total_seconds()
+        return (len(self._finished) - 1) / since if since > 0.0 else None
+
+
+def _equal(before: Sequence[Trial], after: Sequence[Trial]) -> int:
+    """Return how many trials at the beginning are equal."""
+    return next(
+        (k for k, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), min(len(before), len(after))
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None

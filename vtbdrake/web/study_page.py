@@ -1,0 +1,321 @@
+"""The page of a study: it is watched while it runs, its rollouts are seen, and points are tried."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vtbdrake.argument_checks import as_whole
+from vtbdrake.failures import one_line
+from vtbdrake.lazy import extra_module
+from vtbdrake.optimization import Choice, Problem, Study, StudyError
+from vtbdrake.optimization.identity import code_changes, describe
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.solvers import known_solvers
+from vtbdrake.optimization.statement import StatementError, restated
+from vtbdrake.optimization.study_file import StudyFile
+from vtbdrake.web.study_feed import StudyFeed
+from vtbdrake.web.study_model import Surrogate
+from vtbdrake.web.study_scene import StudyScene
+from vtbdrake.web.study_worker import PointError, PointRollout, PointSimulator
+
+if TYPE_CHECKING:
+    from starlette.websockets import WebSocket
+
+_PERIOD = 0.1  # s between two messages to a page
+_PATIENCE = 1.0  # s, for a change
+
+
+class StudyView:
+    """A study with its page, while it runs here, in another process, or not at all.
+
+    Attributes:
+        url: Address of the page, with its token.
+        study: The study; what the page does, it does, too.
+        simulator: Simulates its points, beside the study; None if the problem is not known here.
+        obstacle: Why the problem is not known here.
+    """
+
+    def __init__(
+        self, file: StudyFile, *, problem: Problem | None, trusted: Sequence[str], port: int, hosts: Collection[str]
+    ) -> None:
+        from vtbdrake.web.host import Host
+
+        self.study = Study(file)
+        self.trusted = tuple(trusted)
+        self.obstacle = ""
+        # Whether others can state the problem again, from the file alone.
+        self.restatable = False
+        self.problem = self._stated(problem)
+        self.simulator: PointSimulator | None = None
+        self.surrogate = Surrogate(self.study)
+        self.feed = StudyFeed(file)
+        self.scene = StudyScene()
+        self._host = None
+        try:
+            if self.problem is not None:
+                self.simulator = PointSimulator(self.problem)
+            self._host = Host(self.scene.meshcat_url, script="study.js", serve=self._serve_page, port=port, hosts=hosts)
+        except BaseException:
+            self.close()
+            raise
+        self.url = self._host.url
+
+    def __repr__(self) -> str:
+        return f"<StudyView of {self.study.path or 'a study in memory'} at {self.url}>"
+
+    def __enter__(self) -> StudyView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the page; the study goes on."""
+        if self._host is not None:
+            self._host.close()
+        self.feed.close()
+        self.surrogate.close()
+        if self.simulator is not None:
+            self.simulator.close()
+        self.scene.close()
+
+    def _stated(self, problem: Problem | None) -> Problem | None:
+        try:
+            again = restated(self.study.record, trusted=self.trusted) if self.study.path is not None else None
+            self.restatable = again is not None
+        except StatementError as error:
+            again, self.obstacle = None, one_line(error)
+        if problem is not None:
+            self.obstacle = ""
+        return problem or again
+
+    @property
+    def code_changes(self) -> list[str]:
+        """Return how the code of the problem has changed since the file was written, each as a phrase."""
+        if self.problem is None:
+            return []
+        return code_changes(self.study.record["problem"], describe(self.problem))
+
+    @property
+    def resume_command(self) -> list[str]:
+        """Return the command that resumes the study in a process of its own; empty if only its program can do so."""
+        if not self.restatable:
+            return []
+        trust = [word for module in self.trusted for word in ("--trust", module)]
+        return [sys.executable, "-m", "vtbdrake", "study", "continue", str(self.study.path), *trust]
+
+    def resume(self) -> None:
+        """Resume the study in a process of its own, which goes on when the page ends.
+
+        Raises:
+            StudyError: The study is running, or only its program can resume it.
+        """
+        if not self.resume_command:
+            raise StudyError(f"only the program that began the study can resume it: {self.obstacle}")
+        if self.feed.status.state == "running":
+            raise StudyError("the study is running")
+        # Its output would go to a page that may be gone.
+        quiet: dict[str, Any] = {name: subprocess.DEVNULL for name in ("stdin", "stdout", "stderr")}
+        subprocess.Popen(self.resume_command, start_new_session=True, **quiet)
+
+    async def _serve_page(self, browser: WebSocket) -> None:
+        await _StudyPage(self, browser).serve()
+
+
+class _StudyPage:
+    """The connection to one page."""
+
+    def __init__(self, view: StudyView, browser: WebSocket) -> None:
+        self._view, self._study, self._browser = view, view.study, browser
+        self._revision, self._count = -1, 0
+        self._commands: dict[str, Callable[..., Any]] = {
+            "show": self._show,
+            "hide": lambda role: view.scene.show(str(role), None),
+            "time": lambda time: view.scene.set_time(float(time)),
+            "model": self._model,
+            "try": self._try,
+            "add": lambda point: self._study.add(self._point(point)),
+            "run": view.resume,
+        }
+
+    async def serve(self) -> None:
+        """Answer commands, and send what is new."""
+        from starlette.concurrency import run_in_threadpool
+
+        from vtbdrake.web.host import answer_commands, first_of, send
+
+        await send(self._browser, await run_in_threadpool(self._hello))
+
+        async def tell() -> None:
+            while True:
+                for message in await run_in_threadpool(self._news):
+                    await send(self._browser, message)
+                await asyncio.sleep(_PERIOD)
+
+        async def carry_out(message: Mapping[str, Any]) -> Any:
+            name = message.get("do")
+            if name not in self._commands:
+                raise ValueError(f"there is no command {name!r}; there are: {', '.join(self._commands)}")
+            fields = {key: value for key, value in message.items() if key not in ("id", "do")}
+            return await run_in_threadpool(self._commands[name], **fields)
+
+        await first_of(tell(), answer_commands(self._browser, carry_out))
+
+    def _hello(self) -> dict[str, Any]:
+        view, record = self._view, self._study.record
+        described = record["problem"]
+        return {
+            "type": "hello",
+            "name": "study" if self._study.path is None else self._study.path.name,
+            "path": "" if self._study.path is None else str(self._study.path),
+            "parameters": [
+                _described(parameter, unit)
+                for parameter, unit in zip(self._study.parameters, self._study.units, strict=True)
+            ],
+            "qualities": [
+                {"name": name, "minimize": direction == "minimize"}
+                for name, direction in zip(self._study.names, self._study.directions, strict=True)
+            ],
+            "constraints": [constraint["name"] for constraint in described["constraints"]],
+            "conditions": described["conditions"],
+            "horizon": described["horizon"],
+            "solvers": list(known_solvers()),
+            "simulates": view.simulator is not None,
+            "obstacle": view.obstacle,
+            "changes": view.code_changes,
+            "command": shlex.join(view.resume_command),
+        }
+
+    def _news(self) -> list[dict[str, Any]]:
+        """Return the messages about what has changed, when something has."""
+        revision = self._view.feed.wait(self._revision, _PATIENCE)
+        if revision == self._revision:
+            return []
+        trials = self._view.feed.columns(self._count, self._revision)
+        self._revision, self._count = trials["revision"], trials["first"] + len(trials["kinds"])
+        return [trials, self._status()]
+
+    def _status(self) -> dict[str, Any]:
+        record = self._study.record
+        status = self._view.feed.status
+        budget = record.get("budget")
+        left = None
+        if budget is not None and status.rate:
+            left = max(0.0, budget - status.rollouts) / status.rate
+        queue = [self._as_numbers(tuple(point.values())) for point in self._study.queue.values()]
+        return {
+            "type": "status",
+            **asdict(status),
+            "budget": budget,
+            "left": left,
+            "solver": record["solver"],
+            "queue": queue,
+        }
+
+    # -- commands
+
+    def _show(self, *, role: str, trial: int | None = None, point: Any = None, condition: int = 0) -> dict[str, Any]:
+        """Show the rollout of a trial, or of a point, in a role."""
+        simulator = self._simulator()
+        place = self._trial(trial).point if trial is not None else simulator.problem.point(self._point(point))
+        rollout = simulator.rollout(place, condition=as_whole("the number of a condition", condition))
+        return self._shown(str(role), rollout)
+
+    def _shown(self, role: str, rollout: PointRollout) -> dict[str, Any]:
+        try:
+            self._view.scene.show(role, rollout)
+            message = ""
+        except PointError as error:
+            message = one_line(error)
+        result = rollout.result
+        return {
+            "duration": float(result.times[-1]) if len(result.times) else 0.0,
+            "t_star": None if np.isnan(result.t_star) else result.t_star,
+            "end": result.end,
+            "message": result.message or message,
+        }
+
+    def _try(self, *, point: Any, condition: int = 0) -> dict[str, Any]:
+        simulator = self._simulator()
+        place = simulator.problem.point(self._point(point))
+        tried = simulator.attempt(place)
+        shown = self._shown("tried", simulator.rollout(place, condition=condition))
+        evaluation = tried.evaluation
+        return {
+            **shown,
+            "point": self._as_numbers(place),
+            "values": [None if np.isnan(value) else value for value in evaluation.values],
+            "violations": [None if np.isnan(value) else value for value in evaluation.violations],
+            "kind": "failed" if evaluation.failed else "feasible" if evaluation.feasible else "broken",
+            "message": "; ".join(tried.messages) or shown["message"],
+        }
+
+    def _model(self, *, x: str, y: str, quality: int, trial: int) -> dict[str, Any]:
+        trials = list(self._view.feed.trials)
+        grid = self._view.surrogate.grid(trials, str(x), str(y), quality=int(quality), at=self._trial(trial))
+        return {**grid, "trials": len(trials)}
+
+    def _simulator(self) -> PointSimulator:
+        if self._view.simulator is None:
+            raise StudyError(f"points cannot be simulated here: {self._view.obstacle}")
+        return self._view.simulator
+
+    def _trial(self, number: int) -> Any:
+        trials = self._view.feed.trials
+        if not 0 <= as_whole("the number of a trial", number) < len(trials):
+            raise StudyError(f"the study has {len(trials)} trials, counted from 0, and no trial {number}")
+        return trials[number]
+
+    def _point(self, point: Any) -> list[Any]:
+        """Return a point of a page, which has the numbers of options instead of options."""
+        pairs = zip(self._study.parameters, point, strict=True)
+        return [p.options[int(value)] if isinstance(p, Choice) else value for p, value in pairs]
+
+    def _as_numbers(self, point: Sequence[Any]) -> list[float]:
+        pairs = zip(self._study.parameters, point, strict=True)
+        return [p.options.index(p.as_value(v)) if isinstance(p, Choice) else v for p, v in pairs]
+
+
+def _described(parameter: Dimension, unit: str) -> dict[str, Any]:
+    if isinstance(parameter, Choice):
+        return {"address": parameter.address, "unit": unit, "options": [str(option) for option in parameter.options]}
+    names = ("address", "lower", "upper", "log", "integer")
+    return {"unit": unit, **{name: getattr(parameter, name) for name in names}}
+
+
+def view_study(
+    source: StudyFile | str | os.PathLike[str],
+    *,
+    problem: Problem | None = None,
+    trusted: Sequence[str] = (),
+    port: int = 0,
+    hosts: Collection[str] = (),
+) -> StudyView:
+    """Open the page of a study, which may run here, in another process, or not at all.
+
+    Args:
+        source: The file of the study, or its path.
+        problem: Its problem, if it is known here; else it is stated again from the file.
+        trusted: Modules, or packages of them, that may be imported because the file names them, which runs their code.
+        port: The port of the page on the loopback interface; 0 for any that is free.
+        hosts: Host names (with port) under which proxies offer the page.
+
+    Raises:
+        StudyError: There is no such file, it is no study, damaged, or of another version.
+        PortError: The port is taken.
+        ModuleNotFoundError: The extra ``web`` is not installed.
+    """
+    for name in ("msgpack", "starlette", "uvicorn", "websockets"):
+        extra_module(name, purpose="the page of a study", extra="web")
+    file = source if isinstance(source, StudyFile) else StudyFile(Path(source))
+    return StudyView(file, problem=problem, trusted=trusted, port=port, hosts=hosts)

@@ -1,0 +1,161 @@
+"""Rollouts of a study side by side, at one time: the best as it is, others as ghosts."""
+
+from __future__ import annotations
+
+import gc
+import queue
+import threading
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.rollout.testbeds import Testbeds
+from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.visualization.drawing import Drawing, Parts
+from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.web.study_worker import PointError, PointRollout
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+    from pydrake.systems.framework import Context
+
+_Result = TypeVar("_Result")
+
+# Role -> tint, and the opacity of a ghost. The best has its own colours.
+TINTS = {"best": None, "pointed": "#e69f00", "tried": "#009e73"}
+_GHOST = 0.55
+
+
+@dataclass
+class _Actor:
+    """A rollout, and how it is drawn."""
+
+    rollout: PointRollout
+    testbed: VirtualTestbed
+    context: Context
+    drawing: Drawing
+
+    def pose(self, time: float) -> None:
+        times, states = self.rollout.result.times, self.rollout.result.record["plant.state"]
+        plant = self.testbed.plant
+        assert plant is not None
+        # Between the samples on a line; before and after them as at the ends.
+        after = int(np.clip(np.searchsorted(times, time), 0, len(times) - 1))
+        before = max(after - 1, 0)
+        step = times[after] - times[before]
+        share = float(np.clip((time - times[before]) / step, 0.0, 1.0)) if step > 0.0 else 1.0
+        state = (1.0 - share) * states[before] + share * states[after]
+        plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(self.context), state)
+        self.drawing.pose(self.context)
+
+
+class StudyScene:
+    """A Meshcat with the rollouts that are shown, in a thread of its own.
+
+    Attributes:
+        meshcat_url: Its address; it has no protection of its own.
+    """
+
+    def __init__(self) -> None:
+        self.meshcat_url = ""
+        self._commands: queue.SimpleQueue[tuple[Callable[[], object], Future[object]] | None] = queue.SimpleQueue()
+        ready: Future[None] = Future()
+        self._thread = threading.Thread(target=self._run, args=(ready,), name="vtbdrake scene", daemon=True)
+        self._thread.start()
+        ready.result()
+
+    def close(self) -> None:
+        """End the scene and its Meshcat."""
+        self._commands.put(None)
+        self._thread.join()
+
+    def show(self, role: str, rollout: PointRollout | None) -> None:
+        """Show a rollout in a role, a key of `TINTS`; None removes what is there.
+
+        Raises:
+            PointError: The rollout has no motion that could be drawn.
+        """
+        self._do(lambda: self._show(role, rollout))
+
+    def set_time(self, time: float) -> None:
+        """Show all rollouts at a time in seconds since their begin."""
+        self._do(lambda: self._set_time(time))
+
+    def _do(self, action: Callable[[], _Result]) -> _Result:
+        future: Future[object] = Future()
+        self._commands.put((action, future))
+        while True:
+            with suppress(TimeoutError):
+                return future.result(0.5)  # type: ignore[return-value]
+            if not self._thread.is_alive():
+                raise PointError("the page has ended")
+
+    # -- in the thread of the scene
+
+    def _run(self, ready: Future[None]) -> None:
+        self._meshcat: Meshcat = make_meshcat()
+        self.meshcat_url = self._meshcat.web_url()
+        self._testbeds, self._time = Testbeds(), 0.0
+        self._actors: dict[str, _Actor] = {}
+        self._scenery: tuple[Hashable, Drawing] | None = None
+        ready.set_result(None)
+        while (command := self._commands.get()) is not None:
+            action, future = command
+            try:
+                future.set_result(action())
+            except FAILURES as error:
+                future.set_exception(error if isinstance(error, PointError) else PointError(one_line(error)))
+        for name in ("_actors", "_scenery", "_testbeds", "_meshcat"):
+            del self.__dict__[name]
+        gc.collect()  # Meshcat ends in the thread that made it.
+
+    def _show(self, role: str, rollout: PointRollout | None) -> None:
+        actor = self._actors.pop(role, None)
+        if rollout is None:
+            if actor is not None:
+                actor.drawing.delete()
+            return
+        if len(rollout.result.times) == 0 or "plant.state" not in rollout.result.record:
+            if actor is not None:
+                actor.drawing.delete()
+            raise PointError(rollout.result.message or "there is nothing to draw: the testbed has no MultibodyPlant")
+        if actor is None or actor.rollout.scenario != rollout.scenario:
+            actor = self._make(role, rollout)
+        actor.rollout = rollout
+        actor.pose(self._time)
+        self._actors[role] = actor
+
+    def _make(self, role: str, rollout: PointRollout) -> _Actor:
+        testbed = self._testbed(rollout.scenario)
+        context = testbed.default_context()
+        ghost = role != "best"
+        drawing = Drawing(
+            self._meshcat,
+            testbed,
+            context,
+            f"study/{role}",
+            tint=TINTS[role],
+            opacity=_GHOST if ghost else 1.0,
+            parts=Parts.MOVING,
+        )
+        actor = _Actor(rollout, testbed, context, drawing)
+        if self._scenery is None:
+            actor.pose(0.0)
+            drawing.fit_camera(context)
+        if self._scenery is None or not ghost:
+            self._scenery = (None, Drawing(self._meshcat, testbed, context, "study/scenery", parts=Parts.ANCHORED))
+        return actor
+
+    def _testbed(self, scenario: Scenario) -> VirtualTestbed:
+        return self._testbeds.get(scenario)
+
+    def _set_time(self, time: float) -> None:
+        self._time = min(max(time, 0.0), inf)
+        for actor in self._actors.values():
+            actor.pose(self._time)

@@ -1,0 +1,170 @@
+"""The warm worker of a study's page: rollouts of points that are pointed at or tried, not behind the study's own."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.lru import LruDict
+from vtbdrake.optimization import Problem
+from vtbdrake.optimization.evaluator import Evaluator
+from vtbdrake.optimization.problem import recording_motion
+from vtbdrake.optimization.records import RolloutKey
+from vtbdrake.optimization.solvers.solver import Evaluation, Point
+from vtbdrake.rollout import RolloutResult, RolloutTask
+from vtbdrake.rollout.worker_processes import ProcessExecutor
+from vtbdrake.testbed import Scenario
+
+_Kind = TypeVar("_Kind")
+
+# Rollouts that are kept: some tens of megabytes.
+_KEPT = 200
+
+
+class PointError(ValueError):
+    """A point cannot be simulated here."""
+
+
+@dataclass(frozen=True)
+class PointRollout:
+    """A rollout of a point under one condition, with the states of its plant.
+
+    Attributes:
+        point, condition: The point and the number of the condition.
+        scenario: The scenario, with the fields that the point sets.
+        result: The rollout; ``record`` has ``plant.state``, if the testbed has a plant.
+    """
+
+    point: Point
+    condition: int
+    scenario: Scenario
+    result: RolloutResult
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A point that was tried: its value under all conditions, as in the study.
+
+    Attributes:
+        evaluation: As a study has it, but with values in the user's terms: a cost as a cost.
+        messages: Why rollouts have failed.
+    """
+
+    evaluation: Evaluation
+    messages: tuple[str, ...]
+
+
+class PointSimulator:
+    """Simulates points of a problem in a process of its own, which keeps its testbed.
+
+    Args:
+        problem: The problem.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        task = replace(problem.task, catch=True)
+        self._task: RolloutTask = recording_motion(task, problem.testbed) if problem.testbed.plant is not None else task
+        self._executor = ProcessExecutor(1)
+        self._executor.start_workers(1)
+        self._rollouts: LruDict[RolloutKey, PointRollout] = LruDict(_KEPT)
+        self._jobs: deque[tuple[Callable[[], object], Future[object]]] = deque()
+        self._pointed: tuple[Callable[[], object], Future[object]] | None = None
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="vtbdrake points", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the worker."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._executor.close()
+
+    def rollout(self, point: Point, *, condition: int) -> PointRollout:
+        """Return the rollout of a point under a condition, computed if it is not kept.
+
+        Raises:
+            PointError: The pointer has moved on, so that another point is simulated instead; or there is no such
+                condition, or the worker is lost.
+        """
+        with self._changed:
+            if (rollout := self._rollouts.use((point, condition))) is not None:
+                return rollout
+        future: Future[object] = Future()
+        with self._changed:
+            if self._pointed is not None:
+                self._pointed[1].cancel()
+            self._pointed = (lambda: self._simulate(point, condition), future)
+            self._changed.notify_all()
+        return self._result(future, PointRollout)
+
+    def attempt(self, point: Point) -> Tried:
+        """Evaluate a point under all conditions.
+
+        Raises:
+            PointError: The worker is lost.
+        """
+        future: Future[object] = Future()
+        with self._changed:
+            self._jobs.append((lambda: self._evaluate(point), future))
+            self._changed.notify_all()
+        return self._result(future, Tried)
+
+    @staticmethod
+    def _result(future: Future[object], kind: type[_Kind]) -> _Kind:
+        try:
+            result = future.result()
+        except CancelledError:
+            raise PointError("another point is simulated instead") from None
+        assert isinstance(result, kind)
+        return result
+
+    # -- in the thread of the worker
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._jobs or self._pointed)
+                if self._closed:
+                    for _, future in (*self._jobs, *([self._pointed] if self._pointed else [])):
+                        future.cancel()
+                    return
+                if self._jobs:
+                    action, future = self._jobs.popleft()
+                else:
+                    assert self._pointed is not None
+                    (action, future), self._pointed = self._pointed, None
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(action())
+            except FAILURES as error:
+                future.set_exception(PointError(one_line(error)))
+
+    def _simulate(self, point: Point, condition: int) -> PointRollout:
+        values = self.problem.values(point, condition=condition)
+        ((_, result),) = self._executor.run(self._task, [values])
+        scenario = self.problem.placed(self._task, values)[0].scenario
+        rollout = PointRollout(point, condition, scenario, result)
+        with self._changed:
+            self._rollouts.add((point, condition), rollout)
+        return rollout
+
+    def _evaluate(self, point: Point) -> Tried:
+        results: dict[RolloutKey, RolloutResult] = {}
+        for condition in range(len(self.problem.conditions)):
+            with self._changed:
+                rollout = self._rollouts.use((point, condition))
+            results[point, condition] = (rollout or self._simulate(point, condition)).result
+        evaluator = Evaluator(self.problem, results, lambda _: None)
+        evaluation = evaluator.evaluation(point)
+        messages = tuple(dict.fromkeys(result.message for result in results.values() if result.failed))
+        return Tried(replace(evaluation, values=evaluator.in_user_terms(evaluation)), messages)
