@@ -73,8 +73,8 @@ class Host:
         self.port = int(self._socket.getsockname()[1])
         app = Starlette(
             routes=[
-                WebSocketRoute("/session", self._serve_socket),
-                WebSocketRoute("/", self._relay_meshcat),
+                WebSocketRoute("/session", _until_closed(self._serve_socket)),
+                WebSocketRoute("/", _until_closed(self._relay_meshcat)),
                 *routes,
                 Mount("/page", StaticFiles(directory=_PAGE)),
                 Route("/", self._index),
@@ -160,6 +160,16 @@ async def first_of(*tasks: Coroutine[Any, Any, None]) -> None:
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
+
+
+def _until_closed(serve: Callable[[WebSocket], Awaitable[None]]) -> Callable[[WebSocket], Awaitable[None]]:
+    """Return a handler that also ends in silence when the server ends while its browser is connected."""
+
+    async def serve_until_closed(browser: WebSocket) -> None:
+        with suppress(asyncio.CancelledError):
+            await serve(browser)
+
+    return serve_until_closed
 
 
 def _listen(port: int) -> socket.socket:

@@ -59,6 +59,7 @@ class StudyFeed:
         trials: The trials in the order in which they were recorded.
         status: Where the study stands.
         revision: Counts the changes.
+        meta: The description of the study, see `StudyFile.meta`.
     """
 
     def __init__(self, file: StudyFile) -> None:
@@ -67,6 +68,7 @@ class StudyFeed:
         self._parameters = study.parameters
         self.trials: list[Trial] = []
         self.revision = 0
+        self.meta = file.meta
         self._trial_mark, self._outcome_mark = Mark(), Mark()
         self._failure_of: dict[Point, str] = {}
         self._first_trial: dict[str, int] = {}
@@ -159,7 +161,7 @@ class StudyFeed:
         return True
 
     def _read(self) -> None:
-        version = self._file.version()
+        version, self.meta = self._file.version(), self._file.meta
         earlier, outcomes, outcome_mark = self._file.outcomes_since(self._outcome_mark)
         stay, trials, trial_mark = self._file.trials_since(self._trial_mark)
         with self._changed:

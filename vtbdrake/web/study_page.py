@@ -43,6 +43,7 @@ class StudyView:
         study: The study; what the page does, it does, too.
         simulator: Simulates its points, beside the study; None if the problem is not known here.
         obstacle: Why the problem is not known here.
+        runner: The process in which `resume` has resumed the study.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class StudyView:
         self.study = Study(file)
         self.trusted = tuple(trusted)
         self.obstacle = ""
+        self.runner: subprocess.Popen[bytes] | None = None
         # Whether others can state the problem again, from the file alone.
         self.restatable = False
         self.problem = self._stated(problem)
@@ -126,7 +128,7 @@ class StudyView:
             raise StudyError("the study is running")
         # Its output would go to a page that may be gone.
         quiet: dict[str, Any] = {name: subprocess.DEVNULL for name in ("stdin", "stdout", "stderr")}
-        subprocess.Popen(self.resume_command, start_new_session=True, **quiet)
+        self.runner = subprocess.Popen(self.resume_command, start_new_session=True, **quiet)
 
     async def _serve_page(self, browser: WebSocket) -> None:
         await _StudyPage(self, browser).serve()
@@ -206,9 +208,8 @@ class _StudyPage:
         return [trials, self._status()]
 
     def _status(self) -> dict[str, Any]:
-        record = self._study.record
-        status = self._view.feed.status
-        budget = record.get("budget")
+        meta, status = self._view.feed.meta, self._view.feed.status
+        budget = meta.get("budget")
         left = None
         if budget is not None and status.rate:
             left = max(0.0, budget - status.rollouts) / status.rate
@@ -218,7 +219,7 @@ class _StudyPage:
             **asdict(status),
             "budget": budget,
             "left": left,
-            "solver": record["solver"],
+            "solver": meta["solver"],
             "queue": queue,
         }
 

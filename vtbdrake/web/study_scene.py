@@ -5,18 +5,18 @@ from __future__ import annotations
 import gc
 import queue
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
-from math import inf
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.rollout.testbeds import Testbeds
-from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.camera import fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
 from vtbdrake.web.study_worker import PointError, PointRollout
@@ -28,8 +28,10 @@ if TYPE_CHECKING:
 _Result = TypeVar("_Result")
 
 # Role -> tint, and the opacity of a ghost. The best has its own colours.
-TINTS = {"best": None, "pointed": "#e69f00", "tried": "#009e73"}
+TINTS = {"best": None, "pointed": "#cc3399", "tried": "#009e73"}
 _GHOST = 0.55
+# Instants of a rollout to which the camera is fitted.
+_INSTANTS = 20
 
 
 @dataclass
@@ -103,7 +105,7 @@ class StudyScene:
         self.meshcat_url = self._meshcat.web_url()
         self._testbeds, self._time = Testbeds(), 0.0
         self._actors: dict[str, _Actor] = {}
-        self._scenery: tuple[Hashable, Drawing] | None = None
+        self._scenery: Drawing | None = None
         ready.set_result(None)
         while (command := self._commands.get()) is not None:
             action, future = command
@@ -132,7 +134,7 @@ class StudyScene:
         self._actors[role] = actor
 
     def _make(self, role: str, rollout: PointRollout) -> _Actor:
-        testbed = self._testbed(rollout.scenario)
+        testbed = self._testbeds.get(rollout.scenario)
         context = testbed.default_context()
         ghost = role != "best"
         drawing = Drawing(
@@ -146,16 +148,21 @@ class StudyScene:
         )
         actor = _Actor(rollout, testbed, context, drawing)
         if self._scenery is None:
-            actor.pose(0.0)
-            drawing.fit_camera(context)
+            self._fit_camera(actor)
         if self._scenery is None or not ghost:
-            self._scenery = (None, Drawing(self._meshcat, testbed, context, "study/scenery", parts=Parts.ANCHORED))
+            self._scenery = Drawing(self._meshcat, testbed, context, "study/scenery", parts=Parts.ANCHORED)
         return actor
 
-    def _testbed(self, scenario: Scenario) -> VirtualTestbed:
-        return self._testbeds.get(scenario)
+    def _fit_camera(self, actor: _Actor) -> None:
+        """Move the camera so that all that moves is in view, from begin to end."""
+        corners = []
+        for time in np.linspace(0.0, actor.rollout.result.times[-1], _INSTANTS):
+            actor.pose(time)
+            corners.append(actor.drawing.corners(actor.context))
+        camera = fitting_camera(np.hstack(corners))
+        self._meshcat.SetCameraPose(camera.position, camera.target)
 
     def _set_time(self, time: float) -> None:
-        self._time = min(max(time, 0.0), inf)
+        self._time = time
         for actor in self._actors.values():
             actor.pose(self._time)

@@ -175,7 +175,7 @@ export class Scatter extends Chart {
       point(pen, this.x(x[k]), this.y(this.#height(k)), size, kind[k], this.data.color(k), !!grid?.mean);
     }
     if (best >= 0) ring(pen, this.x(x[best]), this.y(this.#height(best)), 8, BEST);
-    if (this.data.pointed >= 0) ring(pen, this.x(x[this.data.pointed]), this.y(this.#height(this.data.pointed)), 7, "#e69f00");
+    if (this.data.pointed >= 0) ring(pen, this.x(x[this.data.pointed]), this.y(this.#height(this.data.pointed)), 7, "#cc3399");
     for (const { at, tint, shape } of marks) mark(pen, this.x(at[0]), this.y(at[1]), tint, shape);
     if (this.pressed && this.dragged && this.ondrag) this.#box(pen, ...this.pressed, ...this.dragged);
     pen.restore();
@@ -270,7 +270,7 @@ export class Parallel extends Chart {
     pen.globalAlpha = 1;
     pen.lineWidth = 2.5;
     if (best >= 0) this.#line(pen, columns, best, BEST);
-    if (pointed >= 0) this.#line(pen, columns, pointed, "#e69f00");
+    if (pointed >= 0) this.#line(pen, columns, pointed, "#cc3399");
     this.scales.forEach((scale, axis) => {
       const at = this.#x(axis);
       pen.fillStyle = SOFT;

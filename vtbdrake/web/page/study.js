@@ -49,6 +49,7 @@ class Page {
     this.time = 0;
     this.duration = 0;
     this.pointed = this.best = -1;
+    Object.assign(this, { front: [], bestLine: [] });
     this.connection = new Connection({
       hello: (message) => this.#hello(message),
       trials: (message) => this.#take(message),
@@ -142,7 +143,7 @@ class Page {
     this.playButton = element("button", { id: "vtb-play", title: "play or pause (space)", onclick: () => this.play(!this.playing) }, "play");
     this.slider = element("input", { id: "vtb-time", type: "range", min: 0, max: 1, step: "any", value: 0, title: "time of the rollouts", oninput: () => this.setTime(Number(this.slider.value)) });
     this.clock = element("output", { id: "vtb-clock" }, "0.00 s");
-    const legend = [["best", "#5d6870"], ["pointed", "#e69f00"], ["tried", "#009e73"]].map(([name, tint]) =>
+    const legend = [["best", "#5d6870"], ["pointed", "#cc3399"], ["tried", "#009e73"]].map(([name, tint]) =>
       element("span", { className: "vtb-key", id: `vtb-key-${name}`, hidden: true }, element("i", { style: `background:${tint}` }), name),
     );
     return element("footer", { id: "vtb-bar" }, this.playButton, this.clock, this.slider, ...legend, this.hello.conditions.length > 1 ? this.condition : "");
@@ -196,6 +197,7 @@ class Page {
     for (const [key, chart] of Object.entries(this.views)) chart.canvas.hidden = key !== name;
     for (const button of this.switch.children) button.classList.toggle("chosen", button.id === `vtb-view-${name}`);
     this.selectors.hidden = name === "pareto";
+    for (const part of [this.xAxis, this.yAxis, this.model.parentElement]) part.hidden = name !== "landscape";
     this.#draw();
   }
 
@@ -322,9 +324,9 @@ class Page {
 
   // -- charts
 
-  scale(k) {
-    const { address, unit, lower, upper, log, options } = this.parameters[k];
-    return new Scale({ label: unit && unit !== "1" ? `${address} [${unit}]` : address, lower, upper, log, options });
+  scale(k, name = this.parameters[k].address) {
+    const { unit, lower, upper, log, options } = this.parameters[k];
+    return new Scale({ label: unit && unit !== "1" ? `${name} [${unit}]` : name, lower, upper, log, options });
   }
 
   valueScale(quality, label) {
@@ -360,7 +362,7 @@ class Page {
     if (this.view === "landscape") this.#drawLandscape(quality, shade, common);
     if (this.view === "parallel") {
       const order = kind.map((_, k) => k).sort((a, b) => (shade(values[quality][a]) || 0) - (shade(values[quality][b]) || 0));
-      const scales = [...this.parameters.map((_, k) => this.scale(k)), ...this.qualities.map((_, q) => this.valueScale(q))];
+      const scales = [...this.parameters.map(({ address }, k) => this.scale(k, short(address))), ...this.qualities.map((_, q) => this.valueScale(q))];
       this.parallel.show({ ...common, columns: [...points, ...values], order }, scales);
     }
     if (this.view === "pareto") {
