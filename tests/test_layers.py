@@ -74,8 +74,8 @@ BELOW["__main__"] = {"cli"}
 TOP = {"visualization", "web", "testing", "cli"}
 
 # A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
-# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`, studies are shown
-# by `web`, and a testbed is shown by `web`, which lets `testing` save a course as a test, and compiled by `compiled`.
+# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`; a testbed is
+# compiled by `compiled`, and shown by `web`, as a study is; `web` lets `testing` save a course as a test.
 MAY_DELEGATE: dict[str, set[str]] = {
     "testbed": {"calibration", "compiled", "deployment", "visualization", "web"},
     "web": {"testing"},
