@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.stats
+from playwright.sync_api import Browser
 
+from tests.chromium import needs_chromium, screenshot
 from vtbdrake.calibration import Comparison, Tolerance, compare
 from vtbdrake.calibration.validation import Verdict, delay, sprague_geers, whiteness
 from vtbdrake.recording import Log, LogError, Series
@@ -96,14 +98,29 @@ def test_verdict_names_what_is_exceeded() -> None:
     assert str(late).startswith("run.csv: beyond tolerances\n")
 
 
-def test_page_holds_verdict_numbers_and_plot(tmp_path: Path) -> None:
+@needs_chromium
+def test_page_holds_verdict_numbers_and_plot(tmp_path: Path, browser: Browser) -> None:
+    recorded = Log("a<b.csv", of(np.stack([np.sin(TIMES), TIMES], axis=1)), {})
     result = compare(
-        Log("a<b.csv", of(np.sin(TIMES)), {}), of(np.sin(TIMES - 0.1)), tolerances={"q": Tolerance(rmse=1e-3)}
+        recorded,
+        of(np.stack([np.sin(TIMES - 0.1), TIMES], axis=1)),
+        tolerances={"q": Tolerance(rmse=1e-3)},
     )
     result.save_html(tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text()
-    assert "beyond tolerances (rmse 0.07" in page and "data:image/png;base64," in page and "a&lt;b.csv" in page
-    assert "a<b" not in page
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto((tmp_path / "page.html").as_uri())
+    assert page.locator("b").inner_text() == "a<b.csv: beyond tolerances"
+    head, *rows = [row.locator("th, td").all_inner_texts() for row in page.locator("tr").all()]
+    first, second = (dict(zip(head, row, strict=True)) for row in rows)
+    assert first["signal"] == "q[0]" and second["signal"] == "q[1]"
+    assert first["verdict"].startswith("beyond tolerances\nrmse 0.07") and second["verdict"] == "within tolerances"
+    assert float(first["late by (ms)"]) == pytest.approx(100.0, rel=0.01)
+    assert float(first["RMSE"]) == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1) and float(second["RMSE"]) == 0.0
+    width, right = page.locator("img").evaluate("e => [e.naturalWidth, e.getBoundingClientRect().right]")
+    assert width > 400 and right <= 1280
+    colours = screenshot(page).reshape(-1, 3)
+    assert (np.abs(colours - [255, 127, 14]).max(axis=1) < 10).sum() > 200  # the simulation, in tab:orange
+    page.close()
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from math import isnan
+from html import escape
 from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from vtbdrake.visualization.plots import Picture, finish, summary_html
+from vtbdrake.visualization.plots import Picture, finish, image_html
 
 if TYPE_CHECKING:
     from vtbdrake.calibration import Comparison
 
+# Title -> field of a `SignalComparison` and the factor to the unit of the title.
+_COLUMNS = {
+    "RMSE": ("rmse", 1.0),
+    "% of the range": ("normalized", 100.0),
+    "largest": ("largest", 1.0),
+    "at (s)": ("largest_at", 1.0),
+    "late by (ms)": ("delay", 1e3),
+    "magnitude": ("magnitude", 1.0),
+    "phase": ("phase", 1.0),
+    "coverage": ("coverage", 1.0),
+    "whiteness p": ("whiteness", 1.0),
+}
 _RECORDED, _SIMULATED = "0.2", "tab:orange"
 
 
@@ -40,15 +52,15 @@ def plot_comparison(comparison: Comparison) -> Figure:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """Return HTML with the verdict, the numbers and the plot."""
-    rows = {}
+    """Return HTML with the verdict, a table of the numbers and the plot."""
+    head = "".join(f"<th>{escape(title)}</th>" for title in ("signal", "verdict", *_COLUMNS, "samples"))
+    rows = []
     for name, result in comparison.signals.items():
-        reasons = f" ({'; '.join(result.beyond)})" if result.beyond else ""
-        coverage = "" if isnan(result.coverage) else f"coverage {result.coverage:.3g}, "
-        rows[name] = (
-            f"{result.verdict}{reasons}: rmse {result.rmse:.4g} ({100.0 * result.normalized:.3g} % of the range), "
-            f"largest {result.largest:.4g} at {result.largest_at:.4g} s, late by {1e3 * result.delay:.3g} ms, "
-            f"Sprague-Geers magnitude {result.magnitude:+.3f} and phase {result.phase:.3f}, {coverage}whiteness "
-            f"p = {result.whiteness:.2g}, {result.samples} samples"
-        )
-    return summary_html(f"{comparison.source}: {comparison.verdict}", rows, plot_comparison(comparison))
+        numbers = (f"{getattr(result, field) * factor:.4g}" for field, factor in _COLUMNS.values())
+        reasons = "".join(f"<br>{escape(reason)}" for reason in result.beyond)
+        cells = "".join(f"<td>{number}</td>" for number in (*numbers, result.samples))
+        rows.append(f"<tr><td>{escape(name)}</td><td>{result.verdict}{reasons}</td>{cells}</tr>")
+    return (
+        f"<div><b>{escape(f'{comparison.source}: {comparison.verdict}')}</b>"
+        f"<table><tr>{head}</tr>{''.join(rows)}</table>{image_html(plot_comparison(comparison))}</div>"
+    )

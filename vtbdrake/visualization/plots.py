@@ -46,12 +46,15 @@ class Picture(Figure):
 def summary_html(title: str, rows: Mapping[str, object], figure: Figure | None = None) -> str:
     """Return HTML for a notebook: a title, a table of names and values, and a figure beside it."""
     cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows.items())
-    image = ""
-    if figure is not None:
-        buffer = BytesIO()
-        figure.savefig(buffer, format="png", dpi=80)
-        image = f'<img src="data:image/png;base64,{b64encode(buffer.getvalue()).decode()}">'
+    image = "" if figure is None else image_html(figure)
     return f"<div><b>{escape(title)}</b><table>{cells}</table>{image}</div>"
+
+
+def image_html(figure: Figure) -> str:
+    """Return the HTML element of a figure, with its pixels."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=80)
+    return f'<img src="data:image/png;base64,{b64encode(buffer.getvalue()).decode()}">'
 
 
 def label(name: str, unit: str) -> str:
