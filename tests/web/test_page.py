@@ -15,7 +15,8 @@ from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
-GREEN, BLUE = np.array([0, 158, 115]), np.array([0, 114, 178])  # tints of the ghosts
+# Tints of the ghosts.
+GREEN, BLUE, YELLOW = np.array([0, 158, 115]), np.array([0, 114, 178]), np.array([230, 159, 0])
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 
@@ -150,6 +151,14 @@ def test_scrubbed_history_goes_back(page: Page, running: View) -> None:
     settle(page)
     steps = round(running.session.snapshot().time / running.session.config.step)
     assert angle(running.session) == angle_by_hand(steps)
+    before = picture(page)
+    running.session.write({ANGLE: 1.0})
+    running.session.advance(10)
+    drawn(page, f"vtb.differences.textContent.includes('{ANGLE}')")
+    assert page.inner_text("#vtb-differences").startswith("differs first from the other branch (orange):")
+    settle(page)
+    # Where the pole was, there is the ghost of the other branch.
+    assert share(picture(page), YELLOW) > share(before, YELLOW) + 0.002
 
 
 def test_camera_follows_a_body(page: Page) -> None:
@@ -173,7 +182,7 @@ def test_camera_follows_a_body(page: Page) -> None:
 
 def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:
     page.select_option("#vtb-sense-joint_position", "real")
-    drawn(page, "vtb.messages.textContent.includes('nothing feeds real.sense.joint_position')")
+    drawn(page, "vtb.switches.textContent.includes('nothing feeds real.sense.joint_position')")
     drawn(page, "document.querySelector('#vtb-sense-joint_position').value === 'sim'")
     second = browser.new_page()
     second.goto(running.url)

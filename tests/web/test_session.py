@@ -138,6 +138,26 @@ def test_going_back_and_on_is_another_branch(session: Session) -> None:
     assert frame(session, lambda shown: shown.time == (steps + 20) * STEP).history[1] <= (steps + 20) * STEP
 
 
+def test_other_branch_goes_on_with_its_own_changes() -> None:
+    with Session(CartPoleScenario(), values=START, config=SessionConfig(history_period=1e-6)) as session:
+        for k in range(20):
+            if k == 10:
+                session.write({MASS: 0.4})  # in what becomes the other branch
+            session.advance(2)
+            frame(session, lambda shown, k=k: shown.history[1] == 2 * (k + 1) * STEP)
+        session.seek(10 * STEP)
+        assert frame(session, lambda shown: shown.time == 10 * STEP).comparison is None
+        session.write({ANGLE: 1.0})
+        shown = frame(session, lambda shown: shown.comparison is not None)
+        assert shown.comparison == {"failure": "", "differences": [], "branch": True}
+        session.write({ANGLE: 1.2})  # There are still the same two branches.
+        session.advance(30)
+        assert angle(session) == angle_by_hand(40, {10: {ANGLE: 1.2}})
+        first = dict(frame(session, lambda shown: shown.time == 40 * STEP).comparison["differences"])
+        assert first[ANGLE] == 11 * STEP
+        assert first[MASS] == 22 * STEP  # The first state with it that was kept.
+
+
 def test_failed_simulation_stands_still_until_it_is_reset(session: Session) -> None:
     session.advance(10)
     session.write({"sim.sys.cart_pole.pole_pin.velocity": 1e200})

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 _Result = TypeVar("_Result")
 
-# Colours of the ghosts: a preview, a preview that fails, the course without the intervention.
-_PREVIEW, _REFUSED, _WITHOUT = "#009e73", "#d00000", "#0072b2"
+# Colours of the ghosts: a preview, a preview that fails, the course without the intervention, the other branch.
+_PREVIEW, _REFUSED, _WITHOUT, _BRANCH = "#009e73", "#d00000", "#0072b2", "#e69f00"
 _GHOST_OPACITY = 0.45
 
 # Of the wall time between two frames, what a simulation and a preview may take at most.
@@ -94,7 +94,8 @@ class Frame:
         warnings: What a machine's limits would refuse.
         failure: Why the simulation has ended; empty while it can go on.
         preview: What the preview has found: ``time``, ``end``, ``refused``; None if there is none.
-        comparison: Time and first differences of the course without the last intervention; None if there is none.
+        comparison: What the course without the last intervention, or the other branch, shows: ``differences`` (address
+            and time), ``failure``, ``branch``; None if there is none.
         drive: What is driven by hand, see `Driver.status`; None while nothing is.
         layers: What there is to say about each layer that is shown.
     """
@@ -130,15 +131,26 @@ class _Preview:
 
 @dataclass
 class _Comparison:
-    """The course of the simulation without an intervention, and its ghost."""
+    """The course of the simulation without an intervention, and its ghost.
+
+    Of a branch, the course had been simulated already, perhaps with interventions of its own: it passes through the
+    states that were kept of it.
+    """
 
     fork: Fork
     differences: Differences
     ghost: Drawing | None
+    later: deque[tuple[float, Snapshot]]
+    is_branch: bool
+
+    def advance_to(self, testbed: VirtualTestbed, when: float) -> None:
+        while self.later and self.later[0][0] <= when:
+            self.fork = Fork(testbed, self.later.popleft()[1])
+        self.fork.advance_to(when)
 
     def status(self) -> dict[str, Any]:
         differences = [(difference.address, difference.time) for difference in self.differences.first]
-        return {"failure": self.fork.failure, "differences": differences}
+        return {"failure": self.fork.failure, "differences": differences, "branch": self.is_branch}
 
 
 @dataclass
@@ -292,7 +304,8 @@ class Session:
     def seek(self, when: float) -> None:
         """Pause, and go back to the last state that was kept at or before a time.
 
-        What came later is forgotten at the next step of the simulation.
+        What came later is forgotten at the next step of the simulation. What is changed before that begins another
+        branch: the old one goes on as a ghost, see `Frame.comparison`.
         """
         self._do(lambda: self._seek(as_number("the time", when)))
 
@@ -559,7 +572,7 @@ class Session:
             self._failure, self._playing = one_line(error), False
             return
         if (comparison := self._comparison) is not None:
-            comparison.fork.advance_to(after)
+            comparison.advance_to(self._testbed, after)
             if not comparison.fork.failure:
                 comparison.differences.compare(self._context, comparison.fork.context)
 
@@ -699,19 +712,33 @@ class Session:
             self._driver.set(values)
             self._end_preview()
             return
-        before = self._testbed.fork(self._simulator) if compare else None
+        before = self._before_change(compare)
         state = before or self._testbed.snapshot(self._context)
         self._testbed.write(self._context, values)
         self._interventions.add(state, values)
         self._end_preview()
-        if before is not None:
-            self._begin_comparison(before)
+        self._begin_comparison(before)
         self._next_frame = 0.0
 
-    def _begin_comparison(self, before: Snapshot) -> None:
+    def _before_change(self, compare: bool = False) -> Snapshot | None:
+        """Return where the course without a change begins, if it is to go on as a ghost: the other branch always is."""
+        return self._testbed.fork(self._simulator) if compare or self._is_in_the_past() else None
+
+    def _is_in_the_past(self) -> bool:
+        return bool(self._history) and self._history[-1][0] > self._context.get_time()
+
+    def _begin_comparison(self, before: Snapshot | None) -> None:
+        """Let the course from ``before`` on be a ghost; what was kept of it is no future of ours any more."""
+        if before is None:
+            return
         self._end_comparison()
+        now, is_branch = self._context.get_time(), self._is_in_the_past()
+        later = deque(entry for entry in self._history if entry[0] > now)
+        self._forget_future()
         fork = Fork(self._testbed, before)
-        self._comparison = _Comparison(fork, Differences(self._testbed), self._ghost(fork.context, "without", _WITHOUT))
+        name, tint = ("branch", _BRANCH) if is_branch else ("without", _WITHOUT)
+        ghost = self._ghost(fork.context, name, tint)
+        self._comparison = _Comparison(fork, Differences(self._testbed), ghost, later, is_branch)
 
     def _seek(self, when: float) -> None:
         if not isfinite(when):
@@ -741,8 +768,7 @@ class Session:
         before = self._testbed.fork(self._simulator)
         driver = Driver(self._testbed, before, task, step=self.config.step, addresses=addresses, returning=returning)
         self._end_preview()
-        if compare:
-            self._begin_comparison(before)
+        self._begin_comparison(before if compare or self._is_in_the_past() else None)
         self._driver, self._context = driver, driver.context
         self._next_frame = 0.0
 
@@ -779,7 +805,9 @@ class Session:
 
     def _throw(self, mode: str | None, sense: Any, act: Any) -> None:
         self._refuse_driven("a switch")
+        before = self._before_change()
         self._testbed.switch(self._context, mode, sense=sense, act=act)
+        self._begin_comparison(before)
 
     def _end_preview(self) -> None:
         if self._preview is not None and self._preview.ghost is not None:

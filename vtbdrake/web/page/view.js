@@ -7,6 +7,8 @@ import { Keep } from "./keep.js";
 
 const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
 const WINDOW = 20; // s of simulated time in a plot
+// Positions of T_sense and T_act -> mode.
+const MODES = { "sim,sim": "sim", "real,sim": "shadow", "real,real": "real", "real,twin": "twin" };
 const MATCHES = 60; // addresses that the search lists
 const ENTRIES = 12; // entries of an array that get a slider
 const PREVIEW_PERIOD = 100; // ms between two drafts
@@ -205,6 +207,7 @@ class Page {
         )),
         (this.clock = element("output", { id: "vtb-time", title: "simulated time" })),
         (this.rate = element("output", { id: "vtb-rate", title: "simulated seconds per second" })),
+        (this.mode = element("output", { id: "vtb-mode", title: "mode of the switches" })),
         (this.history = element("input", { id: "vtb-history", type: "range", step: "any", title: "go back", oninput: () => this.#scrub() })),
       ),
     );
@@ -376,8 +379,10 @@ class Page {
     else if (preview.refused) this.say(`preview: ${preview.refused}, at ${preview.time.toFixed(2)} s`, "bad", "preview");
     else this.say(`preview until ${preview.time.toFixed(2)} s`, "draft", "preview");
     const rows = comparison?.differences.slice(0, 12) ?? [];
-    if (this.differences.rows.length !== (comparison ? rows.length + 1 : 0)) {
-      const head = element("tr", {}, element("td", { colSpan: 2 }, rows.length ? "differs first:" : "no difference yet"));
+    const course = comparison?.branch ? "other branch (orange)" : "course without the change (blue)";
+    const title = rows.length ? `differs first from the ${course}:` : `no difference yet from the ${course}`;
+    if (this.differences.rows.length !== (comparison ? rows.length + 1 : 0) || (comparison && this.differences.rows[0].textContent !== title)) {
+      const head = element("tr", {}, element("td", { colSpan: 2 }, title));
       const cells = rows.map(([address, time]) => element("tr", {}, element("td", {}, address), element("td", {}, `${time.toFixed(3)} s`)));
       this.differences.replaceChildren(...(comparison ? [head, ...cells] : []));
     }
@@ -391,15 +396,24 @@ class Page {
         if (!chosen) {
           const places = side === "sense" ? ["sim", "real"] : ["sim", "real", "twin"];
           chosen = element("select", { id, onchange: () => this.#throw(chosen, side, signal) }, ...places.map((p) => element("option", {}, p)));
-          this.switches.append(element("div", { className: "vtb-switch" }, element("label", { htmlFor: id }, `T_${side}.${signal}`), chosen));
+          const reason = element("small", { className: "bad" });
+          this.switches.append(element("div", { className: "vtb-switch" }, element("label", { htmlFor: id }, `T_${side}.${signal}`), chosen, reason));
         }
         if (document.activeElement !== chosen) chosen.value = position;
       }
     }
+    const [senses, acts] = ["sense", "act"].map((side) => [...new Set(Object.values(positions[side] ?? {}))]);
+    const mode = senses.length > 1 || acts.length > 1 ? "mixed" : MODES[[senses[0] ?? "sim", acts[0] ?? senses[0] ?? "sim"]];
+    this.mode.textContent = mode ?? "mixed";
+    this.mode.dataset.mode = this.mode.textContent;
   }
 
   #throw(chosen, side, signal) {
-    this.ask("switch", { [side]: { [signal]: chosen.value } });
+    const reason = chosen.parentElement.querySelector("small");
+    this.session.ask("switch", { [side]: { [signal]: chosen.value } }).then(
+      () => (reason.textContent = ""),
+      (error) => (reason.textContent = error.message),
+    );
     chosen.blur();
   }
 
