@@ -19,7 +19,7 @@ from functools import lru_cache
 from inspect import getdoc
 from math import inf, isfinite
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 _KEY = "setting"
 # By the name of a type in an annotation: the types of its values, and what messages and JSON Schema call it.
@@ -300,8 +300,20 @@ def _schema(annotation: Any, limits: Setting, default: Any) -> dict[str, Any]:
     return described
 
 
-def _type_schema(annotation: Any, limits: Setting) -> dict[str, Any]:
-    types = _checkable(_alternatives(annotation))
+def _configs(annotation: Any) -> dict[str, type]:
+    """Return the dataclasses in a type by their names, for example that of ``dict[str, Rock] | None``."""
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return {annotation.__name__: annotation}
+    return {name: kind for part in get_args(annotation) for name, kind in _configs(part).items()}
+
+
+def _type_schema(annotation: Any, limits: Setting, configs: Mapping[str, type] | None = None) -> dict[str, Any]:
+    configs = _configs(annotation) if configs is None else configs
+    alternatives = _alternatives(annotation)
+    if objects := [_object_schema(configs[each.name]()) for each in alternatives if each.name in configs]:
+        nothing = [{"type": "null"}] if any(each.name == "None" for each in alternatives) else []
+        return {"anyOf": [*objects, *nothing]} if len(objects) + len(nothing) > 1 else objects[0]
+    types = _checkable(alternatives)
     names = list(dict.fromkeys(_TYPES[each.name][2] for each in types))
     described: dict[str, Any] = {"type": names[0] if len(names) == 1 else names} if names else {}
     bounds = {
@@ -313,11 +325,11 @@ def _type_schema(annotation: Any, limits: Setting) -> dict[str, Any]:
     for each in types:
         kind = _TYPES[each.name][2]
         if kind == "array":
-            described["items"] = _type_schema(each.entry(0), limits)
+            described["items"] = _type_schema(each.entry(0), limits, configs)
             if each.is_sized:
                 described |= {"minItems": len(each.entries), "maxItems": len(each.entries)}
         elif kind == "object":
-            described["additionalProperties"] = _type_schema(each.entry(0), limits)
+            described["additionalProperties"] = _type_schema(each.entry(0), limits, configs)
         elif limits.choices:
             described["enum"] = [*limits.choices]
         elif kind in ("integer", "number"):

@@ -115,7 +115,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
         (["--at-most", "a=fast"], "LIMIT a number"),
         (["--at-least", "math:hypo(a,b)=1"], "math has no function 'hypo'"),
         (["--risk", "cvar:2"], "a number in (0, 1], not '2'"),
-        (["--risk", "median:0.5"], "expected worst, mean, quantile:LEVEL or cvar:LEVEL"),
+        (["--risk", "median:0.5"], "mean, worst, quantile:LEVEL or cvar:LEVEL"),
         ([], "nothing is varied: add --vary or --choose"),
     ],
 )

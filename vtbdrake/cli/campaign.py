@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import shlex
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.cli import FailedError
-from vtbdrake.cli.options import grouped, option
+from vtbdrake.cli.options import grouped, option, schema_option
 from vtbdrake.cli.output import emit, json_option, number, save_recording, say, table, write_whole
 from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.failures import one_line
@@ -37,12 +36,10 @@ def _parse_rollout(text: str) -> tuple[str, int]:
     return condition, int(seed)
 
 
-def _print_schema(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
-    if is_requested and not ctx.resilient_parsing:
-        from vtbdrake.testing.campaign import Campaign
+def _schema() -> dict[str, Any]:
+    from vtbdrake.testing.campaign import Campaign
 
-        click.echo(json.dumps(Campaign.schema(), indent=2))
-        ctx.exit()
+    return Campaign.schema()
 
 
 @click.command()
@@ -66,14 +63,7 @@ def _print_schema(ctx: click.Context, _: click.Parameter, is_requested: bool) ->
     option("--allow-changed-code", "Resume although the code has changed.", is_flag=True),
 )
 @on_error_option
-@click.option(
-    "--schema",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_schema,
-    help="Print the JSON Schema of FILE.",
-)
+@schema_option(_schema)
 @json_option
 def campaign(
     file: Path,

@@ -270,14 +270,26 @@ def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-def scenario_argument(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command its argument ``scenario``, with the fields that ``--field`` sets."""
+def scenario_argument(
+    command: Callable[..., Any], *, parse: Callable[[str], Any] = parse_scenario, metavar: str | None = None
+) -> Callable[..., Any]:
+    """Give a command its argument ``scenario``, with the fields that ``--field`` sets.
+
+    Args:
+        command: The command.
+        parse: Loads the scenario, or what the command accepts instead.
+        metavar: What the command accepts, for its help.
+    """
 
     @wraps(command)
-    def with_scenario(*, scenario: Scenario, scenario_fields: tuple[tuple[str, Any], ...], **others: Any) -> Any:
-        return command(scenario=scenario.with_fields(settings(scenario_fields)), **others)
+    def with_scenario(*, scenario: Any, scenario_fields: tuple[tuple[str, Any], ...], **others: Any) -> Any:
+        from vtbdrake.testbed import Scenario
 
-    argument = click.argument("scenario", callback=converted(parse_scenario), shell_complete=complete_scenario)
+        if isinstance(scenario, Scenario):
+            scenario = scenario.with_fields(settings(scenario_fields))
+        return command(scenario=scenario, **others)
+
+    argument = click.argument("scenario", callback=converted(parse), shell_complete=complete_scenario, metavar=metavar)
     return argument(_field_option(with_scenario))
 
 
@@ -295,6 +307,20 @@ _field_option = option(
     parse=parse_field,
     multiple=True,
 )
+
+
+def schema_option(load: Callable[[], dict[str, Any]]) -> Callable[[Any], Any]:
+    """Return the option ``--schema``, which prints the JSON Schema of a command's file instead of running it."""
+
+    def show(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
+        if is_requested and not ctx.resilient_parsing:
+            click.echo(json.dumps(load(), indent=2))
+            ctx.exit()
+
+    settings: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": show}
+    return option("--schema", "Print the JSON Schema of the YAML file.", **settings)
+
+
 url_option = option(
     "--url URL", "The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.", parse=parse_url, required=True
 )

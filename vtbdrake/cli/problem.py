@@ -18,12 +18,12 @@ from vtbdrake.cli.options import (
     LazyChoice,
     Setting,
     grouped,
-    horizon_option,
     option,
     output,
     parse_condition,
     parse_grid,
     parse_range,
+    parse_scenario,
     sample_period_option,
     scenario_argument,
     set_option,
@@ -34,7 +34,7 @@ from vtbdrake.cli.output import emit, json_option, number, say, show, table, wri
 from vtbdrake.failures import one_line
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Boundary, Parameter, Problem, Sweep
+    from vtbdrake.optimization import Boundary, Parameter, Problem, ProblemFile, Sweep
     from vtbdrake.optimization.parameter import Dimension
     from vtbdrake.rollout import Constraint, Quality, RolloutResult
     from vtbdrake.testbed import Scenario
@@ -48,30 +48,46 @@ def _executors() -> tuple[str, ...]:
 
 def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command a scenario, and what else states a problem as ``problem``, for `make_problem`."""
-    return scenario_argument(_problem_options(command))
+    return scenario_argument(_statement(required=True)(command))
 
 
-_problem_options = grouped(
-    "problem",
-    option(
-        "--quality ADDRESS|MODULE:FUNCTION",
-        "f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
-        "Python function of the variables named by --of.",
-        required=True,
-    ),
-    option("--of ADDRESS", "An argument of the function. May be repeated.", multiple=True),
-    horizon_option,
-    set_option,
-    option(
-        "--condition ADDRESS=VALUE[;...]",
-        "Evaluate every point under this condition. May be repeated.",
-        name="conditions",
-        parse=parse_condition,
-        multiple=True,
-    ),
-    sample_period_option,
-    start_option,
-)
+def problem_or_file_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command a scenario and what states a problem, or the file of a problem as ``scenario``."""
+    return scenario_argument(_statement(required=False)(command), parse=_parse_problem, metavar="SCENARIO|PROBLEM.yaml")
+
+
+def _parse_problem(text: str) -> Scenario | ProblemFile:
+    if ":" in text or not text.endswith((".yaml", ".yml")):
+        return parse_scenario(text)
+    from vtbdrake.optimization import ProblemFile
+
+    return ProblemFile.load(text)
+
+
+def _statement(*, required: bool) -> Callable[[Any], Any]:
+    return grouped(
+        "problem",
+        option(
+            "--quality ADDRESS|MODULE:FUNCTION",
+            "f, larger is better: abs(value) of a variable or vector port (of an array, its largest entry), or a "
+            "Python function of the variables named by --of.",
+            required=required,
+        ),
+        option("--of ADDRESS", "An argument of the function. May be repeated.", multiple=True),
+        option("--horizon S", "The horizon t_m, in seconds.", type=float, required=required),
+        set_option,
+        option(
+            "--condition ADDRESS=VALUE[;...]",
+            "Evaluate every point under this condition. May be repeated.",
+            name="conditions",
+            parse=parse_condition,
+            multiple=True,
+        ),
+        sample_period_option,
+        start_option,
+    )
+
+
 # For `Problem.sweep`, `Problem.boundary` and `Study.run`.
 executor_options = grouped(
     "running",

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
@@ -19,14 +20,21 @@ from vtbdrake.cli.options import (
     parse_choice,
     parse_field,
     parse_scaled_range,
+    schema_option,
     settings,
 )
 from vtbdrake.cli.output import emit, json_option, say, table, write_csv
 from vtbdrake.cli.page import browser_option, page_options, serve
-from vtbdrake.cli.problem import executor_options, make_constraint, make_problem, on_error_option, problem_options
+from vtbdrake.cli.problem import (
+    executor_options,
+    make_constraint,
+    make_problem,
+    on_error_option,
+    problem_or_file_options,
+)
 
 if TYPE_CHECKING:
-    from vtbdrake.optimization import Choice, Parameter, Study
+    from vtbdrake.optimization import Choice, Parameter, Problem, ProblemFile, Study
     from vtbdrake.optimization.risk import Risk
     from vtbdrake.rollout import Constraint
     from vtbdrake.testbed import Scenario
@@ -44,19 +52,13 @@ _point = click.argument(
 )
 
 
-def _risk(text: str) -> str | Risk:
-    from vtbdrake.optimization import CVaR, Quantile
+def _risk(text: str) -> Risk:
+    from vtbdrake.optimization.risk import make_risk
 
-    name, colon, level = text.partition(":")
-    levels: dict[str, type[CVaR | Quantile]] = {"quantile": Quantile, "cvar": CVaR}
-    if not colon:
-        return text
-    if name not in levels:
-        raise click.BadParameter(f"expected worst, mean, quantile:LEVEL or cvar:LEVEL, not {text!r}")
     try:
-        return levels[name](float(level))
+        return make_risk(text)
     except ValueError as error:
-        raise click.BadParameter(f"the level of {name} is a number in (0, 1], not {level!r}") from error
+        raise click.BadParameter(str(error)) from error
 
 
 @click.group()
@@ -71,9 +73,15 @@ def study() -> None:
     """
 
 
+def _schema() -> dict[str, Any]:
+    from vtbdrake.optimization import ProblemFile
+
+    return ProblemFile.schema()
+
+
 @study.command()
 @click.argument("file", callback=converted(output()))
-@problem_options
+@problem_or_file_options
 @option(
     "--vary ADDRESS=LOWER:UPPER[:log][:integer]",
     "A parameter and its range: on a logarithmic scale, or whole numbers only. May be repeated.",
@@ -148,10 +156,11 @@ def study() -> None:
     "solving",
     option("--allow-changed-code", "Resume although the code of the problem has changed.", is_flag=True),
 )
+@schema_option(_schema)
 @json_option
 def run(
     file: Path,
-    scenario: Scenario,
+    scenario: Scenario | ProblemFile,
     vary: tuple[Parameter, ...],
     choose: tuple[Choice, ...],
     at_most: tuple[Constraint, ...],
@@ -162,26 +171,56 @@ def run(
 ) -> None:
     """Begin a study, or resume the one in FILE. Ctrl-C keeps the finished rollouts.
 
-    The study has one quality, read as the best over time. Several qualities, other readings, limits of the quality and
-    callbacks need a Python program: see Problem.study.
+    Options state a problem with one quality, read as the best over time. A file PROBLEM.yaml states any problem, its
+    solver and its budget, which options replace; its modules are imported, which runs their code.
 
     \b
     Example:
+      vtbdrake study run gait.db gait.yaml --workers 4
       vtbdrake study run gait.db vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
           --vary dps.impl.gait.period=1:4:log --choose scenario.gravity=1.62,9.81 \\
           --quality sim.sys.climber.base.x --at-most sim.sys.climber.base.pitch=0.2
     """
-    if not (vary or choose):
-        raise click.UsageError("nothing is varied: add --vary or --choose")
+    from vtbdrake.testbed import Scenario
+
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    stated = make_problem(scenario, [*vary, *choose], **problem, constraints=[*at_most, *at_least])
     solving["options"] = settings(solving["options"]) or None
+    if not isinstance(scenario, Scenario):
+        stated, solving, running = _of_file(scenario, solving, running)
+    elif not (vary or choose):
+        raise click.UsageError("nothing is varied: add --vary or --choose")
+    elif missing := [name for name in ("horizon", "quality") if problem[name] is None]:
+        raise click.UsageError(f"Missing option '--{missing[0]}'.")
+    else:
+        stated = make_problem(scenario, [*vary, *choose], **problem, constraints=[*at_most, *at_least])
     with stated.study(file, **solving) as opened:
         opened.run(**running)
         say(opened.summary())
         emit({**_described(opened), "reason": opened.reason})
         if opened.reason == "interrupted":
             raise FailedError("the study was interrupted: the same command resumes it")
+
+
+def _of_file(
+    file: ProblemFile, solving: dict[str, Any], running: dict[str, Any]
+) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
+    """Return the problem of a file, with how it is solved and run; options of the command replace what it says."""
+    context = click.get_current_context()
+    typed = [
+        parameter
+        for parameter in context.command.params
+        if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE
+    ]
+    solvable = {*solving, *running}
+    for parameter in typed:
+        if isinstance(parameter, click.Option) and parameter.name not in solvable and parameter.expose_value:
+            raise click.UsageError(f"{file.path} states the problem: leave out {parameter.opts[0]}, or change the file")
+    names = {parameter.name for parameter in typed}
+    return (
+        file.problem,
+        {**file.study_arguments, **{name: value for name, value in solving.items() if name in names}},
+        {**file.run_arguments, **{name: value for name, value in running.items() if name in names}},
+    )
 
 
 @study.command()

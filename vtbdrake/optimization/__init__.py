@@ -3,6 +3,7 @@
 from vtbdrake.optimization.boundary import Boundary
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.problem import Motion, Problem, ProblemRollout
+from vtbdrake.optimization.problem_file import ProblemFile, ProblemFileError
 from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
 from vtbdrake.optimization.study import Study
@@ -18,6 +19,8 @@ __all__ = [
     "Outcome",
     "Parameter",
     "Problem",
+    "ProblemFile",
+    "ProblemFileError",
     "ProblemRollout",
     "Quantile",
     "Risk",

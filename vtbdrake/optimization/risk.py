@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isnan
 from typing import TYPE_CHECKING
@@ -82,21 +82,29 @@ class CVaR(_Level):
 
 
 RISKS: dict[str, Risk] = {"mean": Mean(), "worst": Worst()}
+_LEVELS: dict[str, Callable[[float], Risk]] = {"quantile": Quantile, "cvar": CVaR}
 
 
 def make_risk(risk: str | Risk) -> Risk:
-    """Return a risk by name, or the one given.
+    """Return the risk that a text names, such as ``mean`` or ``cvar:0.5``, or the one given.
 
     Raises:
-        ValueError: The name is unknown.
+        ValueError: The name is unknown, or the level is no number in (0, 1].
     """
     if isinstance(risk, Risk):
         return risk
-    if not isinstance(risk, str) or risk not in RISKS:
+    name, colon, level = risk.partition(":") if isinstance(risk, str) else ("", "", "")
+    if colon and name in _LEVELS:
+        try:
+            return _LEVELS[name](float(level))
+        except ValueError as error:
+            raise ValueError(f"the level of {name} is a number in (0, 1], not {level!r}") from error
+    if colon or name not in RISKS:
         raise ValueError(
-            f"conditions are aggregated by {', '.join(RISKS)}, Quantile(level) or CVaR(level), not by {risk!r}"
+            f"conditions are aggregated by {', '.join(RISKS)}, quantile:LEVEL or cvar:LEVEL (Quantile and CVaR in "
+            f"Python), not by {risk!r}"
         )
-    return RISKS[risk]
+    return RISKS[name]
 
 
 def aggregate(

@@ -29,12 +29,18 @@ def smallest(value: float | np.ndarray) -> float:
     return float(np.min(value))
 
 
+LIBRARY: dict[str, Callable[..., float]] = {f.__name__: f for f in (magnitude, largest, smallest)}
+"""The functions that need no module before their name."""
+
+
 def named_function(text: str) -> Callable[..., Any]:
-    """Return the function ``module:function``; its module is imported, which runs its code.
+    """Return the function ``module:function``, or one of `LIBRARY`; its module is imported, which runs its code.
 
     Raises:
         ValueError: There is no such function, or its module cannot be imported.
     """
+    if text in LIBRARY:
+        return LIBRARY[text]
     if not FUNCTION.fullmatch(text):
         raise ValueError(f"a function is named package.module:function, not {text!r}")
     module_name, _, name = text.partition(":")

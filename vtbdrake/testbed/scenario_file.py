@@ -165,12 +165,15 @@ def is_imported(name: str) -> bool:
     return name.partition(":")[0] in sys.modules
 
 
-def compose_yaml(path: Path, *, kind: str = "scenario") -> yaml.Node | None:
+def compose_yaml(
+    path: Path, *, kind: str = "scenario", loader: type[yaml.SafeLoader] = yaml.SafeLoader
+) -> yaml.Node | None:
     """Return the nodes of a file of YAML, in which no key occurs twice; None if it is empty.
 
     Args:
         path: The file.
         kind: A word for the file in messages.
+        loader: The class that recognizes numbers.
 
     Raises:
         ScenarioError: The file does not exist, is too large, or is not YAML.
@@ -180,7 +183,7 @@ def compose_yaml(path: Path, *, kind: str = "scenario") -> yaml.Node | None:
     if not path.is_file() or path.stat().st_size > _LARGEST_FILE:
         raise ScenarioError(f"{path} is no file of YAML, or larger than {_LARGEST_FILE} bytes")
     try:
-        document = yaml.compose(path.read_text(), Loader=yaml.SafeLoader)
+        document = yaml.compose(path.read_text(), Loader=loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path} is not YAML: {error}") from error
     _check_nodes(document, path)

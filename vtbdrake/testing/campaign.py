@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.optimization import Motion, Problem, Study
@@ -22,9 +20,10 @@ from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.rollout.named_function import largest, named_function, smallest
 from vtbdrake.rollout.quality import READINGS
 from vtbdrake.rollout.testbeds import split
-from vtbdrake.settings import check_settings, field_types, schema, setting
-from vtbdrake.testbed import ScenarioError, load_scenario
-from vtbdrake.testbed.scenario_file import compose_yaml, refuse_unknown, resolve_types
+from vtbdrake.settings import schema, setting
+from vtbdrake.testbed import load_scenario
+from vtbdrake.testbed.scenario_file import resolve_types
+from vtbdrake.testbed.settings_file import read_settings, scenario_beside
 from vtbdrake.testing.campaign_results import ALL, CampaignResult, CampaignRollout, RolloutName
 
 ATTRIBUTE = "campaign"
@@ -168,35 +167,21 @@ class Campaign:
             CampaignError: The file cannot be read, or something in it cannot be used.
         """
         path = Path(path)
-        resolve_types(cls)
-        try:
-            node = compose_yaml(path, kind="campaign")
-            if not isinstance(node, yaml.MappingNode):
-                raise CampaignError("its content is no mapping: it has keys such as scenario, conditions and criteria")
-            refuse_unknown(node, cls)
-            campaign = _typed(cls, yaml.load(path.read_text(), Loader=_Loader), cls.__name__)
-        except ScenarioError as error:
-            raise CampaignError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
-        except (CampaignError, yaml.YAMLError) as error:
-            raise CampaignError(f"{path}: {error}") from error
+        example = "scenario, conditions and criteria"
+        campaign, lines = read_settings(cls, path, noun="campaign", example=example, error=CampaignError)
         campaign.path = path
         try:
             campaign._check()
             campaign.problem  # noqa: B018 - it checks scenario, addresses and functions
         except ValueError as error:
-            raise CampaignError(f"{path}: {error}") from error
+            raise CampaignError(lines.message(error)) from error
         return campaign
 
     @staticmethod
     def schema() -> dict[str, Any]:
         """Return the JSON Schema of the file."""
         resolve_types(Campaign)
-        described = schema(Campaign)
-        nested = {"criteria": Criterion, "stop": Stop}
-        parts = {name: {k: v for k, v in schema(kind).items() if k != "$schema"} for name, kind in nested.items()}
-        described["properties"]["criteria"]["additionalProperties"] = parts["criteria"]
-        described["properties"]["stop"] |= {"anyOf": [parts["stop"], {"type": "null"}]}
-        return described
+        return schema(Campaign)
 
     # -- what it states
 
@@ -213,7 +198,7 @@ class Campaign:
             ValueError: The scenario, an address, a value or a function does not exist or does not fit.
         """
         common, _ = split(self.values)
-        scenario = load_scenario(self._scenario_name()).with_fields(common)
+        scenario = load_scenario(scenario_beside(self.path, self.scenario)).with_fields(common)
         stop = self.stop
         if stop is None:
             quality = Quality(_elapsed, of="time")
@@ -235,12 +220,6 @@ class Campaign:
             constraints=constraints,
             conditions=self._all_values(),
         )
-
-    def _scenario_name(self) -> str:
-        """Return the name of the scenario, whose file is looked for beside that of the campaign."""
-        name, at, file = self.scenario.partition("@")
-        beside = self.path.parent / file.partition("#")[0]
-        return f"{name}@{self.path.parent / file}" if at and beside.exists() else self.scenario
 
     def _all_values(self) -> list[dict[str, Any]]:
         """Return what each rollout sets, address -> value."""
@@ -270,7 +249,6 @@ class Campaign:
 
     def _check(self) -> None:
         """Refuse what the types allow and a campaign cannot be."""
-        check_settings(self, error=CampaignError)
         if not self.scenario:
             raise CampaignError("a campaign has a scenario: package.module:Class")
         for noun, parts in (("conditions", self.conditions), ("criteria", self.criteria)):
@@ -499,40 +477,6 @@ class Rerun:
 def _elapsed(time: float) -> float:
     """Return the simulation's clock: the quality of a rollout that only its criteria judge."""
     return time
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads 1e-3 as a number, as YAML 1.2 and JSON do."""
-
-
-_Loader.yaml_implicit_resolvers = {key: [*rows] for key, rows in yaml.SafeLoader.yaml_implicit_resolvers.items()}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+"), list("-+0123456789")
-)
-
-
-def _typed(kind: type[Any], content: Any, name: str) -> Any:
-    """Return a dataclass with the content of a file, whose keys are fields."""
-    if not isinstance(content, Mapping):
-        raise CampaignError(f"{name} is a mapping of {', '.join(field_types(kind))}, not {content!r}")
-    parts = {"seeds": Seeds, "stop": Stop}
-    # A key without content is left out.
-    values = {key: value for key, value in content.items() if value is not None}
-    for key, value in values.items():
-        if kind is Campaign and key in parts:
-            values[key] = _typed(parts[key], value, key)
-        elif kind is Campaign and key == "criteria" and isinstance(value, Mapping):
-            values[key] = {str(n): _typed(Criterion, criterion, f"criteria.{n}") for n, criterion in value.items()}
-        elif kind is Campaign and key == "values":
-            values[key] = _with_texts(value)
-        elif kind is Campaign and key == "conditions" and isinstance(value, Mapping):
-            values[key] = {str(n): _with_texts({} if c is None else c) for n, c in value.items()}
-    return kind(**values)
-
-
-def _with_texts(values: Any) -> Any:
-    """Return a mapping with texts as keys: YAML has other keys, too, and no address is one."""
-    return {str(key): value for key, value in values.items()} if isinstance(values, Mapping) else values
 
 
 def _text(name: RolloutName) -> str:

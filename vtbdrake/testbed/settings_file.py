@@ -1,0 +1,156 @@
+"""YAML files of settings: dataclasses, nested ones too, whose fields a file gives, with errors that name its line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
+
+import yaml
+
+from vtbdrake.settings import check_settings, field_types
+from vtbdrake.testbed.scenario import ScenarioError
+from vtbdrake.testbed.scenario_file import compose_yaml, refuse_unknown, resolve_types
+
+T = TypeVar("T")
+# The name of an entry in a message: criteria[a], or qualities[0].
+_ENTRY = re.compile(r"\[([^\]\s]+)\]")
+
+
+class Lines:
+    """The lines of a file, by the dotted names of its keys, and by addresses and other texts with a dot or a colon.
+
+    Args:
+        path: The file.
+        node: Its content.
+        kind: The name of the class that has its keys as fields.
+    """
+
+    def __init__(self, path: Path = Path(), node: yaml.Node | None = None, kind: str = "") -> None:
+        self._path = path
+        self._names = dict(_names(node))
+        self._texts: dict[str, int] = {f"{kind}.{name}": line for name, line in self._names.items()}
+        for text, line in [*self._names.items(), *_texts(node)]:
+            if "." in text or ":" in text:
+                self._texts.setdefault(text, line)
+
+    @contextmanager
+    def at(self, name: str) -> Iterator[None]:
+        """Give the errors of a block the line of a dotted name, unless they have one."""
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            if name not in self._names or str(error).startswith("line "):
+                raise
+            raise ValueError(f"line {self._names[name]}: {error}") from error
+
+    def message(self, error: object) -> str:
+        """Return an error with the file, and its line or that of the first text of the file that it mentions."""
+        text = str(error)
+        if text.startswith("line "):
+            return f"{self._path}: {text}"
+        mentioned = _ENTRY.sub(r".\1", text).partition("did you mean")[0]
+        places = [(mentioned.find(name), -len(name), line) for name, line in self._texts.items() if name in mentioned]
+        line = f"line {min(places)[2]}: " if places else ""
+        return f"{self._path}: {line}{text}"
+
+
+def _names(node: yaml.Node | None, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield (dotted name, line) of keys and of the entries of lists, which have numbers."""
+    entries: list[tuple[str, yaml.Node, yaml.Node]] = []
+    if isinstance(node, yaml.MappingNode):
+        entries = [(str(key.value), key, value) for key, value in node.value]
+    elif isinstance(node, yaml.SequenceNode):
+        entries = [(str(index), value, value) for index, value in enumerate(node.value)]
+    for key, place, value in entries:
+        below = f"{name}.{key}".lstrip(".")
+        yield below, place.start_mark.line + 1
+        yield from _names(value, below)
+
+
+def _texts(node: yaml.Node | None) -> Iterator[tuple[str, int]]:
+    """Yield (text, line) of keys and values that are texts."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield str(key.value), key.start_mark.line + 1
+            yield from _texts(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for entry in node.value:
+            yield from _texts(entry)
+    elif node is not None and node.tag.endswith(":str"):
+        yield str(node.value), node.start_mark.line + 1
+
+
+def read_settings(kind: type[T], path: Path, *, noun: str, example: str, error: type[ValueError]) -> tuple[T, Lines]:
+    """Return a dataclass with the fields of a file, checked as `check_settings` does, and the file's lines.
+
+    Args:
+        kind: The class; all its fields have defaults.
+        path: The file.
+        noun: A word for what the file states, in messages.
+        example: Some of its keys, in messages.
+        error: The class of the errors.
+
+    Raises:
+        ValueError: The file does not exist or is not YAML, or a key or value in it is not possible.
+    """
+    resolve_types(kind)
+    try:
+        node = compose_yaml(path, kind=noun, loader=Loader)
+    except ScenarioError as cause:
+        raise error(str(cause)) from cause
+    if not isinstance(node, yaml.MappingNode):
+        raise error(f"{path}: its content is no mapping: it has keys such as {example}")
+    lines = Lines(path, node, kind.__name__)
+    try:
+        refuse_unknown(node, kind)
+        config: T = _typed(kind, Loader("").construct_document(node), "", error)
+        check_settings(config, error=error)
+    except (ValueError, yaml.YAMLError) as cause:
+        raise error(lines.message(cause)) from cause
+    return config, lines
+
+
+def scenario_beside(path: Path, scenario: str) -> str:
+    """Return the name of a scenario that a file names; a file of the scenario is looked for beside that file."""
+    name, at, file = scenario.partition("@")
+    beside = path.parent / file.partition("#")[0]
+    return f"{name}@{path.parent / file}" if at and beside.exists() else scenario
+
+
+class Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, as YAML 1.2 and JSON do."""
+
+
+Loader.yaml_implicit_resolvers = {key: [*rows] for key, rows in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+"), list("-+0123456789")
+)
+
+
+def _typed(hint: Any, content: Any, name: str, error: type[ValueError]) -> Any:
+    """Return content of a file with dataclasses where the type of its field has them, and texts as keys."""
+    kind: Any
+    for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
+        if is_dataclass(kind):
+            types = field_types(kind)
+            if not isinstance(content, Mapping):
+                raise error(f"{name} is a mapping of {', '.join(types)}, not {content!r}")
+            # A key without content is left out.
+            values = {key: value for key, value in content.items() if value is not None}
+            fill: Any = kind
+            return fill(**{k: _typed(types[k], v, f"{name}.{k}".lstrip("."), error) for k, v in values.items()})
+        if get_origin(kind) is dict and isinstance(content, Mapping):
+            inner = get_args(kind)[1]
+            # {} may be left out, too.
+            empty: dict[str, Any] | None = {} if get_origin(inner) is dict else None
+            values = {str(key): empty if value is None else value for key, value in content.items()}
+            return {key: _typed(inner, value, f"{name}.{key}", error) for key, value in values.items()}
+        if get_origin(kind) is list and isinstance(content, list):
+            inner = get_args(kind)[0]
+            return [_typed(inner, value, f"{name}[{index}]", error) for index, value in enumerate(content)]
+    return content
