@@ -12,9 +12,9 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.chromium import PATIENCE, needs_chromium, screenshot
-from tests.web.studies import ANGLE, PLACE, cart_pole_problem, run_elsewhere
+from tests.web.studies import ANGLE, PLACE, RATE, cart_pole_problem, run_elsewhere
 from tests.web.test_page import GREEN, drawn, share
-from vtbdrake.optimization import Parameter
+from vtbdrake.optimization import Parameter, Study
 from vtbdrake.rollout import Quality
 from vtbdrake.rollout.named_function import magnitude
 from vtbdrake.web import StudyView, view_study
@@ -107,6 +107,47 @@ def test_running_study_is_watched_until_its_process_dies(browser: Browser, tmp_p
         assert "study continue" in page.inner_text("[data-kind=died]")
 
 
+def test_study_is_steered_on_its_page(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    with cart_pole_problem().study(path, solver="random", seed=4) as study:
+        study.run(rollouts=8, executor="serial", progress=False)
+    with view_study(path) as view, page_of(browser, view) as page:
+        assert page.is_disabled("#vtb-stop") and page.is_disabled("#vtb-run")
+        page.click("#vtb-tab-search")
+        page.fill("#vtb-budget", "60")
+        page.keyboard.press("Enter")
+        drawn(page, "document.body.dataset.interventions === '1'")
+        # A drag in the landscape forbids the left half.
+        page.check("#vtb-forbid")
+        box = page.locator("#vtb-landscape").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 63, box["y"] + 12)
+        page.mouse.down()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] - 34, steps=3)
+        page.mouse.up()
+        drawn(page, "vtb.status.forbidden.length === 1")
+        page.fill(f"[data-address='{RATE}'] input[aria-label$=lower]", "-1")
+        page.keyboard.press("Enter")
+        drawn(page, "document.body.dataset.interventions === '3'")
+        page.fill(f"[data-address='{RATE}'] input[aria-label$=lower]", "7")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#vtb-messages >> text=lower < upper")
+        page.click("#vtb-tab-changes")
+        assert page.locator("#vtb-changes tr").count() == 3
+        page.click("#vtb-run")
+        drawn(page, "document.body.dataset.state === 'ended' && document.body.dataset.rollouts === '60'")
+        drawn(page, "document.body.dataset.effective === '3' && document.body.dataset.trials === '60'")
+        ((_, region),) = page.evaluate("vtb.status.forbidden")
+        assert view.runner is not None and view.runner.wait() == 0
+    with Study.open(path) as study:
+        later = study.trials[8:]
+        assert study.search.budget == 60
+    assert len(later) == 52 and region[ANGLE][0] < 0.6 < 1.5 < region[ANGLE][1] < 1.9
+    assert all(t.parameters[RATE] >= -1.0 for t in later)
+    inside = [t for t in later if t.parameters[ANGLE] < region[ANGLE][1] and t.parameters[RATE] > region[RATE][0]]
+    assert all(t.parameters[RATE] > region[RATE][1] or t.parameters[ANGLE] < region[ANGLE][0] for t in inside)
+
+
 def test_pareto_front_and_parallel_axes(browser: Browser) -> None:
     problem = cart_pole_problem(
         parameters=[Parameter(ANGLE, 0.5, 3.0), Parameter("sim.sys.cart_pole.pole.mass", 0.1, 1.0, log=True),
@@ -116,12 +157,22 @@ def test_pareto_front_and_parallel_axes(browser: Browser) -> None:
     )  # fmt: skip
     study = problem.study(solver="random", seed=1)
     study.run(rollouts=30, executor="serial", progress=False)
+    study.intervene("budget", rollouts=60)
     with study.view() as view, page_of(browser, view) as page:
         page.click("#vtb-view-pareto")
         assert set(page.evaluate("vtb.front")) == {trial.number for trial in study.pareto()}
         end = page.evaluate("vtb.front[0]")
         page.mouse.move(*place_of(page, "pareto", end))
         drawn(page, f"document.body.dataset.pointed === '{end}'")
+        box = page.locator("#vtb-pareto").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.7 * box["height"], steps=3)
+        page.mouse.up()
+        drawn(page, "vtb.status.aspiration !== null")
+        aspiration = study.search.aspiration
+        assert aspiration is not None and list(aspiration) == page.evaluate("vtb.status.aspiration")
         page.click("#vtb-view-parallel")
         picture = screenshot(page, clip={"x": 20, "y": 130, "width": 460, "height": 250})
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

@@ -142,7 +142,7 @@ def test_options_and_several_qualities_and_failures_reach_the_page(tmp_path: Pat
     study.run(rollouts=20, executor="serial", progress=False)
     with study.view() as view, page(view) as socket:
         reader = Reader(socket).until("ended", 20)
-        assert reader.hello["parameters"][1]["options"] == ["0.0", "2.0"] and reader.hello["command"] == ""
+        assert reader.hello["parameters"][1]["options"] == [0.0, 2.0] and reader.hello["command"] == ""
         for trial, (theta, option, *values, kind) in zip(study.trials, reader.trials, strict=True):
             assert trial.point == (theta, [0.0, 2.0][option])
             assert values == [None if math.isnan(value) else value for value in trial.values] and kind == trial.kind
@@ -151,7 +151,7 @@ def test_options_and_several_qualities_and_failures_reach_the_page(tmp_path: Pat
         assert "late" in message and first == min(failed) and 0 < count <= len(failed) < 20
         tried = reader.ask("try", point=[-1.4, 0])
         assert tried["kind"] == "failed" and "late" in tried["message"]
-        reader.ask("add", point=[0.5, 1])
+        reader.ask("give", point=[0.5, 1])
         assert list(study.queue.values()) == [{angle: 0.5, "scenario.stiffness": 2.0}]
 
 
@@ -191,6 +191,53 @@ def test_dead_runner_is_told_and_another_process_goes_on(tmp_path: Path) -> None
         reader.until("died", done + 20)
 
 
+@pytest.mark.slow
+def test_running_study_is_steered(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    runner = run_elsewhere(path, rollouts=4000)
+    while not path.exists() or not path.with_name("a.db-lock").exists():
+        assert runner.poll() is None
+    with view_study(path) as view, page(view) as socket:
+        reader = Reader(socket).until("running", 10)
+        reader.ask("intervene", kind="pause", payload={})
+        while not (reader.status["paused"] and reader.status["interventions"][-1]["batch"] is not None):
+            reader.read()
+        region = {ANGLE: [0.5, 1.5], RATE: [None, None]}
+        reader.ask("intervene", kind="forbid", payload={"region": region})
+        reader.ask("intervene", kind="range", payload={"address": RATE, "lower": -4.0, "upper": 1.0})
+        for kind, payload, message in (
+            ("forbid", {"region": {ANGLE: [0.0, 9.0]}}, "no point is left"),
+            ("range", {"address": "sim.nothing"}, "varies no parameter"),
+            ("explode", {}, "explode"),
+            ("budget", {"rollouts": 0}, "at least one rollout"),
+        ):
+            with pytest.raises(StudyError, match=message):
+                reader.ask("intervene", kind=kind, payload=payload)
+        # A point outside the first range, tried here with its value, costs the study nothing.
+        tried = reader.ask("try", point=[2.0, -3.5])
+        reader.ask("give", point=[2.0, -3.5])
+        extra = reader.ask("intervene", kind="budget", payload={"rollouts": 3000})
+        reader.ask("remove", number=extra)
+        reader.ask("intervene", kind="resume", payload={})
+        while any(row["batch"] is None for row in reader.status["interventions"]) or reader.status["paused"]:
+            reader.read()
+        since = reader.status["interventions"][-1]["batch"]
+        assert reader.status["parameters"][1]["lower"] == -4.0 and reader.status["ranges"][1]["upper"] == 1.0
+        reader.until("running", len(reader.trials) + 40)
+        reader.ask("intervene", kind="stop", payload={})
+        reader.until("ended", 40)
+        assert reader.status["reason"] == "stopped"
+    assert runner.wait() == 0
+    with Study.open(path) as study:
+        later = [trial for trial in study.trials if trial.batch >= since and trial.origin == "solver"]
+        by_hand = [trial for trial in study.trials if trial.origin == "user"]
+        kinds = [intervention.kind for intervention in study.interventions]
+    assert len(later) >= 40
+    assert all(trial.parameters[ANGLE] > 1.5 and -4.0 <= trial.parameters[RATE] <= 1.0 for trial in later)
+    assert [(trial.point, list(trial.values)) for trial in by_hand] == [((2.0, -3.5), tried["values"])]
+    assert kinds == ["pause", "forbid", "range", "try", "resume", "stop"]
+
+
 def test_file_whose_modules_are_not_trusted_is_shown_without_rollouts(tmp_path: Path) -> None:
     with cart_pole_problem(quality=Quality(lambda place: abs(place), "sim.sys.cart_pole.cart_slider.position")).study(
         tmp_path / "a.db", solver="sobol"
@@ -213,7 +260,7 @@ def test_study_on_a_read_only_disk_is_shown_and_refuses_changes() -> None:
         with that_cannot_be_written(folder), view_study(path) as view, page(view) as socket:
             reader = Reader(socket).until("ended", 4)
             with pytest.raises(StudyError, match="the permissions of the file and its folder"):
-                reader.ask("add", point=[1.0, 0.0])
+                reader.ask("give", point=[1.0, 0.0])
             assert reader.ask("try", point=[1.0, 0.0])["values"]
 
 

@@ -348,10 +348,10 @@ def go_on(file: Path, trusted: tuple[str, ...], running: dict[str, Any]) -> None
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with Study.open(file) as opened:
-        record = opened.record
+        record, budget = opened.record, opened.search.budget
     if running["rollouts"] is None and running["seconds"] is None:
-        running["rollouts"] = record.get("budget")
+        running["rollouts"] = budget
     with restated(record, trusted=trusted).study(file) as resumed:
-        resumed.run(**running)
+        resumed.run(**running, racing=record.get("racing"))
         say(resumed.summary())
         emit({**_described(resumed), "reason": resumed.reason})

@@ -14,7 +14,9 @@ from typing import Any
 
 from vtbdrake.failures import one_line
 from vtbdrake.optimization import Choice, Study, StudyError, Trial
+from vtbdrake.optimization.records import Intervention
 from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.steering import StudySearch
 from vtbdrake.optimization.study_file import Mark, StudyFile
 from vtbdrake.rollout.task import FAILED
 
@@ -38,6 +40,8 @@ class Status:
         ends: Their number by the way in which they ended.
         rate: Rollouts per second, at present.
         failures: Reasons of failures: message, number, and the number of the first trial; the most frequent first.
+        search: The search as the interventions have left it.
+        interventions: The interventions, in their order.
     """
 
     state: str
@@ -47,6 +51,8 @@ class Status:
     ends: dict[str, int]
     rate: float | None
     failures: tuple[tuple[str, int, int | None], ...]
+    search: StudySearch
+    interventions: tuple[Intervention, ...]
 
 
 class StudyFeed:
@@ -59,16 +65,15 @@ class StudyFeed:
         trials: The trials in the order in which they were recorded.
         status: Where the study stands.
         revision: Counts the changes.
-        meta: The description of the study, see `StudyFile.meta`.
     """
 
     def __init__(self, file: StudyFile) -> None:
         self._file = file
-        study = Study(file)
-        self._parameters = study.parameters
+        self._study = Study(file)
+        # The options of choices stay, other ranges may be widened.
+        self._parameters = self._study.parameters
         self.trials: list[Trial] = []
         self.revision = 0
-        self.meta = file.meta
         self._trial_mark, self._outcome_mark = Mark(), Mark()
         self._failure_of: dict[Point, str] = {}
         self._first_trial: dict[str, int] = {}
@@ -161,7 +166,8 @@ class StudyFeed:
         return True
 
     def _read(self) -> None:
-        version, self.meta = self._file.version(), self._file.meta
+        version = self._file.version()
+        self._search, self._interventions = self._study.search, self._study.interventions
         earlier, outcomes, outcome_mark = self._file.outcomes_since(self._outcome_mark)
         stay, trials, trial_mark = self._file.trials_since(self._trial_mark)
         with self._changed:
@@ -203,7 +209,17 @@ class StudyFeed:
         reason = str(last["reason"] or "") if last is not None else ""
         ends = dict(self._ends)
         rate = self._rate() if running else None
-        return Status(state, reason, self._message, sum(ends.values()), ends, rate, tuple(failures))
+        return Status(
+            state=state,
+            reason=reason,
+            message=self._message,
+            rollouts=sum(ends.values()),
+            ends=ends,
+            rate=rate,
+            failures=tuple(failures),
+            search=self._search,
+            interventions=self._interventions,
+        )
 
     def _rate(self) -> float | None:
         if len(self._finished) < 2:

@@ -29,7 +29,7 @@ class Surrogate:
     """
 
     def __init__(self, study: Study) -> None:
-        self._parameters, self._signs = study.parameters, np.array(study.signs)
+        self._study, self._signs = study, np.array(study.signs)
         self._constraints = len(study.record["problem"]["constraints"])
         self._thread = ThreadPoolExecutor(1, "vtbdrake model", initializer=_give_way)
 
@@ -52,11 +52,12 @@ class Surrogate:
         return self._thread.submit(self._grid, trials, x, y, quality=quality, at=at).result()
 
     def _grid(self, trials: Sequence[Trial], x: str, y: str, *, quality: int, at: Trial) -> dict[str, Any]:
-        search = Search(self._parameters, objectives=len(self._signs), constraints=self._constraints)
+        parameters = self._study.parameters
+        search = Search(parameters, objectives=len(self._signs), constraints=self._constraints)
         solver = Bayesian(search, name="bayesian", memory=_POINTS)
         solver.tell([self._evaluation(trial) for trial in self._selected(trials)])
-        addresses = [parameter.address for parameter in self._parameters]
-        columns, rows = (self._parameters[addresses.index(address)] for address in (x, y))
+        addresses = [parameter.address for parameter in parameters]
+        columns, rows = (parameters[addresses.index(address)] for address in (x, y))
         u, v = _centres(columns), _centres(rows)
         units = np.tile(search.unit(at.point), (len(u) * len(v), 1))
         units[:, addresses.index(x)] = np.tile(u, len(v))

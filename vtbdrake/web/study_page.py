@@ -7,6 +7,7 @@ import os
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 _PERIOD = 0.1  # s between two messages to a page
 _PATIENCE = 1.0  # s, for a change
+_LISTED = 200  # interventions
 
 
 class StudyView:
@@ -124,11 +126,23 @@ class StudyView:
         """
         if not self.resume_command:
             raise StudyError(f"only the program that began the study can resume it: {self.obstacle}")
-        if self.feed.status.state == "running":
+        if self.study.is_running:
             raise StudyError("the study is running")
-        # Its output would go to a page that may be gone.
-        quiet: dict[str, Any] = {name: subprocess.DEVNULL for name in ("stdin", "stdout", "stderr")}
-        self.runner = subprocess.Popen(self.resume_command, start_new_session=True, **quiet)
+        if self.study.search.budget is None:
+            raise StudyError("the study has no budget of rollouts: give it one first")
+        # Files outlive this process, as the runner may.
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        quiet: dict[str, Any] = {name: subprocess.DEVNULL for name in ("stdin", "stdout")}
+        self.runner = subprocess.Popen(self.resume_command, start_new_session=True, stderr=self._errors, **quiet)
+
+    @property
+    def runner_failure(self) -> str:
+        """Return why the process in which `resume` has resumed the study has failed; empty if it has not."""
+        if self.runner is None or self.runner.poll() in (None, 0):
+            return ""
+        self._errors.seek(0)
+        lines = self._errors.read().strip().splitlines()
+        return f"the process that was to go on has ended: {lines[-1] if lines else f'code {self.runner.poll()}'}"
 
     async def _serve_page(self, browser: WebSocket) -> None:
         await _StudyPage(self, browser).serve()
@@ -146,7 +160,9 @@ class _StudyPage:
             "time": lambda time: view.scene.set_time(float(time)),
             "model": self._model,
             "try": self._try,
-            "add": lambda point: self._study.add(self._point(point)),
+            "give": self._give,
+            "intervene": lambda kind, payload: self._study.intervene(kind, **payload).number,
+            "remove": lambda number: self._study.remove(number),
             "run": view.resume,
         }
 
@@ -180,10 +196,7 @@ class _StudyPage:
             "type": "hello",
             "name": "study" if self._study.path is None else self._study.path.name,
             "path": "" if self._study.path is None else str(self._study.path),
-            "parameters": [
-                _described(parameter, unit)
-                for parameter, unit in zip(self._study.parameters, self._study.units, strict=True)
-            ],
+            "parameters": _described(self._study.parameters, self._study.units),
             "qualities": [
                 {"name": name, "minimize": direction == "minimize"}
                 for name, direction in zip(self._study.names, self._study.directions, strict=True)
@@ -208,19 +221,26 @@ class _StudyPage:
         return [trials, self._status()]
 
     def _status(self) -> dict[str, Any]:
-        meta, status = self._view.feed.meta, self._view.feed.status
-        budget = meta.get("budget")
+        status, view = self._view.feed.status, self._view
+        search, budget = status.search, status.search.budget
         left = None
         if budget is not None and status.rate:
             left = max(0.0, budget - status.rollouts) / status.rate
-        queue = [self._as_numbers(tuple(point.values())) for point in self._study.queue.values()]
+        names = ("state", "reason", "rollouts", "ends", "rate", "failures")
         return {
             "type": "status",
-            **asdict(status),
+            **{name: getattr(status, name) for name in names},
+            "message": status.message or view.runner_failure,
             "budget": budget,
             "left": left,
-            "solver": meta["solver"],
-            "queue": queue,
+            "parameters": _described(search.widest, self._study.units),
+            "ranges": _described(search.ranges, self._study.units),
+            "frozen": dict(search.frozen),
+            "forbidden": [[number, dict(region)] for number, region in search.forbidden.items()],
+            "solver": search.solver,
+            "aspiration": search.aspiration,
+            "paused": search.paused,
+            "interventions": [intervention.to_dict() for intervention in status.interventions[-_LISTED:]],
         }
 
     # -- commands
@@ -261,15 +281,27 @@ class _StudyPage:
             "message": "; ".join(tried.messages) or shown["message"],
         }
 
+    def _give(self, *, point: Any) -> None:
+        """Give a point to the study, with its rollouts if it was tried here."""
+        values = self._point(point)
+        simulator = self._view.simulator
+        results = simulator.results(simulator.problem.point(values)) if simulator is not None else None
+        if results is None:
+            self._study.add(values)
+        else:
+            self._study.add_results(values, results)
+
     def _model(self, *, x: str, y: str, quality: int, trial: int) -> dict[str, Any]:
         trials = list(self._view.feed.trials)
         grid = self._view.surrogate.grid(trials, str(x), str(y), quality=int(quality), at=self._trial(trial))
         return {**grid, "trials": len(trials)}
 
     def _simulator(self) -> PointSimulator:
-        if self._view.simulator is None:
+        simulator = self._view.simulator
+        if simulator is None:
             raise StudyError(f"points cannot be simulated here: {self._view.obstacle}")
-        return self._view.simulator
+        simulator.widen(self._study.parameters)
+        return simulator
 
     def _trial(self, number: int) -> Any:
         trials = self._view.feed.trials
@@ -287,11 +319,8 @@ class _StudyPage:
         return [p.options.index(p.as_value(v)) if isinstance(p, Choice) else v for p, v in pairs]
 
 
-def _described(parameter: Dimension, unit: str) -> dict[str, Any]:
-    if isinstance(parameter, Choice):
-        return {"address": parameter.address, "unit": unit, "options": [str(option) for option in parameter.options]}
-    names = ("address", "lower", "upper", "log", "integer")
-    return {"unit": unit, **{name: getattr(parameter, name) for name in names}}
+def _described(parameters: Sequence[Dimension], units: Sequence[str]) -> list[dict[str, Any]]:
+    return [{**asdict(parameter), "unit": unit} for parameter, unit in zip(parameters, units, strict=True)]
 
 
 def view_study(

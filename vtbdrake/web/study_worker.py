@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -13,6 +13,7 @@ from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.lru import LruDict
 from vtbdrake.optimization import Problem
 from vtbdrake.optimization.evaluator import Evaluator
+from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.problem import recording_motion
 from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
@@ -79,6 +80,17 @@ class PointSimulator:
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="vtbdrake points", daemon=True)
         self._thread.start()
+
+    def widen(self, parameters: Sequence[Dimension]) -> None:
+        """Take points of these ranges."""
+        if tuple(parameters) != self.problem.parameters:
+            self.problem = self.problem.with_ranges(parameters)
+
+    def results(self, point: Point) -> list[RolloutResult] | None:
+        """Return the rollouts of a point under all conditions, without their records; None if some are not there."""
+        with self._changed:
+            rollouts = [self._rollouts.use((point, k)) for k in range(len(self.problem.conditions))]
+        return None if None in rollouts else [replace(r.result, record={}) for r in rollouts if r is not None]
 
     def close(self) -> None:
         """End the worker."""

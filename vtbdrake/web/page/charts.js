@@ -31,12 +31,13 @@ export class Scale {
 
   value(unit) {
     if (this.options) return Math.min(Math.max(Math.round(this.lower + unit * (this.upper - this.lower)), 0), this.options.length - 1);
+    unit = Math.min(Math.max(unit, 0), 1);
     if (this.log) return this.lower * (this.upper / this.lower) ** unit;
     return this.lower + unit * (this.upper - this.lower);
   }
 
   ticks(count) {
-    if (this.options) return this.options.map((text, k) => [k, text]);
+    if (this.options) return this.options.map((option, k) => [k, String(option)]);
     if (this.log) {
       const places = [];
       for (let e = Math.floor(Math.log10(this.lower)); e <= Math.ceil(Math.log10(this.upper)); e++) {
@@ -56,8 +57,9 @@ export class Scale {
 
 // What the charts have in common: a canvas of the size of its place, drawn at most once per animation frame.
 class Chart {
-  constructor(id, { height, onpoint, onleave, onclick, ondrag }) {
-    Object.assign(this, { height, onpoint, onclick, ondrag });
+  // `height` is a part of the window's; `drags` tells what a drag draws at present: "box", "target" or nothing.
+  constructor(id, { height, onpoint, onleave, onclick, ondrag, drags = () => "" }) {
+    Object.assign(this, { part: height, onpoint, onclick, ondrag, drags });
     this.canvas = element("canvas", { id, className: "vtb-chart", tabIndex: 0 });
     this.draws = 0;
     this.canvas.addEventListener("pointermove", (event) => this.#move(event));
@@ -74,7 +76,7 @@ class Chart {
   #move(event) {
     if (this.pressed) {
       this.dragged = this.#place(event);
-      if (this.ondrag) this.redraw();
+      if (this.drags()) this.redraw();
       return;
     }
     const index = this.near(...this.#place(event));
@@ -93,7 +95,7 @@ class Chart {
     this.pressed = this.dragged = null;
     if (!from) return;
     if (Math.hypot(to[0] - from[0], to[1] - from[1]) < 5) this.onclick?.(this.near(...to), ...this.values(...to));
-    else this.ondrag?.(this.values(...from), this.values(...to));
+    else if (this.drags()) this.ondrag(this.values(...from), this.values(...to));
     this.redraw();
   }
 
@@ -103,6 +105,7 @@ class Chart {
       const ratio = devicePixelRatio, width = this.canvas.clientWidth;
       if (!width) return;
       this.width = width;
+      this.height = Math.max(110, Math.round(this.part * innerHeight));
       this.canvas.style.height = `${this.height}px`;
       const size = [Math.round(width * ratio), Math.round(this.height * ratio)];
       if (this.canvas.width !== size[0] || this.canvas.height !== size[1]) [this.canvas.width, this.canvas.height] = size;
@@ -177,7 +180,9 @@ export class Scatter extends Chart {
     if (best >= 0) ring(pen, this.x(x[best]), this.y(this.#height(best)), 8, BEST);
     if (this.data.pointed >= 0) ring(pen, this.x(x[this.data.pointed]), this.y(this.#height(this.data.pointed)), 7, "#cc3399");
     for (const { at, tint, shape } of marks) mark(pen, this.x(at[0]), this.y(at[1]), tint, shape);
-    if (this.pressed && this.dragged && this.ondrag) this.#box(pen, ...this.pressed, ...this.dragged);
+    const shape = this.pressed && this.dragged && this.drags();
+    if (shape === "box") this.#box(pen, ...this.pressed, ...this.dragged);
+    if (shape === "target") mark(pen, ...this.dragged, "#0b6e99", "target");
     pen.restore();
   }
 
@@ -361,6 +366,10 @@ function mark(pen, x, y, tint, shape) {
     pen.lineTo(x + 9, y);
     pen.moveTo(x, y - 9);
     pen.lineTo(x, y + 9);
+  } else if (shape === "target") {
+    pen.arc(x, y, 8, 0, 2 * Math.PI);
+    pen.moveTo(x + 3, y);
+    pen.arc(x, y, 3, 0, 2 * Math.PI);
   } else {
     pen.rect(x - 5, y - 5, 10, 10);
   }

@@ -2,12 +2,13 @@
 
 import { Parallel, Scale, Scatter, color } from "./charts.js";
 import { Connection, element, load, number } from "./common.js";
+import { Steering } from "./steering.js";
 
 const LISTED = 8; // best trials in the table
 const POINT_PERIOD = 60; // ms between two points that the pointer asks for
 const TIME_PERIOD = 50; // ms between two instants of the animation
 const MODEL_GROWTH = 1.2; // by how much the trials grow before the model is asked for again
-const TABS = ["best", "try", "failures"];
+const TABS = ["best", "try", "search", "changes", "failures"];
 
 const duration = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`);
 const short = (address) => address.split(".").slice(-2).join(".");
@@ -92,10 +93,16 @@ class Page {
       onleave: () => this.point(-1),
       onclick: (k, ...values) => this.#click(k, values),
     };
-    this.landscape = new Scatter("vtb-landscape", { ...events, height: 300 });
-    this.parallel = new Parallel("vtb-parallel", { ...events, height: 300 });
-    this.pareto = new Scatter("vtb-pareto", { ...events, height: 300 });
-    this.history = new Scatter("vtb-history-chart", { ...events, height: 150, onclick: (k) => k >= 0 && this.#pin(k) });
+    this.steering = new Steering(this);
+    this.landscape = new Scatter("vtb-landscape", {
+      ...events,
+      height: 0.32,
+      drags: () => (this.steering.forbids && this.parameters.length > 1 ? "box" : ""),
+      ondrag: (from, to) => this.steering.forbid([Number(this.xAxis.value), Number(this.yAxis.value)], from, to),
+    });
+    this.parallel = new Parallel("vtb-parallel", { ...events, height: 0.32 });
+    this.pareto = new Scatter("vtb-pareto", { ...events, height: 0.32, drags: () => "target", ondrag: (_, to) => this.steering.aim(to) });
+    this.history = new Scatter("vtb-history-chart", { ...events, height: 0.15, onclick: (k) => k >= 0 && this.#pin(k) });
     this.xAxis = choice("vtb-x", "horizontal axis", labels, 0);
     this.yAxis = choice("vtb-y", "vertical axis", labels.length > 1 ? labels : ["value"], Math.min(1, labels.length - 1));
     this.quality = choice("vtb-quality", "quality", this.qualities.map(({ name }) => name), 0);
@@ -109,11 +116,10 @@ class Page {
     this.messages = this.messages ?? element("div", { id: "vtb-messages", role: "status" });
     this.bestTable = element("table", { id: "vtb-best" });
     this.failures = element("table", { id: "vtb-failures" });
-    this.sections = { best: this.bestTable, try: this.#buildTry(), failures: this.failures };
+    this.sections = { best: this.bestTable, try: this.#buildTry(), search: this.steering.search, changes: this.steering.changes, failures: this.failures };
     this.tabs = element("nav", { className: "vtb-tabs" }, ...TABS.map((name) => element("button", { id: `vtb-tab-${name}`, onclick: () => this.openTab(name) }, name)));
     this.pointedText = element("output", { id: "vtb-pointed" });
-    this.controls = element("span", { id: "vtb-controls" });
-    this.header = element("header", { id: "vtb-head" }, element("h1", { title: this.hello.path }, this.hello.name), this.facts, this.controls);
+    this.header = element("header", { id: "vtb-head" }, element("h1", { title: this.hello.path }, this.hello.name), this.facts, this.steering.controls);
     this.selectors = element("div", { className: "vtb-row" }, this.xAxis, this.yAxis, this.qualities.length > 1 ? this.quality : "", element("label", {}, this.model, " model"));
     document.body.append(
       this.messages,
@@ -244,7 +250,7 @@ class Page {
     }
     kinds.forEach((kind, k) => {
       const value = values[0][k];
-      if (kind !== "feasible" || (this.best >= 0 && this.sign[0] * value <= this.sign[0] * values[0][this.best])) return;
+      if (kind !== "feasible" || this.steering?.excludes(this.trials.point(k)) || (this.best >= 0 && this.sign[0] * value <= this.sign[0] * values[0][this.best])) return;
       if (this.best >= 0) this.bestLine.push([k, values[0][this.best]]);
       this.bestLine.push([k, value]);
       this.best = k;
@@ -254,16 +260,21 @@ class Page {
 
   #showStatus(status) {
     this.status = status;
-    const { state, reason, message, rollouts, budget, left, rate, solver, queue } = status;
+    const { state, reason, message, rollouts, budget, left, rate, solver, paused, interventions } = status;
     const method = this.trials.methods.at(-1);
-    const states = { new: "not begun", running: "running", ended: `ended (${reason})`, died: "its process has died" };
+    const waiting = interventions.filter(({ kind, batch }) => kind === "try" && batch === null).length;
+    const states = { new: "not begun", running: paused ? "paused" : "running", ended: `ended (${reason})`, died: "its process has died" };
+    if (JSON.stringify(this.parameters) !== JSON.stringify(status.parameters)) {
+      this.parameters = status.parameters;
+      this.#draw();
+    }
     const facts = {
       state: states[state],
       rollouts: budget ? `${rollouts} of ${budget}` : `${rollouts}`,
       ...(left !== null && left !== undefined ? { left: duration(left) } : {}),
       ...(rate ? { rate: `${number(Math.round(rate * 10) / 10)} per s` } : {}),
       solver: method && method !== solver ? `${solver} (${method})` : solver,
-      ...(queue.length ? { waiting: `${queue.length} points` } : {}),
+      ...(waiting ? { waiting: `${waiting} points` } : {}),
       ...(this.best >= 0 && this.qualities.length === 1 ? { best: number(this.trials.values[0][this.best]) } : {}),
     };
     this.facts.replaceChildren(...Object.entries(facts).map(([name, text]) => element("span", { "data-fact": name, className: name === "state" ? state : "" }, element("small", {}, name), text)));
@@ -271,6 +282,7 @@ class Page {
     else this.takeBack("file");
     this.#showDeath(state);
     this.#showFailures();
+    this.steering.show(status);
     document.body.dataset.state = state;
     document.body.dataset.rollouts = rollouts;
   }
@@ -284,7 +296,7 @@ class Page {
       return;
     }
     told.append(
-      element("button", { id: "vtb-resume", onclick: () => this.do("run") }, "go on in a process of its own"),
+      element("button", { id: "vtb-resume", onclick: () => this.steering.run() }, "go on in a process of its own"),
       element("small", {}, " or: ", element("code", {}, this.hello.command)),
     );
   }
@@ -352,13 +364,17 @@ class Page {
     };
   }
 
+  redraw() {
+    this.#findBest();
+    this.#draw();
+  }
+
   #draw() {
     if (!this.hello) return;
     const quality = this.qualities.length > 1 ? Number(this.quality.value) : 0;
     const { kinds: kind, values, points } = this.trials;
     const shade = this.shades(quality);
     const common = { kind, best: this.best, pointed: this.pointed, color: (k) => color(shade(values[quality][k])) };
-    const marks = this.tried ? [{ at: null, tint: "#009e73", shape: "box" }] : [];
     if (this.view === "landscape") this.#drawLandscape(quality, shade, common);
     if (this.view === "parallel") {
       const order = kind.map((_, k) => k).sort((a, b) => (shade(values[quality][a]) || 0) - (shade(values[quality][b]) || 0));
@@ -381,7 +397,11 @@ class Page {
   }
 
   paretoMarks() {
-    return this.tried ? [{ at: this.tried.values, tint: "#009e73", shape: "box" }] : [];
+    const aim = this.status?.aspiration;
+    return [
+      ...(this.tried ? [{ at: this.tried.values, tint: "#009e73", shape: "box" }] : []),
+      ...(aim ? [{ at: aim, tint: "#0b6e99", shape: "target" }] : []),
+    ];
   }
 
   #drawLandscape(quality, shade, common) {
@@ -393,7 +413,7 @@ class Page {
     const marks = this.tried ? [{ at: [this.tried.point[x], height(this.tried.point, this.tried.values[0])], tint: "#009e73", shape: "box" }] : [];
     if (!single && this.sections.try && !this.sections.try.hidden) marks.push({ at: [this.draft[x], this.draft[y]], tint: "#1c2329", shape: "cross" });
     this.landscape.show(
-      { ...common, x: points[x] ?? [], y: (single ? values[quality] : points[y]) ?? [], grid, shade: (value) => color(shade(value), 0.55), marks, regions: this.regions?.(x, y) },
+      { ...common, x: points[x] ?? [], y: (single ? values[quality] : points[y]) ?? [], grid, shade: (value) => color(shade(value), 0.55), marks, regions: single ? [] : this.steering.regions(x, y) },
       this.scale(x),
       single ? this.valueScale(quality) : this.scale(y),
     );
@@ -538,7 +558,7 @@ class Page {
   }
 
   #give() {
-    this.ask("add", { point: this.draft })
+    this.ask("give", { point: this.draft })
       .then(() => this.say(this.status?.state === "running" ? "the study evaluates it with its next batch" : "it waits until the study goes on"))
       .catch((error) => this.say(error.message, "bad"));
   }
