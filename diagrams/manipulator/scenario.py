@@ -54,7 +54,7 @@ HAND_MAX_AGE = 0.1
 
 
 def _hand_map() -> VectorMap:
-    return vector_map("ARM_HAND", {"hand": "val"}, stamp="timestamp")
+    return vector_map("ARM_HAND", lcmt_scope, {"hand": "value"})
 
 
 def _plant() -> MultibodyPlantConfig:
@@ -153,6 +153,8 @@ class ManipulatorScenario(Scenario):
             command="hand",
             pose="dps.impl.tip_pose",
             begin={"motion": int(Motion.LED)},
+            ready={"dps.impl.motion": int(Motion.LED)},
+            stand=(-0.7, 0.0, 0.0),
             lower=(0.25, -0.5, 0.1),
             upper=(0.85, 0.5, 1.0),
         )

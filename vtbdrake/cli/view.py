@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.cli.options import Setting, option, scenario_argument, set_option, settings, start_option
+from vtbdrake.cli.options import Setting, option, parse_url, scenario_argument, set_option, settings, start_option
 from vtbdrake.cli.output import json_option
 from vtbdrake.cli.page import browser_option, page_options, serve
 
@@ -14,12 +15,23 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
 
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
 
 @click.command()
 @scenario_argument
 @set_option
 @start_option
 @page_options
+@option("--vr", "Let headsets that open the page lead the robot by a hand.", is_flag=True)
+@option(
+    "--url URL",
+    "With --vr, the LCM bus of a loop (vtbdrake run): hands lead its robot instead of the simulated one.",
+    parse=parse_url,
+)
+@option("--tls NAME", "Serve the page by https, at this name or address of this machine, to its network.")
+@option("--certificate FILE", "With --tls, a certificate (PEM); one is made if it is left out.", type=_FILE)
+@option("--key FILE", "With --certificate, its private key (PEM).", type=_FILE)
 @option("--play", "Let time run at once.", is_flag=True)
 @browser_option
 @json_option
@@ -28,19 +40,31 @@ def view(
     values: tuple[Setting, ...],
     start: Snapshot | None,
     page: dict[str, Any],
+    vr: bool,
+    url: str | None,
+    tls: str | None,
+    certificate: Path | None,
+    key: Path | None,
     play: bool,
     browser: bool,
 ) -> None:
     """Watch and steer a testbed in a web browser, until Ctrl-C.
 
-    The page is served on this machine alone, and its address has a token: who has both can steer the testbed.
+    The page is served on this machine alone, unless --tls is given, and its address has a token: who has both can steer
+    the testbed.
 
     \b
     Example:
       vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario
     """
     from vtbdrake.web import view as open_view
+    from vtbdrake.web.tls import Tls
 
+    if url and not vr:
+        raise click.UsageError("--url goes with --vr: hands lead the robot of the loop there")
+    if (certificate or key) and not tls:
+        raise click.UsageError("--certificate and --key go with --tls")
+    page |= {"vr": vr, "url": url or "", "tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
     with open_view(scenario, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()

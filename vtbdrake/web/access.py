@@ -28,7 +28,7 @@ class Access:
     Args:
         app: The application.
         port: The port of the server.
-        hosts: Host names of proxies in front of it, beside those of the loopback interface.
+        hosts: Host names (with port) under which it is reached, beside those of the loopback interface.
 
     Attributes:
         token: The token.
@@ -57,7 +57,8 @@ class Access:
             await PlainTextResponse(f"{reason}\n", status_code=403)(scope, receive, send)
         elif scope["type"] == "http" and "token" in query and scope["path"] in ("", "/"):
             response = RedirectResponse("./", status_code=303)
-            response.set_cookie(self._cookie, self.token, httponly=True, samesite="strict")
+            secure = scope["scheme"] == "https"
+            response.set_cookie(self._cookie, self.token, secure=secure, httponly=True, samesite="strict")
             await response(scope, receive, send)
         else:
             await self._app(scope, receive, send)

@@ -1,4 +1,4 @@
-"""A web server on this machine alone: Meshcat's page with a module of ours, and a socket for that module."""
+"""A web server, on this machine alone by default: Meshcat's page with a module of ours, and a socket for it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,13 +20,14 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vtbdrake.failures import one_line
 from vtbdrake.web.access import Access
 from vtbdrake.web.relay import relay
+from vtbdrake.web.tls import Tls
 
 _PAGE = Path(__file__).with_name("page")
 # How the connection to a browser, or to Meshcat, ends.
@@ -39,7 +40,7 @@ class PortError(OSError):
 
 
 class Host:
-    """Serves a page on the loopback interface, from a thread of its own.
+    """Serves a page from a thread of its own, on the loopback interface or by https on another one.
 
     Args:
         meshcat_url: The address of the Meshcat that the page shows.
@@ -48,12 +49,14 @@ class Host:
         routes: What else is served.
         port: The port; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer it.
+        tls: Where other devices reach it by https; None keeps it to this machine.
 
     Attributes:
         url: The address of the page, with its token.
 
     Raises:
         PortError: The port is taken.
+        TlsError: The certificate cannot be used, or this machine has no such address.
     """
 
     def __init__(
@@ -62,30 +65,42 @@ class Host:
         *,
         script: str,
         serve: Callable[[WebSocket], Awaitable[None]],
-        routes: Collection[Route] = (),
+        routes: Collection[BaseRoute] = (),
         port: int = 0,
         hosts: Collection[str] = (),
+        tls: Tls | None = None,
     ) -> None:
         self._meshcat_url, self._serve = meshcat_url, serve
         # Behind the last script of Meshcat's page, whose viewer it uses.
         self._script = f'<script type="module" src="page/{script}"></script>\n'
-        self._socket = _listen(port)
+        self._socket = _listen(port, *(tls.address() if tls else (socket.AF_INET, "127.0.0.1")))
         self.port = int(self._socket.getsockname()[1])
         app = Starlette(
             routes=[
-                WebSocketRoute("/session", _until_closed(self._serve_socket)),
-                WebSocketRoute("/", _until_closed(self._relay_meshcat)),
+                WebSocketRoute("/session", until_closed(self._serve_socket)),
+                WebSocketRoute("/", until_closed(self._relay_meshcat)),
                 *routes,
                 Mount("/page", StaticFiles(directory=_PAGE)),
                 Route("/", self._index),
                 Route("/{path:path}", self._asset),
             ]
         )
-        access = Access(app, port=self.port, hosts=hosts)
-        self.url = f"http://127.0.0.1:{self.port}/?token={access.token}"
+        names = [*hosts, *([f"{tls.host}:{self.port}"] if tls else [])]
+        access = Access(app, port=self.port, hosts=names)
+        self.url = (
+            f"{'https' if tls else 'http'}://{tls.host if tls else '127.0.0.1'}:{self.port}/?token={access.token}"
+        )
         config = uvicorn.Config(
             access, log_level="warning", lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=1
         )
+        with ExitStack() as stack:
+            if tls:
+                try:
+                    config.ssl_certfile, config.ssl_keyfile = stack.enter_context(tls.files())
+                except ValueError:
+                    self._socket.close()
+                    raise
+            config.load()  # It reads the certificate.
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
             target=self._server.run, kwargs={"sockets": [self._socket]}, name="vtbdrake web", daemon=True
@@ -162,25 +177,25 @@ async def first_of(*tasks: Coroutine[Any, Any, None]) -> None:
         await asyncio.gather(*running, return_exceptions=True)
 
 
-def _until_closed(serve: Callable[[WebSocket], Awaitable[None]]) -> Callable[[WebSocket], Awaitable[None]]:
+def until_closed(serve: Callable[[WebSocket], Awaitable[None]]) -> Callable[[WebSocket], Awaitable[None]]:
     """Return a handler that also ends in silence when the server ends while its browser is connected."""
 
-    async def serve_until_closed(browser: WebSocket) -> None:
+    async def serveuntil_closed(browser: WebSocket) -> None:
         with suppress(asyncio.CancelledError):
             await serve(browser)
 
-    return serve_until_closed
+    return serveuntil_closed
 
 
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+def _listen(port: int, family: socket.AddressFamily, address: str) -> socket.socket:
+    listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind(("127.0.0.1", port))
+        listener.bind((address, port))
     except (OSError, OverflowError) as error:
         listener.close()
         raise PortError(
-            f"port {port} cannot be used ({one_line(error)}): give another one, or 0 for any that is free"
+            f"port {port} cannot be used at {address} ({one_line(error)}): give another one, or 0 for any that is free"
         ) from None
     listener.listen()
     return listener

@@ -15,13 +15,15 @@ from PIL import Image
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from vtbdrake.failures import FAILURES, one_line
-from vtbdrake.web.host import Host, answer_commands, first_of, send
+from vtbdrake.web.host import Host, answer_commands, first_of, send, until_closed
 from vtbdrake.web.layers import LayerError
 from vtbdrake.web.session import Session, SessionError
+from vtbdrake.web.tls import Tls
+from vtbdrake.web.vr import VirtualReality
 
 _FRAME_PERIOD = 0.05  # s of wall time between two frames for a page
 _PATIENCE = 1.0  # s, for a frame
@@ -30,38 +32,60 @@ _ANYBODY = ("watch", "layers", "landmarks")  # commands of pages that do not ste
 
 
 class Server:
-    """Serves a session on the loopback interface, from a thread of its own.
+    """Serves a session from a thread of its own.
 
     Args:
         session: The session.
         folder: Where tests are saved.
         port: The port; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer it.
+        vr: Lets headsets that open it lead a robot; None if none may. It is closed with the server.
+        tls: Where other devices reach it by https; None keeps it to the loopback interface.
 
     Attributes:
         url: The address of the page, with its token.
 
     Raises:
         PortError: The port is taken.
+        TlsError: The certificate cannot be used, or this machine has no such address.
     """
 
-    def __init__(self, session: Session, *, folder: Path = Path(), port: int = 0, hosts: Collection[str] = ()) -> None:
-        self._session, self._folder = session, folder
+    def __init__(
+        self,
+        session: Session,
+        *,
+        folder: Path = Path(),
+        port: int = 0,
+        hosts: Collection[str] = (),
+        vr: VirtualReality | None = None,
+        tls: Tls | None = None,
+    ) -> None:
+        routes: list[BaseRoute] = [Route("/camera/{name}", self._camera_image)]
+        if vr is not None:
+            routes.append(WebSocketRoute("/vr", until_closed(vr.serve)))
+        self._session, self._folder, self._vr = session, folder, vr
         self._steering: Page | None = None
         self._pages: list[Page] = []
         self._host = Host(
             session.meshcat_url,
             script="view.js",
             serve=self._serve_page,
-            routes=[Route("/camera/{name}", self._camera_image)],
+            routes=routes,
             port=port,
             hosts=hosts,
+            tls=tls,
         )
         self.url = self._host.url
 
     def close(self) -> None:
         """End the server and all its connections."""
+        if self._vr is not None:
+            self._vr.close()  # First: the robot is released while its session still runs.
         self._host.close()
+
+    def vr_description(self) -> dict[str, Any]:
+        """Return what a page has to know of virtual reality; empty if there is none."""
+        return {} if self._vr is None else self._vr.description()
 
     async def _serve_page(self, browser: WebSocket) -> None:
         page = Page(self._session, browser, self._folder)
@@ -143,6 +167,7 @@ class Page:
             "scenario": self._session.scenario.name(),
             "variables": dict(self._session.variables),
             "bodies": list(self._session.bodies),
+            "vr": server.vr_description(),
             "quality": "" if problem is None else problem.objectives[0].name,
             "handles": [handle.description() for handle in self._session.handles.values()],
             "layers": dict(self._session.layers),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.server import Server
+    from vtbdrake.web.tls import Tls
 
 
 class View:
@@ -62,6 +64,9 @@ def view(
     folder: str | os.PathLike[str] = ".",
     port: int = 0,
     hosts: Collection[str] = (),
+    vr: bool = False,
+    url: str = "",
+    tls: Tls | None = None,
 ) -> View:
     """Run a testbed in the background, paused, with a page where it is watched and steered.
 
@@ -74,19 +79,31 @@ def view(
         folder: Where the page saves tests.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
+        vr: Let headsets that open the page lead the robot, see `Scenario.hand_command`.
+        url: With ``vr``, the LCM URL of a bus: hands lead the robot that a loop (``vtbdrake run``) controls there,
+            instead of the simulated one.
+        tls: Serve the page by https to other devices; None keeps it to this machine.
 
     Raises:
         ValueError: The testbed cannot be built, or a value cannot be set.
         PortError: The port is taken.
+        BridgeError: There is no bus.
         ModuleNotFoundError: The extra ``web`` is not installed.
     """
     for name in ("msgpack", "starlette", "uvicorn", "websockets"):
         extra_module(name, purpose="the live page", extra="web")
     from vtbdrake.web.server import Server
+    from vtbdrake.web.vr import ControlledRobot, SimulatedRobot, VirtualReality
 
+    if url and not vr:
+        raise ValueError(f"a url ({url}) needs vr=True: hands lead the robot of the loop there")
     session = Session(scenario, start=start, values=values, config=config, problem=problem)
-    try:
-        return View(session, Server(session, folder=Path(folder), port=port, hosts=hosts))
-    except BaseException:
-        session.close()
-        raise
+    with ExitStack() as stack:
+        stack.callback(session.close)
+        reality = None
+        if vr:
+            reality = VirtualReality(ControlledRobot(scenario, url) if url else SimulatedRobot(session))
+            stack.callback(reality.close)
+        opened = View(session, Server(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls))
+        stack.pop_all()
+        return opened

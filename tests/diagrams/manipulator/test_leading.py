@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
@@ -130,5 +131,6 @@ def test_scenario_declares_what_the_hand_commands() -> None:
     declared = scenario.hand_command()
     assert declared is not None and ManipulatorScenario().hand_command() is None
     declared.check_interface(scenario.interface())
+    assert [map.channel for map in protocol_of(scenario).commands] == ["ARM_MOTION", "ARM_HAND"]
     tip = Led(TESTBEDS["cartesian_impedance"]).tip.translation()
     assert np.all((tip > declared.lower) & (tip < declared.upper))

@@ -4,6 +4,7 @@ import { Connection, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
 import { Keep } from "./keep.js";
+import { VirtualReality } from "./vr.js";
 
 const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
 const WINDOW = 20; // s of simulated time in a plot
@@ -151,7 +152,7 @@ class Page {
     this.variables = {};
     this.frames = 0;
     // Each has a section of the panel in `root`, and is told of the session's messages.
-    this.parts = [new Drive(this), new Layers(this), new Keep(this)];
+    this.parts = [new Drive(this), new Layers(this), new Keep(this), new VirtualReality(this)];
     this.#build();
     this.session = new Connection({
       hello: (message) => this.#hello(message),

@@ -1,0 +1,394 @@
+"""Virtual reality: headsets that open the page of a session lead a robot by its command u."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from starlette.concurrency import run_in_threadpool
+from starlette.websockets import WebSocket
+
+from vtbdrake.control.bridge import BridgeError
+from vtbdrake.failures import one_line
+from vtbdrake.lcm.connections import LcmLink
+from vtbdrake.lcm.protocol import protocol_of
+from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
+from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.switch import COMMAND
+from vtbdrake.web.hand import HandError, HandMessage, Lead
+from vtbdrake.web.host import CLOSED, first_of, send
+from vtbdrake.web.session import Session, SessionError
+
+_TICK = 0.01  # s, between two commands while a hand leads
+_STATUS_PERIOD = 0.05  # s
+_ANSWER_TIME = 0.5  # s, for the loop to tell where its tool is
+_BURST = 100
+_FAILURES = (HandError, SessionError, BridgeError, LiveError, LiveTimeoutError, OSError)
+
+
+def hand_command_of(scenario: Scenario) -> HandCommand:
+    """Return how a hand leads the robot of a scenario, checked against its signals.
+
+    Raises:
+        ValueError: No hand leads it, or its declaration does not fit.
+    """
+    command = scenario.hand_command()
+    if command is None:
+        raise HandError(
+            f"no hand leads a {type(scenario).__name__} like this: its method hand_command() returns None; for some "
+            "scenarios, a field decides (the arm: --field led_by_hand=true)"
+        )
+    command.check_interface(scenario.interface())
+    return command
+
+
+class Robot(ABC):
+    """What a hand leads: the simulated robot of a session, or one that a loop controls.
+
+    One thread calls its methods. They raise `HandError`, or what a session or a bus raises.
+
+    Args:
+        scenario: The scenario, which declares how a hand leads its robot.
+
+    Attributes:
+        is_real: Whether a machine may move.
+        command: How it is led.
+        idle: The values of the commands u while no hand leads, by name.
+
+    Raises:
+        ValueError: No hand leads this robot.
+    """
+
+    is_real = False
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.command = command = hand_command_of(scenario)
+        names = {command.command, command.head, command.buttons}
+        self.idle = {s.name: s.default_vector() for s in scenario.interface().commands if s.name in names}
+
+    def begin(self) -> None:
+        """Let the robot follow, as soon as it can."""
+        self.send(self.command.begin)
+
+    def tool(self) -> RigidTransform:
+        """Return the pose from which the tool goes on.
+
+        Raises:
+            HandError: The robot does not follow yet.
+        """
+        values = self.read((self.command.pose, *self.command.ready))
+        for address, expected in self.command.ready.items():
+            if not np.all(values[address] == expected):
+                raise HandError(
+                    f"the robot does not follow a hand yet: {address} is {np.asarray(values[address]).tolist()}, not "
+                    f"{expected}"
+                )
+        matrix = np.asarray(values[self.command.pose], dtype=float).reshape(3, 4)
+        if not np.isfinite(matrix).all():
+            raise HandError("the pose of the tool is not finite")
+        return RigidTransform(matrix)
+
+    @abstractmethod
+    def read(self, addresses: tuple[str, ...]) -> Mapping[str, Any]:
+        """Return the present values of variables."""
+
+    @abstractmethod
+    def send(self, commands: Mapping[str, Any]) -> None:
+        """Give values of commands u, by name."""
+
+    def keep(self) -> None:  # noqa: B027 - most need nothing
+        """Keep the connection to the robot; called in each turn."""
+
+    def close(self) -> None:  # noqa: B027
+        """End the connection to the robot."""
+
+
+class SimulatedRobot(Robot):
+    """The robot of a session."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session.scenario)
+        self._session = session
+
+    def begin(self) -> None:
+        super().begin()
+        self._session.play()
+
+    def read(self, addresses: tuple[str, ...]) -> Mapping[str, Any]:
+        values = self._session.snapshot().values
+        return {address: values[address] for address in addresses}
+
+    def send(self, commands: Mapping[str, Any]) -> None:
+        self._session.write({f"{COMMAND}{name}": value for name, value in commands.items()})
+
+
+class ControlledRobot(Robot):
+    """A robot that a loop (``vtbdrake run``) controls: it receives commands u over LCM, and answers what it is asked.
+
+    Args:
+        scenario: The scenario, whose protocol has a channel for each of the commands.
+        url: The LCM URL of the bus.
+
+    Raises:
+        ValueError: The protocol has no channel for a command.
+        BridgeError: There is no bus.
+    """
+
+    is_real = True
+
+    def __init__(self, scenario: Scenario, url: str) -> None:
+        super().__init__(scenario)
+        signals = {signal.name: signal for signal in scenario.interface().commands}
+        self._encoders = {
+            name: (map.channel, map.encoder([signals[signal] for signal in map.signals]))
+            for map in protocol_of(scenario).commands
+            for name in map.signals
+        }
+        if missing := {*self.idle, *self.command.begin} - self._encoders.keys():
+            raise HandError(
+                f"the protocol of {type(scenario).__name__} has no channel for {', '.join(sorted(missing))}"
+            )
+        self._url, self._utime = url, 0
+        self._link = LcmLink(url, {}, connect_timeout=_ANSWER_TIME)
+        self._link.open()
+
+    def begin(self) -> None:
+        self.read((self.command.pose,))  # A loop that does not answer cannot be led.
+        super().begin()
+
+    def read(self, addresses: tuple[str, ...]) -> Mapping[str, Any]:
+        try:
+            with LiveClient(self._url, timeout=_ANSWER_TIME) as loop:
+                return loop.get(addresses)
+        except (BridgeError, LiveTimeoutError) as error:
+            raise HandError(
+                f"the loop does not answer at {self._url} ({one_line(error)}): start vtbdrake run"
+            ) from None
+
+    def send(self, commands: Mapping[str, Any]) -> None:
+        self._utime = max(self._utime + 1, time.time_ns() // 1000)
+        for name, value in commands.items():
+            channel, encode = self._encoders[name]
+            if not self._link.publish((channel, encode({name: np.atleast_1d(np.asarray(value, float))}, self._utime))):
+                raise HandError(f"the bus {self._url} takes no commands: is the hub running?")
+
+    def keep(self) -> None:
+        self._link.receive(0.0, _BURST)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+@dataclass(frozen=True)
+class VrStatus:
+    """What pages show of a robot that is led; the fields are those of `Lead`.
+
+    Attributes:
+        armed: Whether a hand may lead.
+        leading: Whether a clutch is closed.
+        notice: What has happened last.
+        headset: The headset that leads, or may.
+        refusals: Why the hands of other headsets do not lead.
+        sent: The number of commands that were given.
+    """
+
+    armed: bool = False
+    leading: bool = False
+    notice: str = "not armed"
+    headset: object | None = None
+    refusals: Mapping[object, str] = field(default_factory=dict)
+    sent: int = 0
+
+
+class VirtualReality:
+    """Lets headsets lead a robot, in a thread of its own, which also decides when a hand has let go.
+
+    Args:
+        robot: The robot; it is closed at the end.
+
+    Attributes:
+        status: The present status.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.status = VrStatus()
+        self._robot = robot
+        self._lead = Lead(robot.command, robot.tool)
+        self._refusals: dict[object, str] = {}
+        self._sent = 0
+        self._released = True
+        self._inbox: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="vtbdrake hand", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Release the robot, and end."""
+        self._inbox.put(None)
+        self._thread.join()
+
+    def arm(self) -> None:
+        """Let a headset lead.
+
+        Raises:
+            ValueError: The robot cannot be led.
+        """
+        self._call(self._arm)
+
+    def disarm(self) -> None:
+        """Release the robot, and let nobody lead it until it is armed again."""
+        self._call(lambda: self._lead.disarm("disarmed by hand"))
+
+    def receive(self, headset: object, message: HandMessage) -> None:
+        """Take a message of a headset."""
+        now = time.monotonic()
+        self._inbox.put(lambda: self._receive(headset, message, now))
+
+    def gone(self, headset: object) -> None:
+        """Note that the page of a headset is closed, or has left virtual reality."""
+        self._inbox.put(lambda: self._forget(headset))
+
+    def _call(self, action: Callable[[], None]) -> None:
+        future: Future[None] = Future()
+
+        def carry_out() -> None:
+            try:
+                action()
+            except (*_FAILURES, ValueError) as error:
+                future.set_exception(error)
+            else:
+                future.set_result(None)
+
+        self._inbox.put(carry_out)
+        future.result()
+
+    # -- in the thread
+
+    def _run(self) -> None:
+        try:
+            while self._take():
+                self._work()
+        finally:
+            self._lead.disarm("the server has ended")
+            self._work()
+            self._robot.close()
+
+    def _take(self) -> bool:
+        """Carry out what has arrived, after a tick at most; return whether to go on."""
+        try:
+            action = self._inbox.get(timeout=_TICK)
+            while action is not None:
+                action()
+                action = self._inbox.get_nowait()
+        except Empty:
+            return True
+        return False
+
+    def _work(self) -> None:
+        """Give the command of this instant: while a hand leads, and once when it has let go."""
+        lead = self._lead
+        try:
+            self._robot.keep()
+            command = lead.command(time.monotonic())
+            if lead.leading or not self._released:
+                self._released = False
+                self._robot.send(self._commands(command))
+                self._released = not lead.leading
+                self._sent += 1
+        except _FAILURES as error:
+            lead.disarm(one_line(error))
+        self.status = VrStatus(lead.armed, lead.leading, lead.notice, lead.headset, dict(self._refusals), self._sent)
+
+    def _commands(self, command: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return the values of the commands u."""
+        declared, commands = self._robot.command, dict(self._robot.idle)
+        if not self._lead.leading:
+            return commands
+        commands[declared.command] = command
+        if declared.head and (head := self._lead.head) is not None:
+            commands[declared.head] = np.array([*head.rotation().ToQuaternion().wxyz(), *head.translation()])
+        if declared.buttons:
+            values = commands[declared.buttons] = commands[declared.buttons].copy()
+            pressed = self._lead.buttons[: values.size]
+            values[: len(pressed)] = pressed
+        return commands
+
+    def _arm(self) -> None:
+        self._robot.begin()
+        self._lead.arm()
+
+    def _receive(self, headset: object, message: HandMessage, now: float) -> None:
+        try:
+            self._refusals[headset] = self._lead.receive(headset, message, now)
+        except _FAILURES as error:
+            self._refusals[headset] = self._lead.notice = one_line(error)
+
+    def _forget(self, headset: object) -> None:
+        self._refusals.pop(headset, None)
+        self._lead.gone(headset)
+
+    # -- pages
+
+    async def serve(self, browser: WebSocket) -> None:
+        """Serve the socket of a page: it arms and disarms, and its headset leads."""
+        await browser.accept()
+        headset = object()
+        try:
+            await first_of(self._listen(browser, headset), self._tell(browser, headset))
+        except CLOSED:
+            pass
+        finally:
+            self.gone(headset)
+            with suppress(*CLOSED):
+                await browser.close()
+
+    def description(self) -> dict[str, Any]:
+        """Return what a page has to know."""
+        command = self._robot.command
+        return {"real": self._robot.is_real, "stand": list(command.stand), "box": [[*command.lower], [*command.upper]]}
+
+    async def _listen(self, browser: WebSocket, headset: object) -> None:
+        actions: dict[str, Callable[[], None]] = {
+            "arm": self.arm,
+            "disarm": self.disarm,
+            "leave": lambda: self.gone(headset),
+        }
+        while True:
+            text = await browser.receive_text()
+            try:
+                message = json.loads(text)
+                if (name := message.get("do")) is None:
+                    self.receive(headset, HandMessage.of(message))
+                else:
+                    await run_in_threadpool(actions[name])
+            except (*_FAILURES, ValueError, LookupError, TypeError, AttributeError) as error:
+                await send(browser, {"type": "error", "error": one_line(error)})
+
+    async def _tell(self, browser: WebSocket, headset: object) -> None:
+        before: dict[str, Any] = {}
+        while True:
+            status = self.status
+            message = {
+                "type": "status",
+                "armed": status.armed,
+                "leading": status.leading,
+                "notice": status.notice,
+                "mine": status.headset is headset,
+                "refusal": status.refusals.get(headset, ""),
+                "sent": status.sent,
+            }
+            if message != before:
+                await send(browser, before := message)
+            await asyncio.sleep(_STATUS_PERIOD)
