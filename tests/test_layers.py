@@ -19,7 +19,7 @@ PACKAGE = ROOT / "vtbdrake"
 BELOW: dict[str, set[str]] = {
     "state": set(),
     "testbed": {"state"},
-    "rollout": {"state", "testbed"},
+    "rollout": {"state", "testbed", "compiled"},
     "optimization": {"state", "testbed", "rollout"},
     "reasoning": {"state", "testbed", "rollout", "optimization"},
     "control": {"state", "testbed"},

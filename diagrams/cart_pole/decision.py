@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 def cost(state: NDArray[np.float64]) -> float:
     """Return the cost of a state [x, theta, x', theta']: 0 where the pole stands still in the middle of the rail."""
     x, theta, speed, rate = state.tolist()
-    return float(1.0 + np.cos(theta) + 0.1 * x**2 + 0.01 * speed**2 + 0.01 * rate**2)
+    value: float = 1.0 + np.cos(theta) + 0.1 * x**2 + 0.01 * speed**2 + 0.01 * rate**2
+    return value
 
 
 def plan_of(scenario: CartPoleScenario, address: str) -> Trajectory:

@@ -141,7 +141,7 @@ def test_refuses_values_that_do_not_fit() -> None:
 
 def test_errors_that_are_zero_are_named_to_be_varied() -> None:
     noise = "sim.sense.joint_position.noise"
-    with pytest.raises(UnsupportedTestbedError, match="name it in parameters="):
+    with pytest.raises(ValueError, match="name it in parameters="):
         compiled(SCENARIOS["exact"])({noise: 0.1})
     batch = compiled(SCENARIOS["exact"], parameters=[noise])({noise: [0.0, 0.1], "u.plan": plans(1)[0]})
     perceived = batch.outputs["dps.env.discrete_state_0"]

@@ -63,7 +63,7 @@ def test_an_executor_or_a_pool_that_is_there_is_taken(pendulum):
 @pytest.mark.parametrize(
     ("executor", "options", "message"),
     [
-        ("gpu", {}, "one of auto, serial, threads, processes, dask, an Executor, a concurrent.*, not 'gpu'"),
+        ("gpu", {}, "one of auto, serial, threads, processes, dask, compiled, an Executor, a concurrent.*, not 'gpu'"),
         (3, {}, "a Dask Client, not 3"),
         ("serial", {"time_limit": 2.0}, "executor='serial' cannot keep a time limit of 2 s"),
         ("threads", {"time_limit": 2.0}, "executor='threads' cannot keep a time limit of 2 s"),

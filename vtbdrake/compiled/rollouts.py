@@ -187,7 +187,7 @@ class CompiledRollouts:
         def run(chunk: slice) -> tuple[Array, Array]:
             return program.run(z[chunk], None if noise is None else noise[chunk], instants)
 
-        if self._workers > 1 and len(chunks) > 1:
+        if self._workers > 1 and len(z) > _LARGEST_CHUNK:
             with ThreadPoolExecutor(self._workers) as pool:
                 results = list(pool.map(run, chunks))
         else:

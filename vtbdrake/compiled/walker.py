@@ -142,16 +142,22 @@ class Walker:
                 )
 
     def place(self, address: str) -> slice:
-        """Return where the value of a variable lies in z.
+        """Return where the value of a variable lies in z, to be varied.
 
         Raises:
             ValueError: It does not lie there, or is compiled in; the reason is named.
         """
+        entries = self._lies(address)
+        for fixed, _, reason in self.fixed:
+            if fixed.start < entries.stop and entries.start < fixed.stop:
+                raise ValueError(f"{address} cannot be varied in the compiled testbed: {reason}")
+        return entries
+
+    def _lies(self, address: str) -> slice:
         variable = self.variables[address]
-        place = variable.place
         size = int(np.prod(variable.shape, dtype=int))
-        if place is not None:
-            entries = self._entries(place, size)
+        if variable.place is not None:
+            entries = self._entries(variable.place, size)
             if entries is not None:
                 return entries
         base, _, entry = address.partition("[")
@@ -160,6 +166,14 @@ class Walker:
                 start = block.entries.start + int(entry.rstrip("]") or 0)
                 return slice(start, start + size)
         raise ValueError(f"{address} cannot be varied in the compiled testbed: {self._reason(address)}")
+
+    def can_vary(self, address: str) -> bool:
+        """Return whether a variable can be varied, see `place`."""
+        try:
+            self.place(address)
+        except ValueError:
+            return False
+        return True
 
     def is_finite(self, z: Array) -> Any:
         """Return whether all state of each z is finite, shape (n,)."""
@@ -191,7 +205,7 @@ class Walker:
         if address == "time":
             return time
         if address in self.variables:
-            return z[self.place(address)]
+            return z[self._lies(address)]
         system, port = self._port(address)
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")

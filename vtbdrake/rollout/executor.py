@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 # A thread whose rollout has not stopped after so many seconds is not waited for any more.
 GRACE = 10.0
 
-NAMES = ("auto", "serial", "threads", "processes", "dask")
+NAMES = ("auto", "serial", "threads", "processes", "dask", "compiled")
 
 
 class WorkerError(RuntimeError):
@@ -287,7 +287,7 @@ def make_executor(
     """Return the requested executor. Closing it leaves a pool or client of the user open.
 
     Args:
-        executor: ``auto``, ``serial``, ``threads``, ``processes`` or ``dask``; an Executor of ours; any
+        executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask`` or ``compiled``; an Executor of ours; any
             `concurrent.futures.Executor`; or a `distributed.Client`.
         testbed: The testbed of the rollouts; serial rollouts and threads use it.
         rollouts: The number of rollouts; a single one is run in this thread.
@@ -326,7 +326,7 @@ def make_executor(
 def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_limit: float | None) -> Executor:
     from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor
 
-    if name in ("serial", "threads") and time_limit is not None:
+    if name in ("serial", "threads", "compiled") and time_limit is not None:
         raise ValueError(
             f"executor={name!r} cannot keep a time limit of {time_limit:g} s, because a rollout in this process "
             "cannot be ended: use 'processes' or 'dask'"
@@ -337,11 +337,18 @@ def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_li
         "serial": lambda: SerialExecutor(testbed),
         "threads": lambda: ThreadExecutor(workers, testbed=testbed),
         "processes": lambda: ProcessExecutor(workers, time_limit=TIME_LIMIT if time_limit is None else time_limit),
+        "compiled": lambda: _compiled(testbed, workers),
         "dask": lambda: _dask(None, workers=workers, time_limit=time_limit),
     }
     if name not in makers:
         raise ValueError(_unknown(name))
     return makers[name]()
+
+
+def _compiled(testbed: VirtualTestbed, workers: int | None) -> Executor:
+    from vtbdrake.rollout.compiled import CompiledExecutor
+
+    return CompiledExecutor(testbed, workers=workers)
 
 
 def _dask(client: Any, *, workers: int | None, time_limit: float | None) -> Executor:

@@ -119,6 +119,10 @@ class Measure:
         if not isfinite(sample):
             raise QualityError(f"{where()} is {sample}, but it must be finite")
 
+    def accepts(self, samples: np.ndarray) -> np.ndarray:
+        """Return which samples of f are valid: finite."""
+        return np.isfinite(samples)
+
     def _at(self, values: Sequence[Any], time: float) -> str:
         arguments = ", ".join(f"{address} = {safe_text(value)}" for address, value in zip(self.of, values, strict=True))
         return f"the {self.role} function {self.name} at t = {time:g} s, {arguments},"
@@ -169,6 +173,11 @@ class Quality(Measure):
             raise QualityError(f"{where()} is {sample}, but {remedy}")
         if sample > self.upper:
             raise QualityError(f"{where()} is {sample}, more than its stated upper end of {self.upper:g}")
+
+    def accepts(self, samples: np.ndarray) -> np.ndarray:
+        """Return which samples of f are valid: finite, not negative, and at most ``upper``."""
+        valid: np.ndarray = np.isfinite(samples) & (samples >= 0.0) & (samples <= self.upper)
+        return valid
 
     def quality(self, samples: np.ndarray) -> np.ndarray:
         """Return f' >= 0, larger is better, for samples of f or of the cost."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -472,41 +473,21 @@ class _Samples:
                 )
 
     def result(self, parameters: dict[str, Any], end: str, message: str, started: float) -> RolloutResult:
-        task, f = self._runner.task, self._runner.task.quality
-        times = np.array(self._times)
-        samples = np.array(self._samples[0]) if f is not None else np.array([])
-        exceeded = exceeds(samples, task.threshold, minimize=task.minimize)
-        t_star, h, value, state = np.nan, np.nan, np.nan, None
-        measures: tuple[float, ...] = ()
-        if exceeded.any():
-            # t* = min G1, also in a rollout that runs on and fails later.
-            end = THRESHOLD
-        if times.size and end != FAILED:
-            if f is not None:
-                t_star, value = _t_star(f, times, samples, task.threshold)
-                if end == PRUNED and self._prospect is not None:
-                    value = self._prospect.reachable
-                h = float(f.quality(np.array(value)))
-                if task.keep_state:
-                    state = self._state(parameters, t_star)
-            pairs = zip(task.measures, self._samples[len(self._samples) - len(task.measures) :], strict=True)
-            measures = tuple(measure.read(times, np.array(measured)) for measure, measured in pairs)
-        return RolloutResult(
-            parameters=parameters,
+        task = self._runner.task
+        result = result_of_samples(
+            task,
+            parameters,
+            np.array(self._times),
+            [np.array(samples) for samples in self._samples],
+            {address: _stack(values) for address, values in self._record.items()},
             end=end,
             message=message,
-            t_star=t_star,
-            h=h,
-            value=value,
-            measures=measures,
-            threshold=task.f_m,
-            exceedances=times[exceeded] if f is not None else np.array([]),
-            times=times,
-            quality=f.quality(samples) if f is not None else np.array([]),
-            record={address: _stack(values) for address, values in self._record.items()},
-            state=state,
-            wall_time=time.perf_counter() - started,
+            reachable=None if self._prospect is None else self._prospect.reachable,
         )
+        state = None
+        if task.keep_state and np.isfinite(result.t_star):
+            state = self._state(parameters, result.t_star)
+        return replace(result, state=state, wall_time=time.perf_counter() - started)
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:
         runner = self._runner
@@ -516,6 +497,61 @@ class _Samples:
         if at_end:
             return runner.testbed.snapshot(runner.context)
         return runner.state(parameters, t_star, start=runner._start_context.start)
+
+
+def result_of_samples(
+    task: RolloutTask,
+    parameters: dict[str, Any],
+    times: np.ndarray,
+    samples: Sequence[np.ndarray],
+    record: Mapping[str, Any],
+    *,
+    end: str,
+    message: str = "",
+    reachable: float | None = None,
+) -> RolloutResult:
+    """Return the outcome of a rollout, equations (14) to (17), from what was sampled.
+
+    Args:
+        task: The task.
+        parameters: Address -> value that was set in s0.
+        times: The sample times from t0, in seconds, shape (n,).
+        samples: Those of f, if there is one, and of the other measures, each of shape (n,).
+        record: Address -> the recorded values.
+        end: Why it ended, if no sample has exceeded the threshold.
+        message: The reason.
+        reachable: For a pruned rollout, the best that it could still have reached.
+    """
+    f = task.quality
+    of_quality = samples[0] if f is not None else np.array([])
+    exceeded = exceeds(of_quality, task.threshold, minimize=task.minimize)
+    t_star, h, value = np.nan, np.nan, np.nan
+    measures: tuple[float, ...] = ()
+    if exceeded.any():
+        # t* = min G1, also in a rollout that runs on and fails later.
+        end = THRESHOLD
+    if times.size and end != FAILED:
+        if f is not None:
+            t_star, value = _t_star(f, times, of_quality, task.threshold)
+            if end == PRUNED and reachable is not None:
+                value = reachable
+            h = float(f.quality(np.array(value)))
+        pairs = zip(task.measures, samples[len(samples) - len(task.measures) :], strict=True)
+        measures = tuple(measure.read(times, measured) for measure, measured in pairs)
+    return RolloutResult(
+        parameters=parameters,
+        end=end,
+        message=message,
+        t_star=t_star,
+        h=h,
+        value=value,
+        measures=measures,
+        threshold=task.f_m,
+        exceedances=times[exceeded] if f is not None else np.array([]),
+        times=times,
+        quality=f.quality(of_quality) if f is not None else np.array([]),
+        record=record,
+    )
 
 
 def _copied(value: Any) -> Any:

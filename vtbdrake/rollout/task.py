@@ -70,7 +70,8 @@ class RolloutResult:
         quality: The quality trajectory f' at ``times``, equation (13), shape (n,); for a cost, 1 / (1 + cost).
         record: Address -> the recorded values at ``times``: arrays of shape (n, ...), lists for abstract ports.
         state: The state s(t*) with ``keep_state``, else None.
-        wall_time: Wall time in seconds.
+        wall_time: Wall time in seconds; of a compiled rollout, its share of the batch.
+        computed: How it was computed: ``drake``, or ``compiled`` (see `CompiledExecutor`).
     """
 
     parameters: Mapping[str, Any]
@@ -87,6 +88,7 @@ class RolloutResult:
     record: Mapping[str, Any] = field(default_factory=dict)
     state: Snapshot | None = None
     wall_time: float = nan
+    computed: str = "drake"
 
     def __repr__(self) -> str:
         values = ", ".join(f"{address}={np.asarray(v).tolist()}" for address, v in self.parameters.items())
@@ -102,7 +104,7 @@ class RolloutResult:
         return self.end == FAILED
 
     def identical(self, other: RolloutResult) -> bool:
-        """Return whether nothing but the wall time differs, to the last bit."""
+        """Return whether nothing but the wall time and the way it was computed differs, to the last bit."""
         return (
             (self.end, self.message) == (other.end, other.message)
             and self.parameters.keys() == other.parameters.keys()

@@ -1,0 +1,186 @@
+"""Rollouts in the compiled testbed: the same outcomes as in Drake."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from vtbdrake.compiled import UnsupportedTestbedError
+from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.optimization import Parameter, Problem
+from vtbdrake.reasoning import Budget
+from vtbdrake.rollout import Constraint, Cutoff, Pruning, Quality, RolloutResult, RolloutTask, SerialExecutor
+from vtbdrake.rollout.compiled import CompiledExecutor
+from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.rollout.start import Start
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+
+SCENARIO = CartPoleScenario()
+PLAN, MASS, ANGLE, NOISE = (
+    "u.plan",
+    "sim.sys.cart_pole.pole.mass",
+    "sim.sys.cart_pole.pole_pin.position",
+    "sim.sense.joint_position.noise",
+)
+
+
+def height(state: np.ndarray) -> float:
+    return 1.0 - np.cos(state[1])
+
+
+def with_branch(state: np.ndarray) -> float:
+    return float(abs(state[1])) if state[0] > -1.0 else 0.0
+
+
+def points(n: int) -> list[dict]:
+    random = np.random.default_rng(0)
+    return [{PLAN: np.append(0.0, random.uniform(-60.0, 60.0, 10)), MASS: 0.5 + 0.1 * i} for i in range(n)]
+
+
+def outcomes(task: RolloutTask, rollouts: list[dict], executor) -> list[RolloutResult]:
+    with executor:
+        return run_rollouts(executor, task, rollouts, progress=False)
+
+
+def assert_same(results: list[RolloutResult], expected: list[RolloutResult]) -> None:
+    for a, b in zip(results, expected, strict=True):
+        assert (a.end, [*a.parameters]) == (b.end, [*b.parameters])
+        np.testing.assert_allclose([a.t_star, a.h, a.value], [b.t_star, b.h, b.value], rtol=1e-11)
+        np.testing.assert_allclose(a.measures, b.measures, rtol=1e-11)
+        np.testing.assert_allclose(a.times, b.times, rtol=0, atol=0)
+        np.testing.assert_allclose(a.quality, b.quality, rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(a.exceedances, b.exceedances)
+        for address, values in b.record.items():
+            np.testing.assert_allclose(a.record[address], values, rtol=1e-11, atol=1e-11)
+
+
+QUALITIES = {
+    "integral": (Quality(height, "plant.state", reading="integral", minimize=True), None),
+    "threshold": (Quality(height, "plant.state"), 0.3),
+    "branch": (Quality(with_branch, "plant.state"), 0.4),
+    "cost": (Quality(lambda angle: 2.0 - np.sin(angle), ANGLE, minimize=True, reading="end"), None),
+}
+
+
+@pytest.mark.parametrize("name", QUALITIES)
+@pytest.mark.parametrize("run_on", [False, True])
+def test_outcomes_are_those_of_drake(name: str, run_on: bool) -> None:
+    quality, threshold = QUALITIES[name]
+    task = RolloutTask(
+        SCENARIO,
+        0.8,
+        quality,
+        threshold=threshold,
+        record=(ANGLE, "dps.force"),
+        run_on=run_on,
+        measures=(Constraint(lambda f: f[0], "dps.force", at_most=30.0),),
+    )
+    expected = outcomes(task, points(5), SerialExecutor())
+    results = outcomes(task, points(5), CompiledExecutor(compile=False))
+    assert_same(results, expected)
+    assert {result.computed for result in results} == {"compiled"}
+    assert {result.computed for result in expected} == {"drake"}
+
+
+def test_fields_of_the_scenario_are_compiled_for_themselves() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    rollouts = [{**point, "scenario.period": period} for point, period in zip(points(4), 2 * [0.02, 0.05], strict=True)]
+    assert_same(outcomes(task, rollouts, CompiledExecutor(compile=False)), outcomes(task, rollouts, SerialExecutor()))
+
+
+def test_begins_at_starts() -> None:
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    testbed.write(context, points(1)[0])
+    testbed.simulator(context).AdvanceTo(0.33)
+    start = Start.of(testbed, context)
+    task = RolloutTask(SCENARIO, 0.5, Quality(height, "plant.state"))
+    rollouts = [{PLAN: point[PLAN]} for point in points(3)]
+    with SerialExecutor() as serial, CompiledExecutor(compile=False) as compiled:
+        expected = [result for _, result in serial.run(task, rollouts, start=start)]
+        # The mass of the start is not that of s0, and was not named.
+        by_drake = [result for _, result in compiled.run(task, rollouts, start=start)]
+        compiled.prepare(task, points(1))
+        results = [result for _, result in compiled.run(task, rollouts, start=start)]
+    assert_same(by_drake, expected)
+    assert {result.computed for result in by_drake} == {"drake"}
+    assert_same(results, expected)
+    assert {result.computed for result in results} == {"compiled"}
+
+
+def test_what_diverges_is_told_by_drake() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    rollouts = [*points(2), {PLAN: points(1)[0][PLAN], ANGLE: 1e200}]
+    results = outcomes(task, rollouts, CompiledExecutor(compile=False))
+    expected = outcomes(task, rollouts, SerialExecutor())
+    assert [(result.end, result.message) for result in results] == [(e.end, e.message) for e in expected]
+    assert results[0].computed == "compiled"
+
+
+def test_errors_of_a_quality_are_those_of_drake() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(lambda state: 1.0 - state[0] - 100.0, "plant.state"), catch=True)
+    results = outcomes(task, points(1), CompiledExecutor(compile=False))
+    assert results[0].message == outcomes(task, points(1), SerialExecutor())[0].message
+    assert "must be finite" in results[0].message or "not negative" in results[0].message
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [({"keep_state": True}, "keep_state="), ({"pruning": Pruning()}, "pruning=")],
+)
+def test_refuses_what_it_cannot_do(options: dict, reason: str) -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"), **options)
+    with pytest.raises(ValueError, match=reason):
+        outcomes(task, points(1), CompiledExecutor())
+
+
+def test_refuses_a_world_with_contact() -> None:
+    task = RolloutTask(SpaceClimberScenario(), 0.4)
+    with pytest.raises(UnsupportedTestbedError, match="the testbed cannot be compiled: "):
+        outcomes(task, [{}], CompiledExecutor())
+
+
+def test_a_deadline_that_has_passed_compiles_and_runs_nothing() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    with CompiledExecutor(compile=False) as executor:
+        assert list(executor.run(task, points(2), cutoff=Cutoff(deadline=-inf))) == []
+
+
+def test_a_sweep_over_noise_is_the_same() -> None:
+    scenario = replace(SCENARIO, position_errors=ErrorModel(seed=3))
+    problem = Problem(
+        scenario=scenario,
+        parameters=[Parameter(NOISE, 0.0, 0.1)],
+        quality=Quality(lambda x: x[0] ** 2, "dps.env.discrete_state_0", reading="integral"),
+        horizon=0.5,
+    )
+    expected = problem.sweep(4, executor="serial", progress=False)
+    result = problem.sweep(4, executor="compiled", progress=False)
+    assert_same(list(result.rollouts), list(expected.rollouts))
+    assert {rollout.computed for rollout in result.rollouts} == {"compiled"}
+
+
+def test_decisions_are_the_same() -> None:
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(0.2)
+    decisions = []
+    for executor in ("serial", "compiled"):
+        with make_reasoner(SCENARIO, rollouts=16, executor=executor) as reasoner:
+            decisions.append(reasoner.decide(testbed, context))
+    assert decisions[0].chosen == decisions[1].chosen
+    assert decisions[0].quality == pytest.approx(decisions[1].quality, rel=1e-11)
+    computed = {r.computed for candidate in decisions[1].candidates for r in candidate.rollouts}
+    assert computed == {"compiled"}
+
+
+def test_a_decision_within_wall_time() -> None:
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    with make_reasoner(SCENARIO, executor="compiled", budget=Budget(rollouts=20, seconds=60.0)) as reasoner:
+        assert reasoner.decide(testbed, context).health.rollouts == 20

@@ -1,0 +1,256 @@
+"""Rollouts in the compiled testbed: many in one call, without Drake and without Python."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import casadi
+import numpy as np
+
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.compiled.trace import traced
+from vtbdrake.lru import LruDict
+from vtbdrake.rollout.executor import Executor, Parameters, checked_workers
+from vtbdrake.rollout.pruning import Cutoff
+from vtbdrake.rollout.quality import Measure, QualityError, exceeds
+from vtbdrake.rollout.runner import CancelledError, result_of_samples, values_key
+from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
+from vtbdrake.rollout.task import HORIZON, RolloutResult, RolloutTask
+from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds, split
+from vtbdrake.state.variables import A
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.interrupt import Interruptible
+
+_log = logging.getLogger(__name__)
+
+COMPILED = "compiled"
+
+
+class CompiledExecutor(Executor):
+    """Rollouts of the compiled testbed, equal to Drake's to about 1e-15; see `VirtualTestbed.compiled`.
+
+    The testbed is compiled for a task at the first rollout, and compared with Drake's then; machine code is kept for
+    the next time. Qualities that work with CasADi's numbers (sums, products, numpy's functions; no branches) are
+    compiled, too; others get the recorded samples. A rollout that the compiled testbed cannot make (a joint reaches its
+    stop, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was made.
+
+    Args:
+        testbed: A testbed to use for tasks of its scenario; others are built.
+        workers: Number of threads; by default the number of cores.
+        max_testbeds: Number of testbeds that are kept, for points with different scenario fields.
+        compile: Whether to make machine code; None: if there is a C compiler.
+    """
+
+    def __init__(
+        self,
+        testbed: VirtualTestbed | None = None,
+        *,
+        workers: int | None = None,
+        max_testbeds: int = MAX_TESTBEDS,
+        compile: bool | None = None,
+    ) -> None:
+        self._testbeds = Testbeds(testbed, max_testbeds=max_testbeds)
+        self._runners = Runners(self._testbeds)
+        self._workers = checked_workers(workers)
+        self._compile = compile
+        self._compiled: LruDict[Hashable, _CompiledTask] = LruDict(max_testbeds)
+
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        """Run one rollout per point; see `Executor.run`.
+
+        Raises:
+            UnsupportedTestbedError: The testbed cannot be compiled, or a varied variable is compiled in.
+            CompiledDifferenceError: The compiled testbed differs from Drake's.
+            ValueError: The task needs what compiled rollouts cannot do: pruning, a recorded motion, states.
+        """
+        starts = start_of_each(start, len(points))
+        by_fields: dict[Hashable, list[int]] = {}
+        for index, point in enumerate(points):
+            by_fields.setdefault(values_key(split(point)[0]), []).append(index)
+        with Interruptible() as interruptible:
+            for indices in by_fields.values():
+                of_fields = [points[i] for i in indices]
+                compiled = self._of(task, of_fields)
+                if cutoff is not None and cutoff.is_over:
+                    return
+                results = compiled.run(of_fields, [starts[i] for i in indices])
+                for i, result in zip(indices, results, strict=True):
+                    interruptible.raise_interrupt()
+                    if result is None:
+                        try:
+                            result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
+                        except CancelledError:
+                            return
+                    yield i, result
+
+    def close(self) -> None:
+        self._compiled.clear()
+        self._runners.clear()
+
+    def prepare(self, task: RolloutTask, points: Sequence[Parameters]) -> None:
+        """Compile the testbed of a task, for points like these; the errors are those of `run`."""
+        self._of(task, points)
+
+    def _of(self, task: RolloutTask, points: Sequence[Parameters]) -> _CompiledTask:
+        fields, _ = split(points[0])
+        key = (id(task), values_key(fields))
+        addresses = frozenset(address for point in points for address in split(point)[1])
+        compiled = self._compiled.use(key)
+        if compiled is None or not compiled.varies(addresses):
+            if compiled is not None:
+                addresses |= compiled.addresses
+            testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
+            compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
+            self._compiled.add(key, compiled)
+        return compiled
+
+
+class _CompiledTask:
+    """A task on the compiled testbed of one choice of scenario fields.
+
+    Attributes:
+        addresses: The variables that can be varied.
+    """
+
+    def __init__(
+        self,
+        task: RolloutTask,
+        testbed: VirtualTestbed,
+        addresses: frozenset[str],
+        *,
+        workers: int,
+        compile: bool | None,
+    ) -> None:
+        refused = {
+            "pruning": task.pruning is not None,
+            "motion": task.motion is not None,
+            "keep_state": task.keep_state,
+        }
+        for name, present in refused.items():
+            if present:
+                raise ValueError(
+                    f"compiled rollouts cannot do what {name}= asks for: leave it out, or use another executor"
+                )
+        self._task, self._testbed = task, testbed
+        self.addresses = addresses
+        s0 = testbed.default_context()
+        if task.start is not None:
+            testbed.restore(s0, task.start)
+            testbed.switch(s0, "sim")
+        self._measures: list[Measure] = [*([task.quality] if task.quality else []), *task.measures]
+        functions: dict[str, tuple[casadi.Function, Sequence[str]]] = {}
+        for k, measure in enumerate(self._measures):
+            function = traced(measure.f, [testbed.read(s0, address) for address in measure.of])
+            if function is not None:
+                functions[f"measure {k}"] = function, measure.of
+        self._traced = tuple(functions)
+        sampled = [a for k, m in enumerate(self._measures) if f"measure {k}" not in functions for a in m.of]
+        variables = testbed.variables()
+        # The state can be set anyway; masses and the like only if they are named.
+        believed = [rule.target for rule in testbed.belief_rules if variables[rule.target].kind == A]
+        self._rollouts = CompiledRollouts(
+            testbed.diagram,
+            variables,
+            s0,
+            horizon=task.horizon,
+            sample_period=task.sample_period,
+            parameters=list(dict.fromkeys([*addresses, *believed])),
+            outputs=list(dict.fromkeys([*task.record, *sampled])),
+            measures=functions,
+            timings=testbed.event_timings(),
+            compile=compile,
+            workers=workers,
+        )
+        self._start_context = StartContext(testbed, s0, testbed.copier_from(testbed))
+        self._last_start: tuple[Start | None, np.ndarray, float] | None = None
+
+    def varies(self, addresses: frozenset[str]) -> bool:
+        """Return whether variables can be varied without compiling again."""
+        return all(self._rollouts.walker.can_vary(address) for address in addresses)
+
+    def run(self, points: Sequence[Parameters], starts: Sequence[Start | None]) -> list[RolloutResult | None]:
+        """Return the results of the points; None for those that only Drake can make."""
+        begun = time.perf_counter()
+        results: list[RolloutResult | None] = [None] * len(points)
+        by_start: dict[tuple[int, tuple[str, ...]], list[int]] = {}
+        for i, (point, start) in enumerate(zip(points, starts, strict=True)):
+            by_start.setdefault((id(start), tuple(split(point)[1])), []).append(i)
+        rows: dict[float, list[tuple[list[int], np.ndarray]]] = {}
+        for (_, addresses), indices in by_start.items():
+            try:
+                z, t0 = self._begin(starts[indices[0]])
+                values = {address: np.array([points[i][address] for i in indices]) for address in addresses}
+                filled = self._rollouts.filled(z, values)
+            except StartError:
+                raise
+            except (UnsupportedTestbedError, ValueError) as error:
+                _log.warning("%d rollouts are simulated in Drake: %s", len(indices), error)
+                continue
+            rows.setdefault(t0, []).append((indices, np.broadcast_to(filled, (len(indices), filled.shape[1]))))
+        for t0, parts in rows.items():
+            batch = self._rollouts.from_z(np.concatenate([part for _, part in parts]), t0)
+            order = [i for indices, _ in parts for i in indices]
+            share = (time.perf_counter() - begun) / len(points)
+            for row, i in enumerate(order):
+                if batch.valid[row]:
+                    results[i] = self._result(points[i], {a: v[row] for a, v in batch.outputs.items()}, share)
+        return results
+
+    def _begin(self, start: Start | None) -> tuple[np.ndarray, float]:
+        if self._last_start is None or self._last_start[0] is not start:
+            self._start_context.set(start)
+            context = self._start_context.context
+            self._last_start = start, self._rollouts.z_of(context), context.get_time()
+        return self._last_start[1:]
+
+    def _result(self, point: Parameters, outputs: Mapping[str, np.ndarray], wall_time: float) -> RolloutResult | None:
+        """Return the result of a rollout from what was recorded; None if f fails, so that Drake tells how."""
+        task, times = self._task, self._rollouts.times
+        count, samples = len(times), []
+        try:
+            for k, measure in enumerate(self._measures):
+                sampled = self._samples(k, measure, outputs, count)
+                if k == 0 and task.quality is not None and task.threshold is not None and not task.run_on:
+                    exceeding = np.flatnonzero(exceeds(sampled, task.threshold, minimize=task.minimize))
+                    count = int(exceeding[0]) + 1 if exceeding.size else count
+                samples.append(sampled)
+        except QualityError:
+            return None
+        samples = [sampled[:count] for sampled in samples]
+        record = {address: outputs[address][:count] for address in task.record}
+        result = result_of_samples(task, dict(point), times[:count], samples, record, end=HORIZON)
+        if not np.isfinite([*result.measures, *([result.value] if task.quality is not None else [])]).all():
+            return None
+        return replace(result, wall_time=wall_time, computed=COMPILED)
+
+    def _samples(self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+        """Return the samples of a measure, shape (count,) or more; after ``count`` they do not matter."""
+        times = self._rollouts.times
+        if f"measure {k}" in self._traced:
+            sampled = outputs[f"measure {k}"]
+            for i in np.flatnonzero(~measure.accepts(sampled))[:1].tolist():
+                raise QualityError(f"{measure.name} is {sampled[i]} at t = {times[i]:g} s")
+            return sampled
+        values = [outputs[address] for address in measure.of]
+        samples = []
+        for i, t in enumerate(times[:count].tolist()):
+            samples.append(measure([_value(value[i]) for value in values], time=t))
+            if k == 0 and measure is self._task.quality and self._exceeds(samples[-1]):
+                break
+        return np.array(samples)
+
+    def _exceeds(self, sample: float) -> bool:
+        task = self._task
+        if task.threshold is None or task.run_on:
+            return False
+        return bool(exceeds(np.array(sample), task.threshold, minimize=task.minimize))
+
+
+def _value(value: np.ndarray) -> float | np.ndarray:
+    # f may write into its arguments.
+    return value.copy() if value.shape else float(value)
