@@ -224,6 +224,6 @@ def test_view_in_a_notebook_is_steered_while_its_kernel_computes(empty_page: Pag
 
 
 def test_page_without_a_picture_has_its_text_only() -> None:
-    bundle = page_bundle("http://127.0.0.1:1234/?token=abc", text="<a study>")
+    bundle = page_bundle("http://127.0.0.1:1234/?token=abc", {"text/plain": "<a study>"})
     assert bundle.keys() == {"text/plain", "text/html"}
     assert bundle["text/html"].startswith("<div>&lt;a study&gt;<script>")

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Page
 from tests.chromium import PATIENCE, needs_chromium, screenshot
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
+from vtbdrake.state import Snapshot
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
@@ -207,6 +208,28 @@ def test_page_of_another_origin_cannot_use_the_server(page: Page, running: View,
     assert [hostile.evaluate(closed, path) for path in ("", "session")] == ["refused", "refused"]
     assert page.evaluate(closed, "session") == "open"
     hostile.close()
+
+
+def test_saved_snapshot_opens_with_the_same_camera(page: Page, running: View, browser: Browser, tmp_path: Path) -> None:
+    page.click("#vtb-step")
+    drawn(page, "vtb.clock.textContent === '0.008 s'")
+    page.evaluate("viewer.camera.position.set(0.9, 1.1, 1.3); viewer.controls.target.set(0.1, 0.2, -0.3)")
+    page.click("#vtb-keep summary")
+    with page.expect_download() as downloads:
+        page.click("#vtb-save")
+    assert downloads.value.suggested_filename == "CartPoleScenario-0.008s.vtb"
+    downloads.value.save_as(tmp_path / "saved.vtb")
+    snapshot = Snapshot.load(tmp_path / "saved.vtb")
+    assert snapshot == running.session.snapshot()
+    with view(CartPoleScenario(), start=snapshot) as again:
+        second = browser.new_page()
+        second.set_default_timeout(PATIENCE)
+        second.goto(again.url)
+        drawn(second, "Math.abs(viewer.camera.position.x - 0.9) < 1e-6 && viewer.controls.target.x === 0.1")
+        camera = "[...viewer.camera.position.toArray(), ...viewer.controls.target.toArray()]"
+        np.testing.assert_allclose(second.evaluate(camera), page.evaluate(camera), atol=1e-6)
+        assert again.session.snapshot() == snapshot
+        second.close()
 
 
 def test_closed_session_is_told(page: Page, running: View) -> None:

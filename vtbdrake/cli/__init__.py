@@ -35,6 +35,7 @@ _COMMANDS = {
     "hub": "hub:hub",
     "machine": "machine:machine",
     "new": "new:new",
+    "open": "open:open_",
     "replay": "log:replay",
     "reset": "live:reset",
     "rollout": "testbed:rollout",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from math import isinf
 from typing import Any
@@ -14,10 +13,8 @@ from vtbdrake.optimization.risk import RISKS, CVaR, Quantile, Risk
 from vtbdrake.rollout import Constraint, Quality, RecordedMotion
 from vtbdrake.rollout.named_function import is_named, named_function
 from vtbdrake.testbed import ScenarioError
-from vtbdrake.testbed.scenario_file import scenario_of_text, scenario_text
+from vtbdrake.testbed.scenario_file import is_trusted, scenario_of_text, scenario_text
 
-# Packages that are imported because a file names them: they are installed beside this module.
-_OWN = ("vtbdrake", "vtbdrake_diagrams", "builtins", "math", "numpy")
 _LEVELS: Mapping[str, Callable[[float], Risk]] = {"Quantile": Quantile, "CVaR": CVaR}
 _LEVEL = re.compile(r"(\w+)\(level=([^)]*)\)")
 
@@ -78,9 +75,7 @@ def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Probl
 
 def _refuse_strangers(names: Sequence[str], trusted: Sequence[str]) -> None:
     for name in names:
-        module = name.partition(":")[0]
-        imported = module in sys.modules and module != "__main__"
-        if not imported and not any(module == t or module.startswith(f"{t}.") for t in (*_OWN, *trusted)):
+        if not is_trusted(name, trusted=trusted):
             raise StatementError(
                 f"the file names {name}, and importing its module runs its code: name the module, if you trust it"
             )

@@ -32,15 +32,18 @@ class Snapshot:
         values: The addressed variables (derived ones left out), by address.
         groups: Every numeric group and, through its codec, every abstract state of every leaf system, under
             ``path/group/index`` and ``path/abstract/index/name``.
+        notes: Plain data, as JSON has it, that is no part of the state, such as the ``camera.position`` of the page
+            that has saved it.
 
-    Two snapshots are equal if all attributes are, where NaN equals NaN. Arrays are read only. The contact results of a
-    discrete plant's last step are not part of a snapshot: Python cannot read them.
+    Two snapshots are equal if all attributes but the notes are, where NaN equals NaN. Arrays are read only. The contact
+    results of a discrete plant's last step are not part of a snapshot: Python cannot read them.
     """
 
     time: float
     values: Mapping[str, np.ndarray]
     groups: Mapping[str, np.ndarray]
     scenario: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("values", "groups"):
@@ -50,7 +53,7 @@ class Snapshot:
             object.__setattr__(self, name, MappingProxyType(arrays))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Snapshot, (self.time, dict(self.values), dict(self.groups), dict(self.scenario))
+        return Snapshot, (self.time, dict(self.values), dict(self.groups), dict(self.scenario), dict(self.notes))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Snapshot):
@@ -103,7 +106,9 @@ class Snapshot:
     def _parts(self) -> dict[str, Any]:
         arrays = {f"values/{key}": value for key, value in self.values.items()}
         arrays |= {f"groups/{key}": value for key, value in self.groups.items()}
-        return {"header": {"time": self.time, "scenario": dict(check_plain(self.scenario))}, "arrays": arrays}
+        header = {"time": self.time, "scenario": dict(check_plain(self.scenario))}
+        header |= {"notes": dict(self.notes)} if self.notes else {}
+        return {"header": header, "arrays": arrays}
 
     @classmethod
     def load(cls, source: str | os.PathLike[str] | bytes) -> Snapshot:
@@ -122,7 +127,7 @@ class Snapshot:
             parts[part][key] = array
         if not isinstance(header["scenario"], dict):
             raise ValueError(f"its scenario is {header['scenario']!r}")
-        return cls(float(header["time"]), parts["values"], parts["groups"], header["scenario"])
+        return cls(float(header["time"]), parts["values"], parts["groups"], header["scenario"], header.get("notes", {}))
 
 
 def _largest_difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from inspect import isabstract
 from pathlib import Path
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
 _MOST_NODES = 100_000
+# Packages that are imported because a file names them: they are installed beside this module.
+_OWN = ("vtbdrake", "vtbdrake_diagrams", "builtins", "math", "numpy")
 # What lies below the key in a file.
 _PEDIGREE = re.compile(r"^  pedigree:\n(?:    .*\n)*", re.MULTILINE)
 
@@ -163,6 +165,51 @@ def scenario_class(name: str) -> type[Scenario]:
 def is_imported(name: str) -> bool:
     """Return whether the module of the scenario ``package.module:Class`` is imported in this process."""
     return name.partition(":")[0] in sys.modules
+
+
+def is_trusted(name: str, *, trusted: Sequence[str] = ()) -> bool:
+    """Return whether the module of ``package.module:name`` may be imported because a file names it.
+
+    Importing a module runs its code. So it must be imported already, or one of vtbdrake's or of those in ``trusted``,
+    which are modules, or packages of them.
+    """
+    module = name.partition(":")[0]
+    if module in sys.modules and module != "__main__":
+        return True
+    return any(module == each or module.startswith(f"{each}.") for each in (*_OWN, *trusted))
+
+
+def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> Scenario:
+    """Return the scenario of a `Scenario.record`, such as that of a snapshot.
+
+    Args:
+        record: The record.
+        base: A scenario of the same class, in which fields of plain types are set; that with the defaults if left out.
+
+    Raises:
+        ScenarioError: The class is not vtbdrake's, nor imported already, or the record has a value that cannot be set.
+    """
+    name = str(record.get("scenario", ""))
+    if base is None:
+        if not is_trusted(name):
+            raise ScenarioError(
+                f"it is of {name or 'a bare Diagram'}, and importing a module runs its code: name the "
+                "scenario, if you trust it"
+            )
+        base = load_scenario(name)
+    elif base.name() != name:
+        raise ScenarioError(f"the record is not that of {base.name()}, but of {name or 'a bare Diagram'}")
+    present = base.record()
+    fields_by_key = {key: field for field, key in FILE_KEYS.items()}
+    changed = {}
+    for key, value in record.items():
+        if key != "scenario" and present.get(key) != value:
+            head, dot, rest = key.partition(".")
+            changed[f"{fields_by_key.get(head, head)}{dot}{rest}"] = value
+    scenario = base.with_fields(changed)
+    if scenario.record() != dict(record):
+        raise ScenarioError(f"the record is not that of {name} with today's code: name the scenario with its file")
+    return scenario
 
 
 def compose_yaml(

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+if TYPE_CHECKING:
+    from vtbdrake.state import Snapshot
+
 FIELD_OF_VIEW = np.deg2rad(75.0)
 """The vertical field of view of Meshcat's camera."""
 
+# Keys of the notes of a snapshot.
+_NOTES = ("camera.position", "camera.target")
 # Points from the target to the camera: from the front at the right, and above.
 _DIRECTION = np.array([0.64, -0.68, 0.36]) / np.linalg.norm([0.64, -0.68, 0.36])
 
@@ -37,6 +43,11 @@ class Camera:
             )
 
     @property
+    def notes(self) -> dict[str, Any]:
+        """Return what a snapshot notes of this camera, see `camera_of`."""
+        return dict(zip(_NOTES, (list(self.position), list(self.target)), strict=True))
+
+    @property
     def pose(self) -> RigidTransform:
         """Return X_WC; the camera looks along its z axis, and its y axis points down in the image."""
         position, target = np.array(self.position), np.array(self.target)
@@ -44,6 +55,21 @@ class Camera:
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         return RigidTransform(RotationMatrix(np.column_stack([right, np.cross(forward, right), forward])), position)
+
+
+def camera_of(snapshot: Snapshot) -> Camera | None:
+    """Return the camera of the page that has saved a snapshot; None if none is noted.
+
+    Raises:
+        ValueError: The note is not a camera.
+    """
+    position, target = (snapshot.notes.get(key) for key in _NOTES)
+    if position is None and target is None:
+        return None
+    try:
+        return Camera(tuple(position or ()), tuple(target or ()))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the snapshot notes a camera at {position!r} towards {target!r}: {error}") from error
 
 
 def fitting_camera(points_W: NDArray[np.float64], *, margin: float = 1.15, aspect: float = 4.0 / 3.0) -> Camera:

@@ -14,9 +14,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
-from vtbdrake.components.rendering import RenderingError
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.visualization.camera import fitting_camera
+from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.still import Still
 
 if TYPE_CHECKING:
@@ -125,11 +124,12 @@ class Drawing:
             self._boxes = [(frame, _boxes(query.inspector(), frame)) for frame, _ in self._frames]
         return np.hstack([np.empty((3, 0)), *(query.GetPoseInWorld(frame) @ box for frame, box in self._boxes)])
 
-    def fit_camera(self, context: Context) -> None:
-        """Move the camera so that what moves is in view, with room around it."""
+    def fit_camera(self, context: Context, camera: Camera | None = None) -> None:
+        """Move the camera so that what moves is in view, with room around it; or to a camera."""
         corners = self.corners(context)
-        if corners.size:
+        if camera is None and corners.size:
             camera = fitting_camera(corners, margin=_ROOM, aspect=_ASPECT)
+        if camera is not None:
             self._meshcat.SetCameraPose(camera.position, camera.target)
 
     def add_to(
@@ -162,20 +162,14 @@ class Drawing:
                 Rgba(color.r(), color.g(), color.b(), color.a() * (opacity if moves else 1.0)),
             )
 
-    def picture(self, context: Context) -> bytes | None:
-        """Return what is drawn in the poses of a context as PNG.
-
-        None: nothing in it moves, its state is not finite, or this machine cannot render.
-        """
+    def still(self, context: Context, camera: Camera | None = None) -> Still:
+        """Return a picture of what is drawn in the poses of a context, by default of all that moves."""
         corners = self.corners(context)
-        if not corners.size or not np.isfinite(corners).all():
-            return None
-        still = Still(fitting_camera(corners))
+        if camera is None and corners.size and np.isfinite(corners).all():
+            camera = fitting_camera(corners)
+        still = Still(camera)
         self.add_to(still, context)
-        try:
-            return still.png()
-        except RenderingError:
-            return None
+        return still
 
     def delete(self) -> None:
         """Remove it from the scene."""

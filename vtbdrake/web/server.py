@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import io
 import re
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.visualization.camera import Camera
 from vtbdrake.web.host import Host, answer_commands, first_of, send, until_closed
 from vtbdrake.web.layers import LayerError
 from vtbdrake.web.session import Session, SessionError
@@ -28,7 +30,7 @@ from vtbdrake.web.vr import VirtualReality
 _FRAME_PERIOD = 0.05  # s of wall time between two frames for a page
 _PATIENCE = 1.0  # s, for a frame
 _JPEG_QUALITY = 80
-_ANYBODY = ("watch", "layers", "landmarks")  # commands of pages that do not steer
+_ANYBODY = ("watch", "layers", "landmarks", "snapshot")  # commands of pages that do not steer
 
 
 class Server:
@@ -151,6 +153,7 @@ class Page:
             "cancel_preview": lambda _: session.cancel_preview(),
             "cancel_comparison": lambda _: session.cancel_comparison(),
             "watch": self._watch,
+            "snapshot": self._snapshot,
             "drive": self._drive,
             "deflect": lambda message: session.deflect(message["deflections"]),
             "end_drive": self._end_drive,
@@ -199,6 +202,12 @@ class Page:
         if name not in _ANYBODY and not server.steers(self):
             raise SessionError("another page steers this session: take over first")
         return await run_in_threadpool(self._commands[name], message)
+
+    def _snapshot(self, message: Mapping[str, Any]) -> str:
+        """Return a file with the present and the camera of the page, in base64."""
+        camera = Camera(tuple(message["position"]), tuple(message["target"]))
+        noted = replace(self._session.snapshot(), notes=camera.notes)
+        return base64.b64encode(noted.to_bytes()).decode()
 
     def _drive(self, message: Mapping[str, Any]) -> bool:
         compare = bool(message.get("compare", False))

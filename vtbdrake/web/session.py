@@ -24,6 +24,7 @@ from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.rollout.course import task_without_problem
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.camera import camera_of
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
 from vtbdrake.web.drive import Driven, Driver, Handle, handles
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from vtbdrake.rollout.course import Course
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
+    from vtbdrake.visualization.still import Still
 
 _Result = TypeVar("_Result")
 
@@ -192,7 +194,7 @@ class Session:
 
     Args:
         scenario: The scenario whose testbed is simulated.
-        start: A snapshot to start from; s0 if left out.
+        start: A snapshot to start from, seen from the camera that it notes; s0 if left out.
         values: Variables that are set first, by address.
         config: How it runs.
         problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
@@ -409,9 +411,9 @@ class Session:
         """Return s(t) of the present."""
         return self._do(lambda: self._testbed.snapshot(self._context))
 
-    def picture(self) -> bytes | None:
-        """Return how the testbed looks now, as PNG; None if it has no geometry, or this machine cannot render."""
-        return self._do(lambda: None if self._drawing is None else self._drawing.picture(self._context))
+    def still(self) -> Still | None:
+        """Return a picture of how the testbed looks now; None if it has no geometry."""
+        return self._do(lambda: None if self._drawing is None else self._drawing.still(self._context))
 
     def wait_for_frame(self, after: int, timeout: float) -> Frame | None:
         """Return the first frame with a number above ``after``, or None if it does not come in time."""
@@ -467,7 +469,7 @@ class Session:
         size = 0.0
         if self._testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
-            self._drawing.fit_camera(self._context)
+            self._drawing.fit_camera(self._context, None if self._start is None else camera_of(self._start))
             self.bodies = self._drawing.places
             corners = self._drawing.corners(self._context)
             size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0

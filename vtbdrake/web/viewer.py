@@ -36,11 +36,12 @@ class View:
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
         """Show the page in a notebook, and how the testbed looks now where there is no kernel."""
+        from vtbdrake.visualization.meshcat import picture_bundle
         from vtbdrake.web.notebook import page_bundle
 
         # The address has the token of this run, and is not for those who read a stored notebook.
         text = f"<View of {self.session.scenario.name()}>"
-        return page_bundle(self.url, text=text, picture=self.session.picture())
+        return page_bundle(self.url, picture_bundle(text, self.session.still()))
 
     def __enter__(self) -> View:
         return self
