@@ -114,7 +114,9 @@ def test_study_has_its_points(tmp_path: Path) -> None:
     begin = (PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--quality", ANGLE, "--sample-period", 0.1)
     ran = result("study", "run", file, *begin, "--rollouts", 4, "--executor", "serial", "--solver", "sobol")
     assert ran["reason"] in ("budget", "solver") and len(ran["points"][ANGLE]) == 4
-    assert result("study", "add", file, f"{ANGLE}=0.5") == {"waiting": {"1": {ANGLE: 0.5}}}
+    tried = result("study", "try", file, f"{ANGLE}=0.5", "--by", "me")
+    assert (tried["number"], tried["name"], tried["payload"]) == (1, "me", {"point": {ANGLE: 0.5}})
+    assert result("study", "history", file) == [tried]
     assert result("study", "attribute", file, "operator=me") == {"operator": "me"}
     shown = result("study", "show", file)
     assert shown["waiting"] == {"1": {ANGLE: 0.5}} and shown["attributes"] == {"operator": "me"}

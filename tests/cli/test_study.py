@@ -1,5 +1,6 @@
 """``vtbdrake study``: what it records is what the library finds."""
 
+import json
 import math
 from pathlib import Path
 
@@ -30,10 +31,10 @@ def test_a_study_is_run_shown_given_points_and_resumed(tmp_path: Path) -> None:
     assert f"best: magnitude = {expected.best.value:g} at" in begun.stdout
 
     for arguments in (
-        ["add", file, f"{ANGLE}=0.5", f"{RATE}=1"],
-        ["add", file, f"{ANGLE}=0.25", f"{RATE}=0"],
+        ["try", file, f"{ANGLE}=0.5", f"{RATE}=1"],
+        ["try", file, f"{ANGLE}=0.25", f"{RATE}=0"],
         ["edit", file, 1, f"{RATE}=2", f"{ANGLE}=-0.5"],
-        ["add", file, f"{ANGLE}=1", f"{RATE}=1"],
+        ["try", file, f"{ANGLE}=1", f"{RATE}=1"],
         ["remove", file, 3],
         ["attribute", file, "operator=somebody=else"],
         ["attribute", file, "marks=[1, 2]", "--trial", 0],
@@ -93,8 +94,8 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
     for arguments, message in (
         (["run", file, *BEGIN], "give rollouts=, seconds= or target="),
         (["show", tmp_path / "none.db"], "does not exist"),
-        (["add", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
-        (["add", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
+        (["try", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
+        (["try", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
         (["remove", file, 7], "no intervention 7 waits"),
         (["attribute", file, "a=1", "--trial", 99], "no trial 99"),
         (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
@@ -122,3 +123,73 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
 def test_a_wrong_option_says_what_it_takes(arguments: list[str], message: str, tmp_path: Path) -> None:
     common = (tmp_path / "a.db", PENDULUM, "--horizon", 0.3, "--quality", ANGLE)
     assert message in error_of("study", "run", *common, *arguments)
+
+
+def test_a_study_is_steered_by_commands_and_replayed_without_one(tmp_path: Path) -> None:
+    file, new = tmp_path / "a.db", tmp_path / "b.db"
+    begin = ["study", "run", file, *BEGIN, "--choose", f"{DAMPING}=0.1,0.2,0.4", "--executor", "serial"]
+    begin = [text for text in begin if text not in ("--condition", f"{DAMPING}=0.1", f"{DAMPING}=0.2")]
+    assert run(*begin, "--solver", "random", "--rollouts", 64).exit_code == 0
+    for arguments in (
+        ["budget", 70, "--by", "Ada"],
+        ["range", f"{ANGLE}=-1:"],
+        ["range", f"{DAMPING}=0.1,0.4"],
+        ["forbid", f"{ANGLE}=:-0.5", f"{RATE}=1:2"],
+        ["forbid", f"{DAMPING}=0.1"],
+        ["allow", 4],
+        ["freeze", f"{RATE}=0.5"],
+        ["freeze", RATE],
+        ["unfreeze", RATE],
+        ["solver", "bayesian", "--option", "batch=2"],
+        ["pause"],
+        ["resume"],
+        ["try", f"{ANGLE}=0.5", f"{RATE}=1", f"{DAMPING}=0.2"],
+    ):
+        done = run("study", arguments[0], file, *arguments[1:])
+        assert (done.exit_code, done.stderr) == (0, ""), arguments
+    assert "try" in done.stdout and "waits for the next batch, as soon as the study runs" in done.stdout
+
+    listed = json.loads(run("study", "history", file, "--json").stdout)
+    assert [row["number"] for row in listed] == list(range(1, 14)) and listed[0]["name"] == "Ada"
+    assert listed[1]["payload"] == {"address": ANGLE, "lower": -1.0, "upper": None}
+    assert listed[3]["payload"] == {"region": {ANGLE: [None, -0.5], RATE: [1.0, 2.0]}}
+    assert run(*begin, "--rollouts", 64).exit_code == 0
+    with Study.open(file) as study:
+        later = study.trials[65:]
+        assert len(study) == 70 and len(later) == 5 and {trial.method for trial in later} == {"bayesian"}
+        assert all(trial.parameters[ANGLE] >= -1.0 and trial.parameters[DAMPING] == 0.4 for trial in later)
+    # The pause and what ended it were noticed before the batch on which the others have an effect.
+    rows = [line.split() for line in run("study", "history", file).stdout.splitlines()[2:]]
+    assert len(rows) == 13 and all(row[4] in ("1", "2") for row in rows)
+
+    shown = run("study", "replay", file, new, "--without", 10, "--executor", "serial", "--json")
+    assert json.loads(shown.stdout)["rollouts"] == 70
+    with Study.open(new) as study:
+        assert {trial.method for trial in study.trials} == {"random", "by hand"}
+    assert "no intervention 11 can be left out" in error_of("study", "replay", file, tmp_path / "c.db", "--without", 11)
+    assert "exists already" in error_of("study", "replay", file, new)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["stop"], "no process runs"),
+        (["resume"], "the study is not paused"),
+        (["budget", "many"], "a budget of rollouts must be a number, not 'many'"),
+        (["range", ANGLE], "expected ADDRESS=LOWER:UPPER"),
+        (["range", f"{ANGLE}=a:b"], "LOWER:UPPER with numbers"),
+        (["range", f"{ANGLE}=1:2:3"], "LOWER:UPPER with numbers"),
+        (["forbid", f"{ANGLE}=:"], "no point is left"),
+        (["aspiration", "-1"], "an aspiration belongs to several qualities"),
+        (["solver", "nonsense"], "there is no solver 'nonsense'"),
+    ],
+)
+def test_an_intervention_that_makes_no_sense_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    Problem(
+        scenario=PendulumScenario(),
+        parameters=[Parameter(ANGLE, -1.5, 1.5)],
+        quality=Quality(magnitude, ANGLE),
+        horizon=0.3,
+    ).study(file, solver="sobol").close()
+    assert message in error_of("study", arguments[0], file, *arguments[1:])

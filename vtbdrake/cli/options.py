@@ -155,6 +155,27 @@ def parse_choice(text: str) -> Choice:
     return Choice(address, [_json_or_text(option.strip()) for option in options.split(",")])
 
 
+def parse_limits(text: str) -> tuple[str, dict[str, Any]]:
+    """Parse ``ADDRESS=LOWER:UPPER``, of which an end may be missing, or ``ADDRESS=OPTION,...``.
+
+    Returns:
+        The address, and ``lower`` and ``upper`` (None if missing), or ``options``.
+    """
+    address, values = _assignment(text, "ADDRESS=LOWER:UPPER or ADDRESS=OPTION[,...]")
+    if ":" not in values:
+        return address, {"options": [_json_or_text(option.strip()) for option in values.split(",")]}
+    try:
+        lower, upper = (float(end) if end.strip() else None for end in values.split(":"))
+    except ValueError as error:
+        raise click.BadParameter(f"expected {address}=LOWER:UPPER with numbers, not {text!r}") from error
+    return address, {"lower": lower, "upper": upper}
+
+
+def parse_optional(text: str) -> Any:
+    """Parse JSON, or else a text; ``none`` is None."""
+    return None if text == "none" else _json_or_text(text)
+
+
 def parse_range(text: str) -> Parameter:
     """Parse ``ADDRESS=LOWER:UPPER``."""
     from vtbdrake.optimization import Parameter

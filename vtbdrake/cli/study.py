@@ -1,4 +1,4 @@
-"""``vtbdrake study``: run a study, show it, and add points to it, also while another process runs it."""
+"""``vtbdrake study``: run a study, show it, and steer it, also while another process runs it."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from vtbdrake.cli.options import (
     output,
     parse_choice,
     parse_field,
+    parse_limits,
+    parse_optional,
     parse_scaled_range,
     schema_option,
     settings,
@@ -252,17 +254,214 @@ def _described(study: Study) -> dict[str, Any]:
     return {**record, "rollouts": len(study), "best": best, "points": study.to_dict()}
 
 
-@study.command()
-@_file
-@_point
-@json_option
-def add(file: Path, point: tuple[tuple[str, Any], ...]) -> None:
-    """Add a point, to be evaluated with the next batch."""
+_by = option("--by NAME", "Who makes the change.  [default: your login name]")
+_address = click.argument("address")
+
+
+def _intervene(file: Path, kind: str, by: str | None, **payload: Any) -> None:
     from vtbdrake.optimization import Study
 
     with Study.open(file) as opened:
-        opened.add(settings(point))
-        emit({"waiting": opened.queue})
+        intervention = opened.intervene(kind, by=by, **payload)
+        running = "" if opened.is_running else ", as soon as the study runs"
+        text = f"intervention {intervention.number} waits for the next batch{running}: {intervention.text}"
+        say(text)
+        emit(intervention.to_dict())
+
+
+@study.command("try")
+@_file
+@_point
+@_by
+@json_option
+def try_(file: Path, point: tuple[tuple[str, Any], ...], by: str | None) -> None:
+    """Try a point with the next batch."""
+    _intervene(file, "try", by, point=settings(point))
+
+
+@study.command()
+@_file
+@_by
+@json_option
+def pause(file: Path, by: str | None) -> None:
+    """Let the run finish its batch, and wait."""
+    _intervene(file, "pause", by)
+
+
+@study.command()
+@_file
+@_by
+@json_option
+def resume(file: Path, by: str | None) -> None:
+    """Let a paused run go on."""
+    _intervene(file, "resume", by)
+
+
+@study.command()
+@_file
+@_by
+@json_option
+def stop(file: Path, by: str | None) -> None:
+    """End the run after its batch."""
+    _intervene(file, "stop", by)
+
+
+@study.command("range")
+@_file
+@click.argument("limits", callback=converted(parse_limits), metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]")
+@_by
+@json_option
+def range_(file: Path, limits: tuple[str, dict[str, Any]], by: str | None) -> None:
+    """Narrow or widen the range of a parameter.
+
+    An end that is left out stays: ADDRESS=:2.
+    """
+    address, ends = limits
+    _intervene(file, "range", by, address=address, **ends)
+
+
+@study.command()
+@_file
+@click.argument("parameter", metavar="ADDRESS[=VALUE]")
+@_by
+@json_option
+def freeze(file: Path, parameter: str, by: str | None) -> None:
+    """Hold a parameter at a value.
+
+    By default it is that of the best point.
+    """
+    address, value = parse_field(parameter) if "=" in parameter else (parameter, None)
+    _intervene(file, "freeze", by, address=address, **({} if value is None else {"value": value}))
+
+
+@study.command()
+@_file
+@_address
+@_by
+@json_option
+def unfreeze(file: Path, address: str, by: str | None) -> None:
+    """Vary a frozen parameter again."""
+    _intervene(file, "unfreeze", by, address=address)
+
+
+@study.command()
+@_file
+@click.argument(
+    "region",
+    nargs=-1,
+    required=True,
+    callback=converted(parse_limits),
+    metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
+)
+@_by
+@json_option
+def forbid(file: Path, region: tuple[tuple[str, dict[str, Any]], ...], by: str | None) -> None:
+    """Forbid a region.
+
+    It is the box of all sides that are given. An end that is left out is open: ADDRESS=2:.
+
+    \b
+    Example:
+      vtbdrake study forbid gait.db dps.impl.gait.period=:1.5 dps.impl.gait.stroke=0.2:
+    """
+    sides = {address: limits.get("options") or [limits["lower"], limits["upper"]] for address, limits in region}
+    _intervene(file, "forbid", by, region=sides)
+
+
+@study.command()
+@_file
+@click.argument("number", type=int)
+@_by
+@json_option
+def allow(file: Path, number: int, by: str | None) -> None:
+    """Allow the region that intervention NUMBER forbids."""
+    _intervene(file, "allow", by, number=number)
+
+
+@study.command()
+@_file
+@click.argument("rollouts", metavar="ROLLOUTS|none")
+@_by
+@json_option
+def budget(file: Path, rollouts: str, by: str | None) -> None:
+    """Set the number of rollouts in the end.
+
+    It holds for the present run and for later ones, whatever they are given. ``none`` is no limit.
+    """
+    _intervene(file, "budget", by, rollouts=parse_optional(rollouts))
+
+
+@study.command()
+@_file
+@click.argument("solver")
+@option(
+    "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
+)
+@_by
+@json_option
+def solver(file: Path, solver: str, options: tuple[tuple[str, Any], ...], by: str | None) -> None:
+    """Go on with another solver."""
+    _intervene(file, "solver", by, solver=solver, options=settings(options))
+
+
+@study.command(context_settings={"ignore_unknown_options": True})  # A value may be negative.
+@_file
+@click.argument("targets", nargs=-1, required=True, metavar="VALUE ...|none")
+@_by
+@json_option
+def aspiration(file: Path, targets: tuple[str, ...], by: str | None) -> None:
+    """Aim at values of several qualities, one each.
+
+    ``none`` is the whole Pareto front again.
+    """
+    values = None if targets == ("none",) else [parse_optional(target) for target in targets]
+    _intervene(file, "aspiration", by, targets=values)
+
+
+@study.command()
+@_file
+@click.argument("new_file", callback=converted(output()))
+@option("--without NUMBER", "Leave out this intervention. May be repeated.", type=int, multiple=True)
+@_trust_option
+@executor_options
+@json_option
+def replay(
+    file: Path, new_file: Path, without: tuple[int, ...], trusted: tuple[str, ...], running: dict[str, Any]
+) -> None:
+    """Repeat a study in a new file.
+
+    It is repeated from its first batch, with its interventions or without some of them.
+
+    The problem is the one that FILE states. Rollouts that FILE has are not run again. See Study.replay.
+    """
+    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.statement import restated
+
+    with Study.open(file) as opened:
+        record = opened.record
+    with (
+        restated(record, trusted=trusted).study(file) as original,
+        original.replay(new_file, without=without, **running) as repeated,
+    ):
+        say(repeated.summary())
+        emit({**_described(repeated), "reason": repeated.reason})
+
+
+@study.command()
+@_file
+@json_option
+def history(file: Path) -> None:
+    """List the interventions, with their batches."""
+    from vtbdrake.optimization import Study
+
+    with Study.open(file) as opened:
+        interventions = opened.interventions
+    rows = [
+        [str(i.number), f"{i.time:%Y-%m-%d %H:%M:%S}", i.name, "waits" if i.batch is None else str(i.batch), i.text]
+        for i in interventions
+    ]
+    say(table(["number", "time (UTC)", "name", "batch", "intervention"], rows))
+    emit([intervention.to_dict() for intervention in interventions])
 
 
 @study.command()
@@ -284,7 +483,7 @@ def edit(file: Path, number: int, point: tuple[tuple[str, Any], ...]) -> None:
 @click.argument("number", type=int)
 @json_option
 def remove(file: Path, number: int) -> None:
-    """Remove a waiting point; `show` lists the numbers."""
+    """Remove an intervention that waits."""
     from vtbdrake.optimization import Study
 
     with Study.open(file) as opened:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
@@ -103,6 +104,11 @@ class Intervention:
     kind: str
     payload: Mapping[str, Any]
     batch: int | None = None
+
+    @property
+    def text(self) -> str:
+        """Return kind and payload in a line."""
+        return " ".join([self.kind, *(f"{name}={json.dumps(value)}" for name, value in self.payload.items())])
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON data."""

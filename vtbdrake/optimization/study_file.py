@@ -487,7 +487,7 @@ class StudyFile:
         """
         with self._transaction():
             rows = self.interventions()
-            first, now = 1 + max((row.number for row in rows), default=0), datetime.now(UTC)
+            first, now = 1 + max((row.number for row in rows), default=0), datetime.fromisoformat(_now())
             new = [Intervention(first + k, now, name, kind, payload) for k, payload in enumerate(payloads)]
             check([*rows, *new])
             self._insert("interventions", [_row(intervention) for intervention in new])
