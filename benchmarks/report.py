@@ -57,6 +57,7 @@ BENCHMARKS: Registry = {
     "arm_trajectory": "benchmarks.arm_trajectory:arm_trajectory",
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
     "scanner_cost": "benchmarks.scanner:scanner_cost",
+    "vr_pose_to_command": "benchmarks.vr:vr_pose_to_command",
     "localization_update_p50": "benchmarks.localization:localization_update_p50",
 }
 

@@ -1,0 +1,223 @@
+"""How late the command of a hand in virtual reality is, and how soon a robot is released when the hand is gone."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from http.cookiejar import CookieJar
+from math import inf
+from typing import Any
+from urllib.parse import urlsplit
+
+import lcm
+import numpy as np
+from drake import lcmt_scope
+from websockets.sync.client import connect
+
+from benchmarks.measure import LOWER, Benchmark
+from vtbdrake.lcm.hub import Hub
+from vtbdrake.machine import MachineProcess
+from vtbdrake.monitoring.live.client import LiveClient
+from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.web import view
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+
+POSES = 400
+RATE = 90.0  # Hz
+RELEASES = 12  # of each kind
+SHIFT = 1e-4  # m, between two poses, by which they are told apart
+PATIENCE = 20.0  # s
+CHANNEL = "ARM_HAND"
+
+
+@dataclass
+class QuickArm(ManipulatorScenario):
+    """An arm whose commanded pose is that of the hand at once, so that each pose is told from the one before."""
+
+    led_by_hand: bool = True
+    release_time: float = 0.1
+
+    def hand_command(self) -> HandCommand | None:
+        command = super().hand_command()
+        assert command is not None
+        return replace(command, speed=1e6, turn_rate=1e6, release_time=self.release_time)
+
+
+class Listener:
+    """Keeps when each command of the hand arrived on the bus, and its value."""
+
+    def __init__(self, url: str) -> None:
+        self.commands: list[tuple[float, np.ndarray]] = []
+        self._lcm = lcm.LCM(url)
+        self._lcm.subscribe(CHANNEL, self._note).set_queue_capacity(0)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _note(self, _: str, data: bytes) -> None:
+        self.commands.append((time.monotonic(), np.array(lcmt_scope.decode(data).value)))
+
+    def _listen(self) -> None:
+        while not self._ended.is_set():
+            self._lcm.handle_timeout(50)
+
+    def first(self, begin: float, condition: Callable[[np.ndarray], bool]) -> tuple[float, np.ndarray]:
+        """Return the first command after ``begin`` that fulfils the condition, and when it arrived."""
+        limit, place = time.monotonic() + PATIENCE, 0
+        while time.monotonic() < limit:
+            while place < len(self.commands):
+                when, value = self.commands[place]
+                place += 1
+                if when >= begin and condition(value):
+                    return when, value
+            time.sleep(1e-3)
+        raise RuntimeError("no such command came")
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+class Headset:
+    """A page that sends poses."""
+
+    def __init__(self, url: str, stack: ExitStack) -> None:
+        cookies = CookieJar()
+        urllib.request.build_opener(urllib.request.HTTPCookieProcessor(cookies)).open(url, timeout=PATIENCE).close()
+        header = "; ".join(f"{cookie.name}={cookie.value}" for cookie in cookies)
+        address = f"ws://{urlsplit(url).netloc}/vr"
+        self._socket = stack.enter_context(connect(address, additional_headers={"Cookie": header}))
+        self.close = self._socket.close
+
+    def send(self, message: dict[str, Any]) -> None:
+        self._socket.send(json.dumps(message))
+
+    def hold(self, height: float, *, grip: bool) -> float:
+        """Send a pose, and return when."""
+        hand = {"pose": [1, 0, 0, 0, 0, 0, height], "grip": grip, "buttons": [0.0, float(grip)]}
+        now = time.monotonic()
+        self.send({"time": now, "head": None, "left": None, "right": hand})
+        return now
+
+    def until(self, condition: Callable[[dict[str, Any]], bool]) -> None:
+        """Wait for a status."""
+        while not condition(json.loads(self._socket.recv(PATIENCE))):
+            pass
+
+    def lead(self) -> None:
+        """Arm the robot, and take a grip; the poses that follow lead."""
+        self.send({"do": "disarm"})
+        self.until(lambda status: not status["armed"])  # Older ones have waited.
+        self.send({"do": "arm"})
+        self.until(lambda status: bool(status["armed"]))
+        leads = False
+        while not leads:  # The motion of the arm changes.
+            self.hold(1.0, grip=False)
+            self.hold(1.0, grip=True)
+            leads = json.loads(self._socket.recv(PATIENCE))["leading"]
+
+
+@contextmanager
+def _loop(url: str) -> Iterator[None]:
+    """A machine process, and a process of the loop that controls it."""
+    scenario = ["vtbdrake_diagrams.manipulator:ManipulatorScenario", "--field", "led_by_hand=true"]
+    command = [sys.executable, "-m", "vtbdrake", "run", *scenario, "--url", url, "--priority", "0"]
+    with MachineProcess(QuickArm(), url):
+        loop = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            with LiveClient(url, timeout=PATIENCE) as live:
+                live.get(["dps.impl.tip_pose"])
+            yield
+        finally:
+            loop.send_signal(signal.SIGINT)
+            loop.wait(PATIENCE)
+
+
+def vr_pose_to_command() -> list[Benchmark]:
+    """Time from a pose that a headset's page sends to its command u on the bus of the loop, and to that of a release.
+
+    The page is a client without a browser; the server shows a session that runs, and the loop controls a machine
+    process. The loop takes a command of the bus in its next period.
+    """
+    with ExitStack() as stack:
+        hub = stack.enter_context(Hub(port=0))
+        stack.enter_context(_loop(hub.url))
+        listener = Listener(hub.url)
+        stack.callback(listener.close)
+        delays = _delays(hub.url, listener)
+        releases = _releases(hub.url, listener)
+    p95 = float(np.percentile(delays, 95.0))
+    worst = max(float(np.percentile(times, 95.0)) for times in releases.values())
+    note = "; ".join(
+        f"{kind}: median {1e3 * np.median(t):.0f} ms, p95 {1e3 * np.percentile(t, 95.0):.0f} ms"
+        for kind, t in releases.items()
+    )
+    return [
+        Benchmark(
+            name="vr_pose_to_command",
+            value=p95,
+            unit="s",
+            goal=0.05,
+            better=LOWER,
+            against=f"a pose every {1e3 / RATE:.0f} ms, at p95; the median is {1e3 * np.median(delays):.1f} ms",
+        ),
+        Benchmark(
+            name="vr_release_to_idle",
+            value=worst,
+            unit="s",
+            goal=0.15,
+            better=LOWER,
+            against="the silence of 100 ms that releases, at p95 of the slowest kind",
+            note=note,
+        ),
+    ]
+
+
+def _delays(url: str, listener: Listener) -> list[float]:
+    """Return the time from each pose to the first command that is at least as new."""
+    # Poses that are late on a busy computer are measured, too, and release nothing.
+    with ExitStack() as stack:
+        running = stack.enter_context(view(QuickArm(release_time=5.0), vr=True, url=url))
+        running.session.play()
+        headset = Headset(running.url, stack)
+        headset.lead()
+        height = float(listener.first(0.0, _leads)[1][7])
+        begin, sent = time.monotonic(), []
+        for k in range(1, POSES + 1):
+            time.sleep(max(begin + k / RATE - time.monotonic(), 0.0))
+            sent.append((headset.hold(1.0 + SHIFT * k, grip=True), height + SHIFT * (k - 0.5)))
+        return [listener.first(when, partial(_leads, height=height))[0] - when for when, height in sent]
+
+
+def _releases(url: str, listener: Listener) -> dict[str, list[float]]:
+    """Return the times from the last pose of a hand to the idle command, by what happens after it."""
+    times: dict[str, list[float]] = {"let go": [], "silent": [], "closed": []}
+    with ExitStack() as stack:
+        running = stack.enter_context(view(QuickArm(), vr=True, url=url))
+        running.session.play()
+        headset = Headset(running.url, stack)
+        for kind in RELEASES * list(times):
+            released = -inf
+            while released < 0.0:  # On a busy computer, the clutch may be released before.
+                headset.lead()
+                begin = time.monotonic()
+                when = headset.hold(1.0, grip=kind != "let go")
+                if kind == "closed":
+                    headset.close()
+                    headset = Headset(running.url, stack)
+                released = listener.first(begin, lambda value: value[0] == 0.0)[0] - when
+            times[kind].append(released)
+    return times
+
+
+def _leads(value: np.ndarray, height: float = -inf) -> bool:
+    return bool(value[0] == 1.0 and value[7] >= height)
