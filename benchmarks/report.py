@@ -50,6 +50,8 @@ BENCHMARKS: Registry = {
     "study_against_optuna": "benchmarks.study:study_against_optuna",
     "auto_regret": "benchmarks.auto_regret:auto_regret",
     "racing_savings": "benchmarks.study:racing_savings",
+    "study_page_open": "benchmarks.study_page:study_page_open",
+    "study_page_cost": "benchmarks.study_page:study_page_cost",
     "camera_study_speedup": "benchmarks.camera_study:camera_study_speedup",
     "time_to_target": "benchmarks.gait:time_to_target",
     "capture_rtf": "benchmarks.satellite:capture_rtf",

@@ -21,6 +21,7 @@ from vtbdrake.optimization.study_file import Mark, StudyFile
 from vtbdrake.rollout.task import FAILED
 
 _POLL = 0.1  # s
+_SHARE = 0.004  # of a core, that the reading takes at most
 _SIGN_OF_LIFE = 1.0  # s between two looks at whether a process runs the study
 _RATE_OVER = 60  # rollouts over which their rate is measured
 _FAILURES = 40  # different reasons that are listed
@@ -139,9 +140,11 @@ class StudyFeed:
     # -- in the thread of the feed
 
     def _watch(self) -> None:
-        next_look = 0.0
-        while not self._closed.wait(_POLL):
+        next_look, wait = 0.0, _POLL
+        while not self._closed.wait(wait):
+            begin = time.thread_time()
             changed = self._read_if_changed()
+            wait = max(_POLL, (time.thread_time() - begin) / _SHARE)
             now = time.monotonic()
             if not changed and now < next_look:
                 continue

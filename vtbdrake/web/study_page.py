@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -32,7 +33,7 @@ from vtbdrake.web.study_worker import PointError, PointRollout, PointSimulator
 if TYPE_CHECKING:
     from starlette.websockets import WebSocket
 
-_PERIOD = 0.1  # s between two messages to a page
+_PERIOD = 0.2  # s between two messages to a page
 _PATIENCE = 1.0  # s, for a change
 _LISTED = 200  # interventions
 
@@ -264,6 +265,7 @@ class _StudyPage:
             "t_star": None if np.isnan(result.t_star) else result.t_star,
             "end": result.end,
             "message": result.message or message,
+            "seconds": None if np.isnan(result.wall_time) else result.wall_time,
         }
 
     def _try(self, *, point: Any, condition: int = 0) -> dict[str, Any]:
@@ -293,8 +295,9 @@ class _StudyPage:
 
     def _model(self, *, x: str, y: str, quality: int, trial: int) -> dict[str, Any]:
         trials = list(self._view.feed.trials)
+        begin = time.monotonic()
         grid = self._view.surrogate.grid(trials, str(x), str(y), quality=int(quality), at=self._trial(trial))
-        return {**grid, "trials": len(trials)}
+        return {**grid, "trials": len(trials), "seconds": time.monotonic() - begin}
 
     def _simulator(self) -> PointSimulator:
         simulator = self._view.simulator

@@ -32,6 +32,8 @@ TINTS = {"best": None, "pointed": "#cc3399", "tried": "#009e73"}
 _GHOST = 0.55
 # Instants of a rollout to which the camera is fitted.
 _INSTANTS = 20
+# Of the camera's view, which is half a page, and narrower than 4:3.
+_MARGIN = 1.8
 
 
 @dataclass
@@ -159,7 +161,7 @@ class StudyScene:
         for time in np.linspace(0.0, actor.rollout.result.times[-1], _INSTANTS):
             actor.pose(time)
             corners.append(actor.drawing.corners(actor.context))
-        camera = fitting_camera(np.hstack(corners))
+        camera = fitting_camera(np.hstack(corners), margin=_MARGIN)
         self._meshcat.SetCameraPose(camera.position, camera.target)
 
     def _set_time(self, time: float) -> None:

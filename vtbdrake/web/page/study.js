@@ -8,6 +8,7 @@ const LISTED = 8; // best trials in the table
 const POINT_PERIOD = 60; // ms between two points that the pointer asks for
 const TIME_PERIOD = 50; // ms between two instants of the animation
 const MODEL_GROWTH = 1.2; // by how much the trials grow before the model is asked for again
+const SHARE = 0.003; // of a core, what a page takes by itself while the study runs, for the model and for new bests
 const TABS = ["best", "try", "search", "changes", "failures"];
 
 const duration = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`);
@@ -44,13 +45,28 @@ class Trials {
   }
 }
 
+// What the page does by itself, without being asked to, rests after each time so that it takes a small share of a core.
+class Thrift {
+  constructor() {
+    this.next = 0;
+  }
+
+  get rests() {
+    return performance.now() < this.next;
+  }
+
+  spent(seconds) {
+    this.next = performance.now() + (1000 * seconds) / SHARE;
+  }
+}
+
 class Page {
   constructor() {
     this.trials = new Trials();
     this.time = 0;
     this.duration = 0;
     this.pointed = this.best = -1;
-    Object.assign(this, { front: [], bestLine: [] });
+    Object.assign(this, { front: [], bestLine: [], modelThrift: new Thrift(), bestThrift: new Thrift() });
     this.connection = new Connection({
       hello: (message) => this.#hello(message),
       trials: (message) => this.#take(message),
@@ -236,7 +252,16 @@ class Page {
     this.#findBest();
     this.#draw();
     document.body.dataset.trials = this.trials.count;
-    if (this.best >= 0 && this.best !== this.shownBest && !this.pinned) this.#showBest(this.best);
+    this.#renewBest();
+  }
+
+  get #running() {
+    return this.status?.state === "running";
+  }
+
+  #renewBest() {
+    if (this.best < 0 || this.best === this.shownBest || this.pinned || (this.#running && this.bestThrift.rests)) return;
+    this.#showBest(this.best);
   }
 
   #findBest() {
@@ -283,6 +308,7 @@ class Page {
     this.#showDeath(state);
     this.#showFailures();
     this.steering.show(status);
+    this.#renewBest();
     document.body.dataset.state = state;
     document.body.dataset.rollouts = rollouts;
   }
@@ -422,17 +448,24 @@ class Page {
 
   #askForModel(x, y, quality) {
     const key = `${x} ${y} ${quality}`, count = this.trials.count;
-    if (this.best < 0 || this.asking || (this.grid?.key === key && count < MODEL_GROWTH * this.grid.trials)) return;
+    const renews = this.grid?.key === key;
+    if (this.best < 0 || this.asking || (renews && count < MODEL_GROWTH * this.grid.trials)) return;
+    if (renews && this.#running && this.modelThrift.rests) return;
     this.asking = true;
     const address = (k) => this.parameters[k].address;
     this.ask("model", { x: address(x), y: address(y), quality, trial: this.shownBest ?? this.best })
       .then((grid) => {
         this.grid = { ...grid, key };
         this.asking = false;
+        this.modelThrift.spent(grid.seconds);
         document.body.dataset.model = grid.trials;
         this.#draw();
       })
-      .catch((error) => this.say(`the model cannot be computed: ${error.message}`, "bad", "model"));
+      .catch((error) => {
+        this.grid = { key, trials: count };
+        this.asking = false;
+        this.say(`the model cannot be computed: ${error.message}`, "bad", "model");
+      });
   }
 
   // -- rollouts
@@ -506,6 +539,7 @@ class Page {
       .then((shown) => {
         this.#legend("best", true, this.pinned ? `trial ${k}` : "best");
         this.#extend(shown.duration);
+        this.bestThrift.spent(shown.seconds ?? 0);
         document.body.dataset.best = k;
         if (shown.message) this.say(shown.message, "bad");
       })
