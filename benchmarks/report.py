@@ -32,6 +32,8 @@ BENCHMARKS: Registry = {
     "decision_overhead": "benchmarks.decision:decision_overhead",
     "predictive_sampling": "benchmarks.predictive_sampling:predictive_sampling",
     "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
+    "compiled_testbed": "benchmarks.compiled_testbed:compiled_testbed",
+    "compile_time": "benchmarks.compiled_testbed:compile_time",
     "hub_round_trip_p50": "benchmarks.hub:hub_round_trip_p50",
     "loop_state_to_command_p50": "benchmarks.loop:loop_state_to_command_p50",
     "loop_misses": "benchmarks.loop:loop_misses",

@@ -1,0 +1,129 @@
+"""Rollouts of compiled testbeds, beside the same rollouts in Drake; and how long the compilation takes."""
+
+from __future__ import annotations
+
+import os
+import resource
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio
+from vtbdrake.rollout import RolloutTask, SerialExecutor
+from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.testbed import Scenario
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+
+STATE = "plant.state"
+# Rounding grows in the motion that is compared.
+TOLERANCE = 1e-9
+
+
+def compiled_testbed(repeats: int = 10) -> list[Benchmark]:
+    """How many times as many rollouts per second a compiled testbed makes as Drake, on one core each."""
+    random = np.random.default_rng(0)
+    cart_pole = CartPoleScenario().mental()
+    plans = np.column_stack([np.zeros(32), random.uniform(-60.0, 60.0, (32, cart_pole.knots))])
+    pushes = 5.0 * random.standard_normal((8, 6))
+    return [
+        _compared("compiled_testbed", cart_pole, {"u.plan": plans}, horizon=1.0, goal=100.0, repeats=repeats),
+        _compared(
+            "compiled_testbed_arm",
+            ManipulatorScenario(),
+            {"sim.env.push.wrench": pushes},
+            horizon=0.5,
+            goal=20.0,
+            repeats=max(repeats // 3, 2),
+        ),
+    ]
+
+
+def _compared(
+    name: str, scenario: Scenario, values: Mapping[str, np.ndarray], *, horizon: float, goal: float, repeats: int
+) -> Benchmark:
+    count = len(next(iter(values.values())))
+    points = [{address: value[i] for address, value in values.items()} for i in range(count)]
+    testbed = scenario.build()
+    rollouts = testbed.compiled(
+        horizon=horizon, sample_period=0.05, parameters=list(values), outputs=[STATE], compile=True
+    )
+    task = RolloutTask(scenario, horizon, record=[STATE])
+    with SerialExecutor(testbed) as executor:
+        in_drake = partial(run_rollouts, executor, task, points, progress=False)
+        results = in_drake()
+        batch = rollouts(values)
+        expected = np.array([result.record[STATE] for result in results if result is not None])
+        apart = float(np.max(np.abs(batch.outputs[STATE] - expected)) / max(1.0, np.max(np.abs(expected))))
+        if not (batch.valid.all() and apart <= TOLERANCE):
+            raise ArithmeticError(f"the compiled {type(scenario).__name__} is {apart:.2g} from Drake")
+        by_drake, compiled = interleaved(in_drake, partial(rollouts, values), repeats=repeats)
+    return Benchmark(
+        name=name,
+        value=ratio(by_drake, compiled),
+        unit="1",
+        goal=goal,
+        better=HIGHER,
+        against="the same rollouts in Drake, on one core each",
+        note=f"ms per rollout of {horizon:g} s: {1e3 * np.median(compiled) / count:.3g}, in Drake "
+        f"{1e3 * np.median(by_drake) / count:.3g}; states {apart:.1g} apart; n = {repeats}",
+    )
+
+
+def compile_time(repeats: int = 5) -> list[Benchmark]:
+    """Processor time until the arm's testbed is compiled: the first time, and when its machine code is there."""
+    testbed = ManipulatorScenario().build()
+    compile_arm: Any = partial(
+        testbed.compiled, horizon=0.5, sample_period=0.05, outputs=[STATE], compile=True, check=False
+    )
+    with tempfile.TemporaryDirectory() as folder, _cache(folder):
+        first = _processor_time(compile_arm)
+        again = float(np.median([_processor_time(compile_arm) for _ in range(repeats)]))
+        checked = _processor_time(partial(compile_arm, check=True))
+    return [
+        Benchmark(
+            name="compile_time",
+            value=first,
+            unit="s",
+            goal=10.0,
+            better=LOWER,
+            against="nothing: the arm's testbed, for the first time",
+            note=f"with the check of its rollouts {checked - again:.2g} s more",
+        ),
+        Benchmark(
+            name="compile_time_cached",
+            value=again,
+            unit="s",
+            goal=0.1,
+            better=LOWER,
+            against="nothing: the same, whose machine code is there",
+            note=f"n = {repeats}",
+        ),
+    ]
+
+
+def _processor_time(function: Callable[[], Any]) -> float:
+    """Return the seconds of processor time of a call, with that of the compiler."""
+    kinds = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    before = [resource.getrusage(kind) for kind in kinds]
+    function()
+    after = [resource.getrusage(kind) for kind in kinds]
+    return sum(b.ru_utime + b.ru_stime - a.ru_utime - a.ru_stime for a, b in zip(before, after, strict=True))
+
+
+@contextmanager
+def _cache(folder: str) -> Any:
+    """Keep machine code in a folder."""
+    name, before = "XDG_CACHE_HOME", os.environ.get("XDG_CACHE_HOME")
+    os.environ[name] = folder
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
