@@ -28,7 +28,8 @@ from vtbdrake.web import View, view
 from vtbdrake.web.notebook import page_bundle
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
-SCRIPT = Path(__file__).parents[2] / "vtbdrake" / "web" / "page" / "notebook.js"
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "vtbdrake" / "web" / "page" / "notebook.js"
 ANGLE = "sim.sys.cart_pole.pole_pin.position"
 CODE = f"""
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
@@ -221,6 +222,36 @@ def test_view_in_a_notebook_is_steered_while_its_kernel_computes(empty_page: Pag
     empty_page.wait_for_selector("[data-state=unreachable]")
     assert empty_page.locator("iframe").count() == 0
     assert empty_page.evaluate("document.querySelector('img').naturalWidth") == 640
+
+
+@pytest.mark.slow
+@needs_chromium
+def test_study_that_blocks_its_kernel_is_stopped_by_its_page(empty_page: Page, front_end: str, tmp_path: Path) -> None:
+    begin = f"""
+from tests.web.studies import cart_pole_problem
+study = cart_pole_problem().study({str(tmp_path / "a.db")!r}, solver="random")
+study.run(rollouts=4, executor="serial", progress=False)
+study.view()
+"""
+    go_on = 'study.run(rollouts=1_000_000, executor="serial", progress=False).interventions[-1].kind'
+    cells = [nbformat.v4.new_code_cell(code) for code in (begin, go_on)]
+    client = NotebookClient(nbformat.v4.new_notebook(cells=cells), timeout=300, resources={"metadata": {"path": ROOT}})
+    with client.setup_kernel():
+        data = client.execute_cell(cells[0], 0).outputs[-1]["data"]
+        assert pixels(data).shape[1] == 800  # the history
+        show(empty_page, front_end, data["text/html"])
+        frame = empty_page.frame_locator("iframe")
+        frame.locator("body[data-page=open][data-trials]").wait_for(state="attached")
+        frame.locator("body").evaluate(
+            """(body) => {
+                const timer = setInterval(() => {
+                    if (Number(body.dataset.trials) < 8) return;
+                    clearInterval(timer);
+                    document.getElementById("vtb-stop").click();
+                }, 20);
+            }"""
+        )
+        assert client.execute_cell(cells[1], 1).outputs[-1]["data"]["text/plain"] == "'stop'"
 
 
 def test_page_without_a_picture_has_its_text_only() -> None:

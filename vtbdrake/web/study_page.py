@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import os
 import shlex
 import subprocess
@@ -77,6 +78,17 @@ class StudyView:
 
     def __repr__(self) -> str:
         return f"<StudyView of {self.study.path or 'a study in memory'} at {self.url}>"
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        """Show the page in a notebook, and the history of the study where there is no kernel."""
+        from vtbdrake.visualization.plots import png_of
+        from vtbdrake.web.notebook import page_bundle
+
+        # The address has the token of this run, and is not for those who read a stored notebook.
+        static: dict[str, Any] = {"text/plain": repr(self.study)}
+        if any(trial.counts for trial in self.study.trials):
+            static["image/png"] = base64.b64encode(png_of(self.study.plot_history())).decode()
+        return page_bundle(self.url, static, height=800)
 
     def __enter__(self) -> StudyView:
         return self
