@@ -26,7 +26,7 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 @option("--vr", "Let headsets that open the page lead the robot by a hand.", is_flag=True)
 @option(
     "--url URL",
-    "With --vr, the LCM bus of a loop (vtbdrake run): hands lead its robot instead of the simulated one.",
+    "The LCM bus of a loop (vtbdrake run), which is shown instead of a simulation; with --vr, hands lead its robot.",
     parse=parse_url,
 )
 @option("--tls NAME", "Serve the page by https, at this name or address of this machine, to its network.")
@@ -56,15 +56,22 @@ def view(
     \b
     Example:
       vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario
+      vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario --url tcpq://127.0.0.1:7700
     """
     from vtbdrake.web import view as open_view
+    from vtbdrake.web import view_loop
     from vtbdrake.web.tls import Tls
 
-    if url and not vr:
-        raise click.UsageError("--url goes with --vr: hands lead the robot of the loop there")
     if (certificate or key) and not tls:
         raise click.UsageError("--certificate and --key go with --tls")
-    page |= {"vr": vr, "url": url or "", "tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
+    page |= {"tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
+    if url and not vr:
+        if values or start is not None or play:
+            raise click.UsageError("a loop is shown as it is: leave --set, --start and --play out, or --url")
+        with view_loop(scenario, url, **page) as watched:
+            serve(watched.url, browser=browser)
+        return
+    page |= {"vr": vr, "url": url or ""}
     with open_view(scenario, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()

@@ -411,12 +411,23 @@ class VirtualTestbed(AddressedDiagram):
             ValueError: The testbed declares no belief, or there is none at present.
         """
         self.check_context(context)
+        addresses = {address for rule in self.belief_rules for address in rule.of}
+        estimates = {address: self._variables[address].get(context) for address in addresses}
+        return self.belief_of(estimates, time=context.get_time())
+
+    def belief_of(self, estimates: Mapping[str, Any], *, time: float) -> dict[str, ArrayLike]:
+        """Return what a DPS with these estimates (by address) believes of the simulated world at ``time`` (s).
+
+        Raises:
+            ValueError: The testbed declares no belief, or there is none at present.
+        """
         if not self.belief_rules:
             raise ValueError(
                 "this testbed does not declare which estimates of its DPS set its simulated world: see "
                 "VirtualTestbedBuilder.believe"
             )
-        return {
-            rule.target: np.clip(rule.value(self._variables, context), *self._variables[rule.target].bounds)
+        values = {
+            rule.target: rule.value_of([estimates[address] for address in rule.of], late=rule.late(time))
             for rule in self.belief_rules
         }
+        return {address: np.clip(value, *self._variables[address].bounds) for address, value in values.items()}

@@ -175,6 +175,7 @@ class Page:
             "handles": [handle.description() for handle in self._session.handles.values()],
             "layers": dict(self._session.layers),
             "cameras": list(self._session.cameras),
+            "loop": self._session.loop_url,
         }
         await send(self._browser, hello)
         await first_of(

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from vtbdrake.optimization import Problem
     from vtbdrake.rollout.course import Course
-    from vtbdrake.state import Snapshot
+    from vtbdrake.state import Snapshot, Variable
     from vtbdrake.testbed import Scenario
     from vtbdrake.visualization.still import Still
 
@@ -100,6 +100,8 @@ class Frame:
             and time), ``failure``, ``branch``; None if there is none.
         drive: What is driven by hand, see `Driver.status`; None while nothing is.
         layers: What there is to say about each layer that is shown.
+        loop: Of a loop that runs in another process: ``ages`` of its sensor signals' last messages (s), ``reasons`` why
+            nothing reaches the machine, ``faults`` with the seconds since then; None of a simulation.
     """
 
     number: int
@@ -116,6 +118,7 @@ class Frame:
     comparison: Mapping[str, Any] | None
     drive: Mapping[str, Any] | None = None
     layers: Mapping[str, str] = field(default_factory=dict)
+    loop: Mapping[str, Any] | None = None
 
 
 @dataclass
@@ -207,6 +210,7 @@ class Session:
         layers: The layers that can be shown: name -> title.
         cameras: The cameras whose images can be shown.
         meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
+        loop_url: LCM URL of the loop that is watched instead, see `LoopSession`; empty for a simulation.
 
     Raises:
         ValueError: The testbed cannot be built, or a value cannot be set.
@@ -232,7 +236,7 @@ class Session:
         self.bodies: tuple[str, ...] = ()
         self.layers: Mapping[str, str] = {}
         self.cameras: tuple[str, ...] = ()
-        self.meshcat_url = ""
+        self.meshcat_url = self.loop_url = ""
         self._start, self._values = start, dict(values or {})
         self._interventions = Interventions(self.config.step)
         self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -475,16 +479,7 @@ class Session:
             size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
         self._layers = Layers(self._meshcat, self._testbed, size)
         self.layers, self.cameras = self._layers.titles, self._layers.cameras
-        self.variables = {
-            variable.address: {
-                "kind": variable.kind,
-                "shape": list(variable.shape),
-                "unit": variable.unit,
-                "bounds": [_plain(np.broadcast_to(bound, variable.shape)) for bound in variable.bounds],
-                "settable": not variable.derived,
-            }
-            for variable in self._testbed.variables().values()
-        }
+        self.variables = {address: describe(variable) for address, variable in self._testbed.variables().items()}
         self._next_frame = 0.0
         self._show(time.monotonic())
 
@@ -633,7 +628,7 @@ class Session:
             if not self._failure:
                 self._keep(now)
                 self._draw()
-                values = {address: _plain(reader(self._context)) for address, reader in self._readers.items()}
+                values = {address: plain(reader(self._context)) for address, reader in self._readers.items()}
                 warnings = self._limits.violations(self._context)
         except FAILURES as error:  # What draws or is watched cannot be computed in this state.
             self._failure, self._playing = one_line(error), False
@@ -845,7 +840,18 @@ def _failure(error: BaseException) -> Exception:
     return error if isinstance(error, Exception) else SessionError(one_line(error))
 
 
-def _plain(value: Any) -> Any:
+def describe(variable: Variable) -> dict[str, Any]:
+    """Return what a page needs to know of a variable, for JSON."""
+    return {
+        "kind": variable.kind,
+        "shape": list(variable.shape),
+        "unit": variable.unit,
+        "bounds": [plain(np.broadcast_to(bound, variable.shape)) for bound in variable.bounds],
+        "settable": not variable.derived,
+    }
+
+
+def plain(value: Any) -> Any:
     """Return a value of a variable or a port as plain data, for JSON; of an abstract one its text."""
     if isinstance(value, float | int | bool):
         return float(value) if isfinite(value) else None

@@ -55,6 +55,33 @@ class View:
         self.session.close()
 
 
+def view_loop(
+    scenario: Scenario, url: str, *, port: int = 0, hosts: Collection[str] = (), tls: Tls | None = None
+) -> View:
+    """Show a loop that runs in another process, such as ``vtbdrake run``, through its live values.
+
+    Args:
+        scenario: The scenario of the loop.
+        url: LCM URL of its bus.
+        port: The port of the page on the loopback interface; 0 for any that is free.
+        hosts: Host names (with port) under which proxies offer the page.
+        tls: Serve the page by https to other devices; None keeps it to this machine.
+
+    Raises:
+        ValueError: The testbed cannot be built.
+        PortError: The port is taken.
+        ModuleNotFoundError: The extra ``web`` is not installed.
+    """
+    _check_extra()
+    from vtbdrake.web.loop import LoopSession
+
+    with ExitStack() as stack:
+        session = stack.enter_context(LoopSession(scenario, url))
+        opened = _served(session, port=port, hosts=hosts, tls=tls)
+        stack.pop_all()
+        return opened
+
+
 def view(
     scenario: Scenario,
     *,
@@ -91,13 +118,11 @@ def view(
         BridgeError: There is no bus.
         ModuleNotFoundError: The extra ``web`` is not installed.
     """
-    for name in ("msgpack", "starlette", "uvicorn", "websockets"):
-        extra_module(name, purpose="the live page", extra="web")
-    from vtbdrake.web.server import Server
+    _check_extra()
     from vtbdrake.web.vr import ControlledRobot, SimulatedRobot, VirtualReality
 
     if url and not vr:
-        raise ValueError(f"a url ({url}) needs vr=True: hands lead the robot of the loop there")
+        raise ValueError(f"a url ({url}) needs vr=True: hands lead the robot of the loop there; see also view_loop")
     session = Session(scenario, start=start, values=values, config=config, problem=problem)
     with ExitStack() as stack:
         stack.callback(session.close)
@@ -105,6 +130,17 @@ def view(
         if vr:
             reality = VirtualReality(ControlledRobot(scenario, url) if url else SimulatedRobot(session))
             stack.callback(reality.close)
-        opened = View(session, Server(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls))
+        opened = _served(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls)
         stack.pop_all()
         return opened
+
+
+def _check_extra() -> None:
+    for name in ("msgpack", "starlette", "uvicorn", "websockets"):
+        extra_module(name, purpose="the live page", extra="web")
+
+
+def _served(session: Session, **options: Any) -> View:
+    from vtbdrake.web.server import Server
+
+    return View(session, Server(session, **options))

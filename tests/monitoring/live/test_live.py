@@ -17,12 +17,16 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.control.scripted import PERIOD
-from tests.monitoring.live.rig import PATIENCE, Rig, served
+from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.monitoring.live.rig import PATIENCE, Rig, moving, served
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError, LiveWatch, watch
 from vtbdrake.monitoring.live.server import MAX_WAITING
+from vtbdrake.monitoring.live.service import loop_status
+from vtbdrake.testbed import DpsAlone
 
 # Enough to read everything in one cycle, even on a busy computer.
 AMPLE = {"budget": 10.0, "longest": 10.0}
@@ -51,6 +55,38 @@ def asked(url: str, method: str, *arguments: Any) -> Any:
 
 def watched(url: str, addresses: list[str], count: int, **options: Any) -> list[tuple[float, dict[str, Any]]]:
     return list(islice(watch(url, addresses, timeout=PATIENCE, **options), count))
+
+
+# -- status
+
+
+def test_status_tells_switches_ages_and_faults(hub: Hub) -> None:
+    with served(hub.url, **AMPLE) as (rig, _):
+        status = rig.during(asked, hub.url, "status")
+        assert status.positions["act"] == {"velocity": "real"}
+        assert set(status.positions["sense"].values()) == {"real"}
+        assert (status.reasons, status.latched) == ([], [])
+        assert set(status.ages) == set(rig.bridge.sensed)
+        assert all(0.0 <= age <= 2 * PERIOD for age in status.ages.values())
+        rig.bridge.sensors = lambda now: {}
+        rig.until(lambda: bool(rig.runtime.guards.latched))
+        latched = [fault.reason for fault in rig.runtime.guards.latched]
+        status = rig.during(asked, hub.url, "status")
+        assert status.latched == latched
+        assert latched[0] in [reason for reason, _ in status.faults]
+        assert all(age >= 0.0 for _, age in status.faults)
+        assert max(status.ages.values()) > 2 * PERIOD
+
+
+def test_status_tells_why_nothing_is_commanded_yet(hub: Hub) -> None:
+    scenario = ServoScenario()
+    clock = SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, moving)
+    runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock, blocked_by=lambda: "the brakes are on")
+    status = loop_status(runtime)
+    assert status.positions["act"] == {"velocity": "idle"}
+    assert any("the brakes are on" in reason for reason in status.reasons)
+    assert all(age == np.inf for age in status.ages.values())
 
 
 # -- set and get

@@ -7,10 +7,12 @@ import pytest
 from vtbdrake.monitoring.live.messages import (
     GET,
     SET,
+    STATUS,
     WATCH,
     ReadRequest,
     RequestError,
     SetRequest,
+    StatusRequest,
     nested,
     parse_request,
     request_id,
@@ -29,6 +31,7 @@ def test_valid_requests_are_parsed():
     )
     assert parse_request(GET, encoded(id="a", get=["x", "y", "x"])) == ReadRequest("a", ("x", "y"))
     assert parse_request(WATCH, encoded(id="a", watch=["x"], every=3, lease=0.5)) == ReadRequest("a", ("x",), 3, 0.5)
+    assert parse_request(STATUS, encoded(id="a", status=True)) == StatusRequest("a")
     assert parse_request(WATCH, encoded(id="a", watch=[])) == ReadRequest("a", (), 1, 2.0)
 
 
@@ -49,6 +52,7 @@ def test_valid_requests_are_parsed():
         (SET, encoded(id="a", get=["x"]), "this request must have id, set, not 'id, get'"),
         (SET, encoded(id=7, set={"x": 1}), "the id must be"),
         (SET, encoded(id="a/b", set={"x": 1}), "the id must be"),
+        (STATUS, encoded(id="a", status=1), "status must be true, not 1"),
         (GET, encoded(id="a", get="x"), "a list of strings"),
         (GET, encoded(id="a", get=[]), "1 to 64 addresses, not 0"),
         (WATCH, encoded(id="a", watch=["x"] * 65), "0 to 64 addresses, not 65"),

@@ -17,7 +17,19 @@ from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lazy import extra_module
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
-from vtbdrake.monitoring.live.messages import ANSWER, GET, RESET, SET, WATCH, WATCHED, is_number, parse_request, to_json
+from vtbdrake.monitoring.live.messages import (
+    ANSWER,
+    GET,
+    RESET,
+    SET,
+    STATUS,
+    WATCH,
+    WATCHED,
+    LoopStatus,
+    is_number,
+    parse_request,
+    to_json,
+)
 
 _CONNECT_TIMEOUT = 2.0  # s
 _BURST = 1000  # messages taken at a time
@@ -58,7 +70,7 @@ class LiveClient:
         self._id = ""
         self._answer: dict[str, Any] = {}
         self._owners: dict[str, str] = {}  # of the channels that a hub protects, and that other clients own
-        handlers = dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET)], self._receive)
+        handlers = dict.fromkeys([channel + ANSWER for channel in (SET, GET, RESET, STATUS)], self._receive)
         self._link = LcmLink(url, {**handlers, STATUS_CHANNEL: self._receive_status}, connect_timeout=_CONNECT_TIMEOUT)
         self._link.open()
 
@@ -93,6 +105,19 @@ class LiveClient:
         if not isinstance(released, list) or not all(isinstance(reason, str) for reason in released):
             raise _invalid(RESET, "the list of reasons in 'released'", answer)
         return released
+
+    def status(self) -> LoopStatus:
+        """Return the status of the loop.
+
+        Raises:
+            LiveError: It cannot be told.
+            LiveTimeoutError: There is no answer.
+        """
+        answer = self._request(STATUS, {"status": True})
+        try:
+            return LoopStatus(**answer["status"])
+        except (KeyError, TypeError):
+            raise _invalid(STATUS, "the status of a loop in 'status'", answer) from None
 
     def _request(self, channel: str, request: dict[str, Any]) -> dict[str, Any]:
         self._id, self._answer = uuid.uuid4().hex, {}

@@ -6,6 +6,8 @@ channel    request                                               answer, on the 
 VTB_SET    ``{"id": ID, "set": {ADDRESS: VALUE, ...}}``          ``{"id": ID, "ok": true}``
 VTB_GET    ``{"id": ID, "get": [ADDRESS, ...]}``                 ``{"id": ID, "ok": true, "time": T, "values": {...}}``
 VTB_RESET  ``{"id": ID, "reset": true}``                         ``{"id": ID, "ok": true, "released": [REASON, ...]}``
+VTB_STATUS ``{"id": ID, "status": true}``                        ``{"id": ID, "ok": true, "status": {...}}``, see
+                                                                 `LoopStatus`
 VTB_WATCH  ``{"id": ID, "watch": [ADDRESS, ...], "every": N,     ``{"id": ID, "ok": true}``, and then the values on
            "lease": S}``, again before the lease is over         ``VTB_WATCHED/ID``, every N cycles
 ========== ===================================================== =======================================
@@ -30,7 +32,7 @@ from math import isfinite
 from operator import methodcaller
 from typing import Any
 
-SET, GET, RESET, WATCH = "VTB_SET", "VTB_GET", "VTB_RESET", "VTB_WATCH"
+SET, GET, RESET, STATUS, WATCH = "VTB_SET", "VTB_GET", "VTB_RESET", "VTB_STATUS", "VTB_WATCH"
 WATCHED = "VTB_WATCHED/"
 ANSWER = "_ANSWER"
 
@@ -73,7 +75,36 @@ class ResetRequest:
     id: str
 
 
-Request = SetRequest | ReadRequest | ResetRequest
+@dataclass(frozen=True)
+class StatusRequest:
+    """A request to tell how the loop is."""
+
+    id: str
+
+
+Request = SetRequest | ReadRequest | ResetRequest | StatusRequest
+
+
+@dataclass(frozen=True)
+class LoopStatus:
+    """How a loop is between two cycles.
+
+    Attributes:
+        time: The time of the DPS, in seconds.
+        positions: Positions of the switches, by side (``sense``, ``act``) and signal. The actuator signals of a DPS
+            alone are ``idle`` until it commands.
+        ages: Time since the last message of each sensor signal arrived, in seconds; infinite before the first one.
+        reasons: Why commands do not reach the machine, or why a switch to real would be refused; empty if neither.
+        latched: The faults for which the fallbacks command.
+        faults: The newest faults and warnings of the guards, each with the seconds since then, the newest first.
+    """
+
+    time: float
+    positions: dict[str, dict[str, str]]
+    ages: dict[str, float]
+    reasons: list[str]
+    latched: list[str]
+    faults: list[tuple[str, float]]
 
 
 def to_json(message: Any) -> bytes:
@@ -129,6 +160,10 @@ def _request(channel: str, message: dict[str, Any]) -> Request:
         if _field(message, "reset") is not True:
             raise RequestError(f"reset must be true, not {_short(message['reset'])}")
         return ResetRequest(id)
+    if channel == STATUS:
+        if _field(message, "status") is not True:
+            raise RequestError(f"status must be true, not {_short(message['status'])}")
+        return StatusRequest(id)
     if channel == GET:
         return ReadRequest(id, _addresses(_field(message, "get"), least=1))
     addresses = _addresses(_field(message, "watch", "every", "lease"), least=0)

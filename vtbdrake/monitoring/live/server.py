@@ -24,6 +24,7 @@ from vtbdrake.monitoring.live.messages import (
     GET,
     RESET,
     SET,
+    STATUS,
     WATCH,
     WATCHED,
     ReadRequest,
@@ -85,7 +86,7 @@ class LiveServer:
         self._loop = loop
         self._addresses = addresses
         self._link = LcmLink(
-            url, dict.fromkeys((SET, GET, RESET, WATCH), self._receive), connect_timeout=_CONNECT_TIMEOUT
+            url, dict.fromkeys((SET, GET, RESET, STATUS, WATCH), self._receive), connect_timeout=_CONNECT_TIMEOUT
         )
         self._open()
         self._tasks: dict[int, _Task] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from math import inf
 from typing import Any, Self
 
@@ -16,15 +17,21 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.failures import FAILURES
-from vtbdrake.monitoring.live.messages import ReadRequest, Request, SetRequest
+from vtbdrake.monitoring.live.messages import LoopStatus, ReadRequest, Request, SetRequest, StatusRequest
 from vtbdrake.monitoring.live.server import OUTCOME, VALUES, Record, serve
+from vtbdrake.testbed import DpsAlone
+from vtbdrake.testbed.switch import Position
 
 # Seconds between two frames of watched values: waking the worker process costs more than reading a value.
 _PAUSE = 0.01
+# The newest faults that a status tells.
+_FAULTS = 5
 
 
 class LiveService:
     """Lets other processes set variables of a running DPS, read and watch variables and ports, and reset its guards.
+
+    They can ask for the status of the loop, too.
 
     ::
 
@@ -110,6 +117,8 @@ class LiveService:
             else:
                 readers = [self._runtime.target.reader(address) for address in request.addresses]
                 self._readings.append(_Reading(number, request.addresses, readers, request.every))
+        elif isinstance(request, StatusRequest):
+            self._post(number, self._status())
         else:
             self._post(number, self._reset())
 
@@ -137,6 +146,12 @@ class LiveService:
         except SwitchRefusedError as error:
             return {"error": str(error)}
         return {"ok": True, "released": released}
+
+    def _status(self) -> dict[str, Any]:
+        try:
+            return {"ok": True, "status": asdict(loop_status(self._runtime))}
+        except FAILURES as error:
+            return {"error": str(error)}
 
     def _read(self, cycle: Cycle) -> bool:
         """Read values one after another, from where the previous cycle ended; return whether any was due."""
@@ -182,6 +197,31 @@ class LiveService:
         self._flush_at = now + _PAUSE
         if self._worker.dropped and not self._worker.alive:
             self._readings.clear()
+
+
+def loop_status(runtime: Runtime) -> LoopStatus:
+    """Return how a loop is, between two cycles."""
+    target, now = runtime.target, runtime.clock.now()
+    if isinstance(target, DpsAlone):
+        act = "idle" if runtime.idle else Position.REAL.value
+        sides = (("sense", target.interface.sense, Position.REAL.value), ("act", target.interface.act, act))
+        positions = {side: {signal.name: position for signal in signals} for side, signals, position in sides}
+    else:
+        positions = target.positions(runtime.context)
+    if set(positions["act"].values()) <= {Position.REAL.value, Position.TWIN.value}:
+        blocked = runtime.blocked_reason()
+        reasons = [] if blocked is None else [blocked]
+    else:
+        reasons = list(runtime.prepare("real").reasons)
+    newest = [runtime.guards.log[-1 - k] for k in range(min(_FAULTS, len(runtime.guards.log)))]
+    return LoopStatus(
+        time=runtime.time,
+        positions=positions,
+        ages={name: received.age(now) for name, received in runtime.bridge.sensed.items()},
+        reasons=reasons,
+        latched=[fault.reason for fault in runtime.guards.latched],
+        faults=[(fault.reason, now - fault.time) for fault in newest],
+    )
 
 
 class _Reading:

@@ -3,13 +3,14 @@
 import { Connection, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
+import { Loop } from "./loop.js";
 import { Keep } from "./keep.js";
 import { VirtualReality } from "./vr.js";
 
 const SPEEDS = [0.125, 0.25, 0.5, 1, 2, 4, 8];
 const WINDOW = 20; // s of simulated time in a plot
 // Positions of T_sense and T_act -> mode.
-const MODES = { "sim,sim": "sim", "real,sim": "shadow", "real,real": "real", "real,twin": "twin" };
+const MODES = { "sim,sim": "sim", "real,sim": "shadow", "real,real": "real", "real,twin": "twin", "real,idle": "idle" };
 const MATCHES = 60; // addresses that the search lists
 const ENTRIES = 12; // entries of an array that get a slider
 const PREVIEW_PERIOD = 100; // ms between two drafts
@@ -152,7 +153,7 @@ class Page {
     this.variables = {};
     this.frames = 0;
     // Each has a section of the panel in `root`, and is told of the session's messages.
-    this.parts = [new Drive(this), new Layers(this), new Keep(this), new VirtualReality(this)];
+    this.parts = [new Drive(this), new Layers(this), new Keep(this), new Loop(this), new VirtualReality(this)];
     this.#build();
     this.session = new Connection({
       hello: (message) => this.#hello(message),
@@ -219,6 +220,7 @@ class Page {
   #hello(message) {
     const { scenario, variables, bodies } = message;
     this.variables = variables;
+    this.loop = message.loop;
     for (const part of this.parts) part.hello(message);
     this.follow.append(...bodies.map((path) => element("option", { value: path }, path.replace(/^now\//, ""))));
     this.title.textContent = scenario.split(":").at(-1);
@@ -290,6 +292,7 @@ class Page {
   }
 
   preview(watched, values) {
+    if (this.loop) return;
     this.draft = { watched, values };
     this.timer ??= setTimeout(() => {
       this.timer = null;
@@ -342,6 +345,7 @@ class Page {
       Escape: () => this.cancel(),
     };
     if (event.ctrlKey || event.metaKey || event.altKey || !actions[event.key]) return;
+    if (this.loop && event.key !== "r") return;
     event.preventDefault();
     actions[event.key]();
   }
@@ -352,7 +356,7 @@ class Page {
     this.playing = frame.playing;
     this.playButton.textContent = frame.playing ? "pause" : "play";
     this.clock.textContent = `${frame.time.toFixed(3)} s`;
-    this.rate.textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : "paused";
+    this.rate.textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : this.loop ? "no values" : "paused";
     if (document.activeElement !== this.speed) this.speed.value = frame.speed;
     [this.history.min, this.history.max] = frame.history;
     if (!(performance.now() - this.scrubbing < 500)) this.history.value = frame.time;
@@ -372,7 +376,7 @@ class Page {
       const take = element("button", { id: "vtb-take", onclick: () => this.ask("take over") }, "steer here");
       this.messages.querySelector('[data-kind="steering"]').append(take);
     }
-    if (failure) this.say(`the simulation has failed: ${failure}`, "bad", "failure");
+    if (failure) this.say(this.loop ? failure : `the simulation has failed: ${failure}`, "bad", "failure");
     else this.takeBack("failure");
     if (warnings.length) this.say(warnings.join("; "), "bad", "warnings");
     else this.takeBack("warnings");
@@ -400,12 +404,15 @@ class Page {
           const reason = element("small", { className: "bad" });
           this.switches.append(element("div", { className: "vtb-switch" }, element("label", { htmlFor: id }, `T_${side}.${signal}`), chosen, reason));
         }
-        if (document.activeElement !== chosen) chosen.value = position;
+        if (document.activeElement === chosen) continue;
+        if (![...chosen.options].some(({ value }) => value === position)) chosen.append(element("option", {}, position));
+        chosen.value = position;
+        chosen.disabled = Boolean(this.loop);
       }
     }
     const [senses, acts] = ["sense", "act"].map((side) => [...new Set(Object.values(positions[side] ?? {}))]);
     const mode = senses.length > 1 || acts.length > 1 ? "mixed" : MODES[[senses[0] ?? "sim", acts[0] ?? senses[0] ?? "sim"]];
-    this.mode.textContent = mode ?? "mixed";
+    this.mode.textContent = Object.keys(positions).length ? mode ?? "mixed" : "unknown";
     this.mode.dataset.mode = this.mode.textContent;
   }
 

@@ -1,0 +1,47 @@
+// A loop that runs in another process: the ages of its messages, what keeps it from the machine, and its faults.
+
+import { element } from "./common.js";
+
+const OLD = 1; // s, from which on a fault is told with its age
+
+export class Loop {
+  constructor(page) {
+    this.page = page;
+    this.address = element("p");
+    this.reasons = element("ul");
+    this.ages = element("table");
+    this.faults = element("ul");
+    this.root = element(
+      "div",
+      { id: "vtb-loop", hidden: true },
+      element("h2", {}, "Loop"),
+      this.address,
+      this.reasons,
+      this.ages,
+      this.faults,
+    );
+  }
+
+  hello({ loop }) {
+    this.root.hidden = !loop;
+    document.body.classList.toggle("vtb-live", Boolean(loop));
+    if (!loop) return;
+    this.address.textContent = `at ${loop}`;
+    document.getElementById("vtb-reset").title = "let the DPS command again after a fault that is over (r)";
+  }
+
+  frame({ loop, playing, failure }) {
+    if (!loop) return;
+    document.body.dataset.loop = failure ? "silent" : playing ? "running" : "awaited";
+    const item = (text) => element("li", {}, text);
+    this.reasons.replaceChildren(...(loop.reasons ?? []).map((reason) => item(`not commanded: ${reason}`)));
+    this.ages.replaceChildren(
+      ...Object.entries(loop.ages ?? {}).map(([signal, age]) =>
+        element("tr", {}, element("td", {}, signal), element("td", {}, age === null ? "never" : `${(1e3 * age).toFixed(age < 0.1 ? 1 : 0)} ms ago`)),
+      ),
+    );
+    this.faults.replaceChildren(
+      ...(loop.faults ?? []).map(([reason, age]) => item(age < OLD ? reason : `${reason} (${age.toFixed(0)} s ago)`)),
+    );
+  }
+}
