@@ -27,8 +27,8 @@ class DaskCluster:
 
 
 @contextmanager
-def dask_cluster(*, workers: int = 2, allowed_failures: int = 3) -> Iterator[DaskCluster]:
-    """A scheduler and ``workers`` worker processes of one thread each, with nannies, on the loopback device only."""
+def dask_cluster(*, workers: int = 2, threads: int = 1, allowed_failures: int = 3) -> Iterator[DaskCluster]:
+    """A scheduler and ``workers`` worker processes of some threads each, with nannies, on the loopback device only."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         environment = {
@@ -39,7 +39,7 @@ def dask_cluster(*, workers: int = 2, allowed_failures: int = 3) -> Iterator[Das
         }
         port, file = _free_port(), folder / "scheduler.json"
         scheduler = ["--port", "0", "--dashboard-address", f"127.0.0.1:{port}"]
-        worker = ["--nthreads", "1", "--nworkers", str(workers), "--no-dashboard"]
+        worker = ["--nthreads", str(threads), "--nworkers", str(workers), "--no-dashboard"]
         log = stack.enter_context((folder / "log").open("w"))
         for module, options in (("dask_scheduler", scheduler), ("dask_worker", worker)):
             command = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", *options]

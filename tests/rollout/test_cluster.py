@@ -11,7 +11,7 @@ from pathlib import Path
 import dask
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, get_task_stream
 
 from benchmarks.dask_cluster import dask_cluster
 from tests.rollout.scenarios import HANG, KILL, KILL_PARENT, RecordedScenario, TreacherousScenario
@@ -247,3 +247,14 @@ def test_missing_scheduler_is_an_error():
         pytest.raises(WorkerError, match="no Dask scheduler answers at tcp://127.0.0.1:9: start one"),
     ):
         DaskExecutor("tcp://127.0.0.1:9")
+
+
+def test_short_rollouts_travel_together(cluster):
+    points = _points(120)
+    with DaskExecutor(cluster.client) as executor, get_task_stream(client=cluster.client) as stream:
+        _assert_right(executor, TASK, points)
+        # One by one until their duration is known; a few milliseconds each.
+        tasks = {entry["key"] for entry in stream.data}
+        assert len(tasks) < 100
+        # Not so many together that a thread has nothing to do.
+        _assert_right(executor, TASK, _points(4))

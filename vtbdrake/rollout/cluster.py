@@ -7,10 +7,10 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from typing import Any
 
 from vtbdrake.failures import error_text
@@ -35,10 +35,24 @@ _GONE = (OSError, ClosedClientError)
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 # The number of tasks that the workers keep.
 _TASKS = 16
+# A scheduler needs about 3 ms for a chunk, so a chunk needs so many seconds for each thread of the cluster; how long a
+# rollout is taken for that nobody has timed, in s, how much the newest one counts, and the most of a chunk.
+_TASK_TIME, _GUESS, _NEWEST, _LARGEST_CHUNK = 0.01, 1.0, 0.1, 256
 # A cluster without workers is reported after so many seconds, and again after as many.
 NO_WORKERS = 30.0
 # The period in seconds at which the size of the cluster is read: it may grow while it works.
 _SIZE_PERIOD = 5.0
+
+
+def run_on_dask(
+    name: str, indices: Sequence[int], points: Sequence[bytes], starts: Sequence[bytes], time_limit: float
+) -> list[bytes]:
+    """Run rollouts of the task called ``name`` on a Dask worker; return what `answer` returns for each."""
+    plugin: Any = get_worker().plugins[name]
+    rollouts = (
+        partial(_roll, plugin.task, point, start, time_limit) for point, start in zip(points, starts, strict=True)
+    )
+    return [answer(index, rollout) for index, rollout in zip(indices, rollouts, strict=True)]
 
 
 class DaskExecutor(FuturesExecutor):
@@ -46,18 +60,21 @@ class DaskExecutor(FuturesExecutor):
 
     A task is sent once to every worker, also to those that join later. Each thread of a worker runs its rollouts in a
     child process (see `ProcessExecutor`), which builds the testbed once and keeps it. So a rollout that crashes or
-    hangs costs two such processes and becomes a failed result; it costs no Dask worker. When a Dask worker is lost,
-    Dask runs its rollouts elsewhere. A rollout that was running when more workers than
-    ``distributed.scheduler.allowed-failures`` were lost is tried again alone, because another one may be at fault; if
-    that fails too, it is a failed result. Without any worker, the executor waits for one, and logs a warning every half
-    minute.
+    hangs costs two such processes and becomes a failed result; it costs no Dask worker.
+
+    Rollouts travel in chunks, which a thread runs one after another: the more of them the shorter they are and the
+    larger the cluster, because a scheduler handles some 300 chunks a second. When a Dask worker is lost, Dask runs its
+    chunks elsewhere. The rollouts of a chunk that was running when more workers than
+    ``distributed.scheduler.allowed-failures`` were lost are tried again one by one, because one of them, or one of
+    another chunk, may be at fault; if that fails too, it is a failed result. Without any worker, the executor waits for
+    one, and logs a warning every half minute.
 
     Args:
         client: A client of the cluster, which stays open, or the address of the scheduler; by default the address in
             the environment variable ``DASK_SCHEDULER_ADDRESS``.
         time_limit: The wall time for one rollout, in seconds, without building its testbed; an hour by default, ``inf``
             for none.
-        in_flight: The number of rollouts that the cluster has at a time; by default twice its threads.
+        in_flight: The number of chunks that the cluster has at a time; by default twice its threads.
 
     Raises:
         ValueError: No scheduler is given.
@@ -67,6 +84,8 @@ class DaskExecutor(FuturesExecutor):
     _name = "a Dask cluster"
     _loss = KilledWorker
     _loss_text = "its workers died again and again, also while no other rollout ran"
+    # What a worker runs: (name of the task, indices, points, starts, time limit) -> answers.
+    _function: Callable[..., list[bytes]] = staticmethod(run_on_dask)
 
     def __init__(
         self, client: Client | str | None = None, *, time_limit: float = TIME_LIMIT, in_flight: int | None = None
@@ -80,6 +99,8 @@ class DaskExecutor(FuturesExecutor):
         self._threads = 0
         self._counted = -inf
         self._sent: LruDict[str, str] = LruDict(_TASKS)
+        # Task's digest -> how long its rollouts take, in s.
+        self._durations: LruDict[str, float] = LruDict(_TASKS)
 
     def _run(
         self, call: Call, indices: Iterable[int], *, retrying: bool = False
@@ -94,18 +115,33 @@ class DaskExecutor(FuturesExecutor):
     def _landed(self) -> Any:
         return as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
 
-    def _outcome(self, reply: Any) -> bytes | BaseException:
+    def _outcomes(self, reply: Any) -> list[bytes] | BaseException:
         # The status of a future may change after its reply has arrived. An error is (class, error, traceback).
         if isinstance(reply, BaseException):
             return _given_up(reply)
-        outcome: bytes | BaseException = reply[1] if isinstance(reply, tuple) else reply
-        return outcome
+        outcomes: list[bytes] | BaseException = reply[1] if isinstance(reply, tuple) else reply
+        return outcomes
 
-    def _submit(self, call: Call, index: int) -> Any:
-        name, key = self._send(call.task), f"rollout-{uuid.uuid4().hex}"
-        arguments = name, index, pack(call.points[index]), call.starts[index], self._time_limit
+    def _chunk(self, call: Call, waiting: int) -> int:
+        # As many as need so long that the scheduler can follow, but none that would leave other threads without work.
+        together = _TASK_TIME * self._threads / max(self._durations.get(call.task.digest, _GUESS), 1e-6)
+        shared = -(-waiting // (2 * max(self._threads, 1)))
+        return int(max(min(together, shared, _LARGEST_CHUNK), 1))
+
+    def _result(self, call: Call, index: int, outcome: bytes | BaseException) -> RolloutResult:
+        result = super()._result(call, index, outcome)
+        if isfinite(result.wall_time):  # It was not lost.
+            before = self._durations.get(call.task.digest, result.wall_time)
+            self._durations.add(call.task.digest, before + _NEWEST * (result.wall_time - before))
+        return result
+
+    def _submit(self, call: Call, chunk: Sequence[int]) -> Any:
+        name, key = self._send(call.task), f"rollouts-{uuid.uuid4().hex}"
+        points, starts = [pack(call.points[i]) for i in chunk], [call.starts[i] for i in chunk]
         try:
-            return self._client.submit(run_on_dask, *arguments, key=key, pure=False)
+            return self._client.submit(
+                self._function, name, chunk, points, starts, self._time_limit, key=key, pure=False
+            )
         except _GONE as error:
             raise _given_up(error) from error
 
@@ -244,12 +280,6 @@ class _Children:
 
 
 _children = _Children()
-
-
-def run_on_dask(name: str, index: int, point: bytes, start: bytes, time_limit: float) -> bytes:
-    """Run one rollout of the task called ``name`` on a Dask worker; return what `answer` returns."""
-    plugin: Any = get_worker().plugins[name]
-    return answer(index, partial(_roll, plugin.task, point, start, time_limit))
 
 
 def _roll(task: PickledTask, point: bytes, start: bytes, time_limit: float) -> RolloutResult:

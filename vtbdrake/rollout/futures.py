@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 from vtbdrake.failures import error_text
@@ -107,25 +108,29 @@ class FuturesExecutor(Executor):
         self, call: Call, indices: Iterable[int], *, retrying: bool = False
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Submit rollouts, as many at a time as keep all workers busy, and yield (index, result) as they finish."""
-        waiting, flying, landed = deque(indices), dict[Any, int](), self._landed()
+        waiting, flying, landed = deque(indices), dict[Any, Sequence[int]](), self._landed()
         lost: dict[int, BaseException] = {}
         refusal: _RefusedError | None = None
         try:
             while flying or (waiting and refusal is None):
                 try:
                     while waiting and refusal is None and len(flying) < self._room():
-                        future = self._submit(call, waiting[0])
-                        flying[future] = waiting.popleft()
+                        chunk = list(islice(waiting, self._chunk(call, len(waiting))))
+                        future = self._submit(call, chunk)
+                        flying[future] = chunk
                         landed.add(future)
+                        for _ in chunk:
+                            waiting.popleft()
                 except _RefusedError as error:
                     refusal = error  # Those under way come first.
                 if flying:
                     future, reply = next(landed)
-                    index, outcome = flying.pop(future), self._outcome(reply)
-                    if isinstance(outcome, self._loss) and self._retries() and not retrying:
-                        lost[index] = outcome
-                    else:
-                        yield index, self._result(call, index, outcome)
+                    landed_chunk, outcomes = flying.pop(future), self._outcomes(reply)
+                    if isinstance(outcomes, self._loss) and self._retries() and not retrying:
+                        lost.update(dict.fromkeys(landed_chunk, outcomes))
+                        continue
+                    for k, index in enumerate(landed_chunk):
+                        yield index, self._result(call, index, outcomes[k] if isinstance(outcomes, list) else outcomes)
         finally:
             self._cancel(flying)
         if refusal is not None:
@@ -148,20 +153,24 @@ class FuturesExecutor(Executor):
         """Return an empty collection that yields futures as they finish, each with its reply or error."""
         return _Landed()
 
-    def _outcome(self, reply: Any) -> bytes | BaseException:
-        """Return what `answer` has returned in the worker, or an error of the workers."""
-        outcome: bytes | BaseException = reply
-        return outcome
+    def _outcomes(self, reply: Any) -> list[bytes] | BaseException:
+        """Return what `answer` has returned in the worker for each rollout of a chunk, or an error of the workers."""
+        outcomes: list[bytes] | BaseException = reply
+        return outcomes
 
     def _room(self) -> int:
-        """Return how many rollouts may be under way."""
+        """Return how many chunks may be under way."""
         return self._in_flight or 2 * _workers(self._pool)
 
-    def _submit(self, call: Call, index: int) -> Any:
-        """Return the future of a rollout."""
-        point = pack(call.points[index])
+    def _chunk(self, call: Call, waiting: int) -> int:
+        """Return how many of the rollouts that wait travel together next."""
+        return 1
+
+    def _submit(self, call: Call, chunk: Sequence[int]) -> Any:
+        """Return the future of some rollouts, which a worker runs one after another."""
+        points, starts = [pack(call.points[i]) for i in chunk], [call.starts[i] for i in chunk]
         try:
-            return self._pool.submit(run_in_pool, call.task, index, point, call.starts[index])
+            return self._pool.submit(run_in_pool, call.task, chunk, points, starts)
         except RuntimeError as error:  # It is broken, or was shut down.
             if isinstance(error, self._loss) and self._retries():
                 future: concurrent.futures.Future[bytes] = concurrent.futures.Future()
@@ -221,6 +230,9 @@ class _Worker:
 _worker = _Worker()
 
 
-def run_in_pool(task: PickledTask, index: int, point: bytes, start: bytes) -> bytes:
-    """Run one rollout in a worker of the pool; return what `answer` returns."""
-    return answer(index, partial(_worker.run, task, point, start))
+def run_in_pool(
+    task: PickledTask, indices: Sequence[int], points: Sequence[bytes], starts: Sequence[bytes]
+) -> list[bytes]:
+    """Run rollouts in a worker of the pool; return what `answer` returns for each."""
+    rollouts = (partial(_worker.run, task, point, start) for point, start in zip(points, starts, strict=True))
+    return [answer(index, rollout) for index, rollout in zip(indices, rollouts, strict=True)]
