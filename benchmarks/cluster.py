@@ -1,4 +1,4 @@
-"""Efficiency of a cluster of a thousand worker slots: scheduler, client and messages are real, the rollouts only wait."""
+"""Efficiency of a thousand worker slots: scheduler, client and messages are real, the rollouts only wait."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TIMES = np.linspace(0.0, 15.0, 151)
 
 
 def cluster_projection() -> list[Benchmark]:
-    """The throughput of rollouts of half a second over that of workers that do nothing else, from the first to the last.
+    """The throughput of rollouts over that of workers that do nothing else, from the first rollout to the last.
 
     A real network, and the building of the testbeds, are left out.
     """
