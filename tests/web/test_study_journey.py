@@ -44,6 +44,7 @@ def scene(page: Page) -> np.ndarray:
 
 def place_of(page: Page, chart: str, trial: int) -> tuple[float, float]:
     """Where a trial lies on the screen."""
+    drawn(page, f"vtb.{chart}.draws > 0")
     x, y = page.evaluate(f"(k) => [vtb.{chart}.x(vtb.{chart}.data.x[k]), vtb.{chart}.y(vtb.{chart}.data.y[k])]", trial)
     box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
     assert box is not None

@@ -110,6 +110,8 @@ class Host:
     def close(self) -> None:
         """End the server and all its connections."""
         self._server.should_exit = True
+        for task in tuple(self._server.server_state.tasks):  # Browsers do not end them by themselves.
+            task.get_loop().call_soon_threadsafe(task.cancel)
         self._thread.join()
         self._socket.close()
 

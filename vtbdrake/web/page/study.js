@@ -96,8 +96,8 @@ class Page {
     document.title = `${hello.name}: study`;
     this.#build();
     document.body.dataset.page = "open";
-    if (!hello.simulates) this.say(`no rollouts are shown: ${hello.obstacle}`, "", "obstacle");
-    if (hello.changes.length) this.say(`the code has changed since: ${hello.changes.join("; ")}`, "bad", "changes");
+    if (!hello.simulates) this.#note(`no rollouts are shown: ${hello.obstacle}`, "obstacle");
+    if (hello.changes.length) this.#note(`the code has changed since: ${hello.changes.join("; ")}`, "changes");
   }
 
   #build() {
@@ -112,13 +112,13 @@ class Page {
     this.steering = new Steering(this);
     this.landscape = new Scatter("vtb-landscape", {
       ...events,
-      height: 0.32,
+      height: 0.3,
       drags: () => (this.steering.forbids && this.parameters.length > 1 ? "box" : ""),
       ondrag: (from, to) => this.steering.forbid([Number(this.xAxis.value), Number(this.yAxis.value)], from, to),
     });
-    this.parallel = new Parallel("vtb-parallel", { ...events, height: 0.32 });
-    this.pareto = new Scatter("vtb-pareto", { ...events, height: 0.32, drags: () => "target", ondrag: (_, to) => this.steering.aim(to) });
-    this.history = new Scatter("vtb-history-chart", { ...events, height: 0.15, onclick: (k) => k >= 0 && this.#pin(k) });
+    this.parallel = new Parallel("vtb-parallel", { ...events, height: 0.3 });
+    this.pareto = new Scatter("vtb-pareto", { ...events, height: 0.3, drags: () => "target", ondrag: (_, to) => this.steering.aim(to) });
+    this.history = new Scatter("vtb-history-chart", { ...events, height: 0.14, onclick: (k) => k >= 0 && this.#pin(k) });
     this.xAxis = choice("vtb-x", "horizontal axis", labels, 0);
     this.yAxis = choice("vtb-y", "vertical axis", labels.length > 1 ? labels : ["value"], Math.min(1, labels.length - 1));
     this.quality = choice("vtb-quality", "quality", this.qualities.map(({ name }) => name), 0);
@@ -239,6 +239,12 @@ class Page {
     if (kind) shown.dataset.kind = kind;
     else setTimeout(() => shown.remove(), 8000);
     return shown;
+  }
+
+  // Shows a message until it is clicked.
+  #note(text, kind) {
+    const shown = this.say(text, "", kind);
+    Object.assign(shown, { title: "a click hides it", onclick: () => shown.remove() });
   }
 
   takeBack(kind) {
