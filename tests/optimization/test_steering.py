@@ -199,6 +199,7 @@ def test_without_an_intervention_a_study_is_what_it_would_have_been(tmp_path):
     assert table(kept_first)[: len(first)] == first
 
 
+@pytest.mark.one_python
 @pytest.mark.parametrize("solver", ["auto", "bayesian", "TPE", "NSGA-II", "cmaes", "differential-evolution", "CEM"])
 def test_nothing_is_simulated_in_a_forbidden_region(solver):
     if solver in ("TPE", "NSGA-II"):
@@ -224,6 +225,7 @@ def test_a_forbidden_point_is_no_longer_the_best_until_it_is_allowed():
     assert study.best == best
 
 
+@pytest.mark.one_python
 def test_a_race_is_not_won_by_a_forbidden_point():
     """The best point by far is forbidden; racing must not compare the others with it."""
     conditions = [{DAMPING: damping} for damping in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)]
@@ -235,7 +237,7 @@ def test_a_race_is_not_won_by_a_forbidden_point():
 
     study = problem.study(solver="cmaes", seed=2)
     study.add([0.3, 0.0])
-    study.run(rollouts=300, racing=True, callbacks=[forbid], **SERIAL)
+    study.run(rollouts=120, racing=True, callbacks=[forbid], **SERIAL)
     later = [trial for trial in study.trials if trial.batch > 0]
     assert any(trial.exact for trial in later) and any(not trial.exact for trial in later)
     assert study.best.batch > 0 and study.best.exact
@@ -348,6 +350,7 @@ def _schaffer(values):
     return x**2 + y**2, ((x - 2.0) ** 2 + y**2,)
 
 
+@pytest.mark.one_python
 def test_an_aspiration_leads_to_the_point_of_the_front_at_which_it_aims():
     end = {"minimize": True, "reading": "end"}
     problem = pendulum_problem(
@@ -510,3 +513,63 @@ def test_a_study_in_a_folder_that_cannot_be_written_is_read_and_not_changed():
             assert (study.search.solver, study.interventions) == ("CMA-ES", ())
             with pytest.raises(StudyError, match="the permissions of the file and its folder"):
                 study.intervene("freeze", address=RATE, value=0.0)
+
+
+class Interrupting(StatedExecutor):
+    """An executor in which Ctrl-C arrives before a rollout."""
+
+    def __init__(self, outcome, *, before: int) -> None:
+        super().__init__(outcome)
+        self._left = before
+
+    def run(self, task, points):
+        for result in super().run(task, points):
+            if self._left == 0:
+                raise KeyboardInterrupt
+            self._left -= 1
+            yield result
+
+
+@pytest.mark.parametrize("before", [3, 8, 14])
+def test_a_batch_that_was_interrupted_is_finished_as_it_was_begun(tmp_path, before):
+    """In a race, a second point would change which rollouts the first one takes."""
+
+    def outcome(values):
+        return abs(values[THETA] - 0.3) + values[DAMPING], ()
+
+    conditions = [{DAMPING: 0.1 * k} for k in range(10)]
+    problem = pendulum_problem(conditions=conditions, quality=Quality(gap, THETA, minimize=True, reading="end"))
+    study = problem.study(tmp_path / "a.db", solver="cmaes", seed=1)
+    study.add([0.2, 0.0])
+    study.run(rollouts=120, racing=True, executor=Interrupting(outcome, before=before), progress=False)
+    assert study.reason == "interrupted" and len(study) == before
+    study.add([0.3, 0.0])
+    study.intervene("range", address=THETA, lower=0.0)
+    study.run(rollouts=120, racing=True, executor=StatedExecutor(outcome), progress=False)
+    assert [intervention.batch for intervention in study.interventions] == [0, 1, 1]
+    again = study.replay(reuse=False, executor=StatedExecutor(outcome), progress=False)
+    assert table(again) == table(study)
+    complete = {trial.point for trial in study.trials}
+    assert {key for key in study.rollouts if key[0] in complete} == {
+        key for key in again.rollouts if key[0] in complete
+    }
+
+
+@pytest.mark.one_python
+def test_a_long_design_goes_on_behind_its_known_points_and_counts_none_twice():
+    executor = StatedExecutor(lambda values: (values[THETA], ()))
+    study = pendulum_problem().study(solver="sobol", seed=1)
+    forbid = (3500, "forbid", {"region": {THETA: [0.0, 1.4]}})
+    study.run(rollouts=3700, callbacks=[steering(forbid)], executor=executor, progress=False)
+    assert len(study.trials) == len({trial.point for trial in study.trials}) == 3700
+    last = [trial.parameters[THETA] for trial in study.trials if trial.batch >= study.interventions[0].batch]
+    assert len(last) > 100 and not any(0.0 <= theta <= 1.4 for theta in last)
+
+
+def test_a_larger_budget_of_run_makes_the_changes_at_the_same_batches(tmp_path):
+    study = pendulum_problem().study(tmp_path / "a.db", solver="cmaes", seed=1)
+    changes = [(7, "range", {"address": THETA, "lower": 0.0}), (13, "freeze", {"address": RATE, "value": 0.25})]
+    study.run(rollouts=24, callbacks=[steering(*changes)], **SERIAL)
+    study.run(rollouts=48, **SERIAL)
+    whole = pendulum_problem().study(seed=1, solver="cmaes").run(rollouts=48, callbacks=[steering(*changes)], **SERIAL)
+    assert [trial.point for trial in study.trials] == [trial.point for trial in whole.trials]

@@ -237,7 +237,8 @@ def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:
 def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
     """Return the point of a trial; None if its parameters are not all drawn yet."""
     params = {**trial.system_attrs.get("fixed_params", {}), **trial.params}
-    addresses = [parameter.address for parameter in study.parameters]
+    parameters = study.parameters
+    addresses = [parameter.address for parameter in parameters]
     foreign = [key for key in params if key not in addresses]
     missing = [address for address in addresses if address not in params]
     if foreign or (missing and trial.state.is_finished()):
@@ -247,4 +248,4 @@ def _point(study: Study, trial: FrozenTrial, name: str) -> Point | None:
         )
     if missing:
         return None
-    return tuple(p.as_value(params[p.address]) for p in study.parameters)
+    return tuple(p.as_value(params[p.address]) for p in parameters)

@@ -13,9 +13,10 @@ import numpy as np
 
 from vtbdrake.argument_checks import as_number, as_whole
 from vtbdrake.optimization.identity import dimensions, plain
-from vtbdrake.optimization.parameter import Choice, Dimension, Parameter, checked_point
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.records import Intervention
 from vtbdrake.optimization.solvers import Evaluation, Point, Solver, SolverError, make_solver
+from vtbdrake.optimization.solvers.designs import Design
 from vtbdrake.optimization.solvers.solver import rank_key
 
 PAUSE, RESUME, STOP, TRY = "pause", "resume", "stop", "try"
@@ -255,10 +256,13 @@ class SteeredSolver:
     Args:
         search: The search with which the study begins.
         racing: Whether points are raced.
+
+    Attributes:
+        circles: Whether the method has asked for all points of its last batch before.
     """
 
-    # So many batches of forbidden points in a row end the solver.
-    patience = 1000
+    # So many forbidden points in a row end the solver; of a design, which costs nothing, so many.
+    patience, patience_of_designs = 2000, 1_000_000
 
     def __init__(self, search: StudySearch, *, racing: bool) -> None:
         self.search = search
@@ -266,9 +270,13 @@ class SteeredSolver:
         self._spent = 0.0
         self._evaluations: dict[Point, Evaluation] = {}
         self._proposed: list[Point] = []
+        # The points that were known when the method began, and those that it has asked for.
+        self._earlier: frozenset[Point] = frozenset()
+        self._repeated: set[Point] = set()
         self._scalar = search.achievement(())
         self._solver = search.make_solver(evaluations=self._left, racing=racing)
         self._message = ""
+        self.circles = False
 
     @property
     def _left(self) -> float:
@@ -325,20 +333,30 @@ class SteeredSolver:
             start = inside[min(usable)[1]].point
             fresh = search.make_solver(evaluations=self._left, start=start, racing=self._racing, begun=True)
         self._solver = fresh
+        self._earlier, self._repeated = frozenset(self._evaluations), set()
         if scalar:
             self._solver.tell(scalar)
 
     def ask(self) -> list[Point]:
         """Return the points to be evaluated next; an empty list when the solver has ended."""
-        for _ in range(self.patience):
+        patience = self.patience_of_designs if isinstance(self._solver, Design) else self.patience
+        forbidden = 0
+        while forbidden < patience:
             self._proposed = [self.search.complete(point) for point in self._solver.ask()]
             points = [point for point in self._proposed if self.search.allows(point)]
             if points or not self._proposed:
+                self.circles = bool(points) and self._repeated.issuperset(points)
+                self._repeated.update(points)
                 return points
+            forbidden += len(self._proposed)
             self._answer([])
-        self._message = f"{self.patience} times in a row it asked for points in forbidden regions only"
+        self._message = f"{forbidden} points in a row lay in forbidden regions"
         self._solver.close()
         return []
+
+    def repeats(self, evaluation: Evaluation) -> bool:
+        """Return whether the point was evaluated before the present method began."""
+        return evaluation.point in self._earlier
 
     def tell(self, evaluations: Sequence[Evaluation]) -> None:
         """Tell the evaluations of the points asked for, in their order."""
@@ -477,8 +495,7 @@ def _solver(search: StudySearch, _: int, *, solver: Any, options: Any = None) ->
 
 
 def _try(search: StudySearch, _: int, *, point: Any) -> StudySearch:
-    checked_point(search.widest, point)
-    return search
+    return search  # The point was checked where it was written.
 
 
 def _aspiration(search: StudySearch, _: int, *, targets: Any) -> StudySearch:

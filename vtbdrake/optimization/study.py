@@ -338,7 +338,11 @@ class Study:
         return self._file.intervene(kind, stored, name=safe_text(by) if by else _user(), check=self._check)
 
     def _check(self, interventions: Sequence[Intervention]) -> None:
-        StudySearch.of(self._meta).after(interventions).check()
+        search = StudySearch.of(self._meta).after(interventions)
+        search.check()
+        for intervention in interventions:
+            if intervention.kind == TRY and intervention.batch is None:
+                checked_point(search.widest, intervention.payload["point"])  # A range may not be that wide any more.
 
     def _refuse_if_finished(self, kind: str) -> None:
         if self.is_running:
@@ -418,6 +422,8 @@ class Study:
             search = search.after([intervention])
             if intervention.kind != TRY:
                 search.check()
+            else:
+                checked_point(search.widest, intervention.payload["point"])
         study = Study(StudyFile(path, meta=self._file.description), self._problem)
         study._file.copy_interventions(changes)
         study._run(

@@ -170,7 +170,8 @@ class StudyRun:
             if batch >= self._completed:
                 self._after_batch(batch)
             if batch >= self._new_from:
-                silent = 0 if len(self._outcomes) > before else silent + 1
+                new = len(self._outcomes) > before or not self._solver.circles
+                silent = 0 if new else silent + 1
             self._show_best()
             batch += 1
         return SOLVER, f"{self._solver.name} asks only for points that are known"
@@ -199,6 +200,7 @@ class StudyRun:
         Raises:
             _RunEnd: Someone has stopped the study, or the time is over.
         """
+        logged = False
         while True:
             waiting = self._file.interventions(waiting=True)
             controls = [intervention for intervention in waiting if intervention.kind in CONTROLS]
@@ -210,9 +212,12 @@ class StudyRun:
             for control in controls:
                 if control.kind == STOP:
                     raise _RunEnd(STOPPED, f"{control.name} stopped it (intervention {control.number})")
-                _log.info("the study is %sd by %s", control.kind, control.name)
+                _log.info("%s by %s (intervention %d)", control.kind, control.name, control.number)
             if not self._newest.paused:
                 return [intervention for intervention in waiting if intervention.kind not in CONTROLS]
+            if not logged:
+                _log.warning("the study is paused, and waits for resume() or `vtbdrake study resume`")
+            logged = True
             self._end_at_deadline()
             time.sleep(POLL_PERIOD)
 
@@ -220,7 +225,8 @@ class StudyRun:
         """Return whether rollouts of a batch were finished by a run that was interrupted in it."""
         if batch > self._new_from:
             return False
-        tried = {self._tried(i) for i in self._file.interventions() if i.kind == TRY}
+        # Points that wait may have been run elsewhere.
+        tried = {self._tried(i) for i in self._file.interventions(waiting=True) if i.kind == TRY}
         since = islice(self._outcomes, self._file.rollouts_before(), None)
         return any(key not in self._evaluator.needed and key[0] not in tried for key in since)
 
@@ -383,7 +389,9 @@ class StudyRun:
                 batch=batch,
             )
             for position, (evaluation, (origin, method)) in enumerate(zip([*by_hand, *proposed], origins, strict=True))
-            if (complete or evaluation.exact) and not self._recorded(evaluation)
+            if (complete or evaluation.exact)
+            and not self._recorded(evaluation)
+            and not (origin == "solver" and self._solver.repeats(evaluation))
         }
         self._file.save_trials(batch, trials, complete=complete)
 
