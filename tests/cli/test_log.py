@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 import pytest
 
-from tests.cli.program import error_of, run
+from tests.cli.program import PENDULUM, error_of, run
 from tests.recording.servo import Servo
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
@@ -124,3 +124,25 @@ def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
         (("export", path, tmp_path / "run.xls"), "ends in .csv or .mcap or .parquet"),
     ]:
         assert expected in error_of(*arguments)
+
+
+def test_log_that_cannot_be_viewed_is_told(path: Path, tmp_path: Path) -> None:
+    servo = SCENARIO[1]
+    assert f"{path} is of the scenario {servo}, not of tests.testbeds:PendulumScenario" in error_of(
+        "view", "tests.testbeds:PendulumScenario", "--log", path
+    )
+    other = error_of("view", servo, "--field", "rate=3.5", "--log", path)
+    assert "the log is of another scenario" in other and "rate" in other
+    (tmp_path / "cut.lcm").write_bytes(path.read_bytes()[:600])
+    assert "cut.lcm" in error_of("view", servo, "--log", tmp_path / "cut.lcm")
+    (tmp_path / "text.lcm").write_text("a text")
+    assert "is not a log of a control loop" in error_of("view", servo, "--log", tmp_path / "text.lcm")
+    assert "leave out --set, --start and --vr" in error_of("view", servo, "--log", path, "--set", "dps.gain=2")
+
+
+def test_problem_that_cannot_be_viewed_is_told() -> None:
+    assert "expected MODULE:NAME" in error_of("view", PENDULUM, "--problem", "nothing")
+    assert "cannot import nothing" in error_of("view", PENDULUM, "--problem", "nothing:problem")
+    assert "is no Problem" in error_of("view", PENDULUM, "--problem", "tests.testbeds:PENDULUM")
+    other = error_of("view", PENDULUM, "--problem", "tests.web.test_drive:problem")
+    assert "the problem is one of LimitedPendulumScenario" in other

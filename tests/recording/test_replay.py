@@ -176,6 +176,15 @@ def test_testbed_replays_log_of_dps_alone(tmp_path: Path) -> None:
     assert (report.record["sim.sys.axes.discrete_state_0"] == 0.0).all(), "the simulated world is idle"
 
 
+def test_testbed_replays_log_of_dps_that_had_been_started(tmp_path: Path) -> None:
+    servo = Servo()
+    servo.runtime.run(cycles=19)
+    log = recorded(tmp_path, servo)
+    assert not log.changes
+    report = replay(log, servo.scenario.build())
+    assert report.identical and report.digests == 60, report
+
+
 def test_dps_alone_rejects_simulated_sensors(tmp_path: Path) -> None:
     servo = Servo(alone=False)
     log = recorded(tmp_path, servo, lambda: servo.runtime.switch(sense={"speed": "sim"}))

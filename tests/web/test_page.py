@@ -10,14 +10,22 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.control.scripted import ScriptedBridge
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
+from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.recording.recorder import Recorder
 from vtbdrake.state import Snapshot
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 # Tints of the ghosts.
 GREEN, BLUE, YELLOW = np.array([0, 158, 115]), np.array([0, 114, 178]), np.array([230, 159, 0])
+
+ANGLE_OF_DRIVE = "parseFloat(document.querySelector('#vtb-drive-status').textContent.match(/u.angle +(\\S+)/)?.[1])"
+
+PURPLE = np.array([156, 0, 200])  # the recorded course
 
 pytestmark = [pytest.mark.slow, needs_chromium]
 
@@ -253,7 +261,10 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path)
         opened.click("#vtb-drive-begin")
         opened.wait_for_selector("#vtb-drive-keep")
         opened.keyboard.down("ArrowRight")
-        drawn(opened, "parseFloat(vtb.parts[0].status.textContent.match(/u.angle +(\\S+)/)?.[1]) > 0.1")
+        drawn(
+            opened,
+            "parseFloat(document.getElementById('vtb-drive-status').textContent.match(/u.angle +(\\S+)/)?.[1]) > 0.1",
+        )
         opened.keyboard.up("ArrowRight")
         assert 0.1 < running.session.snapshot()["u.angle"] <= 1.0
         opened.click("#vtb-drive-drop")
@@ -262,7 +273,10 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path)
         assert running.session.snapshot()["u.angle"] == 0.0
         opened.click("#vtb-drive-begin")
         opened.evaluate("window.axes = [-0.5, 0, 0, 0]")
-        drawn(opened, "parseFloat(vtb.parts[0].status.textContent.match(/u.angle +(\\S+)/)?.[1]) < -0.1")
+        drawn(
+            opened,
+            "parseFloat(document.getElementById('vtb-drive-status').textContent.match(/u.angle +(\\S+)/)?.[1]) < -0.1",
+        )
         opened.click("#vtb-drive-keep")
         opened.wait_for_selector("#vtb-drive-begin")
         assert -1.0 <= running.session.snapshot()["u.angle"] < -0.1
@@ -271,4 +285,43 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path)
         opened.click("#vtb-save-test")
         drawn(opened, "vtb.messages.textContent.includes('test_to_the_left.py')")
         assert sorted(file.suffix for file in tmp_path.glob("test_to_the_left.*")) == [".py", ".vtb"]
+        opened.close()
+
+
+def record_swing(path: Path) -> None:
+    """Record a simulated run of the pendulum, which follows a command."""
+    scenario, clock = LimitedPendulumScenario(), SimulatedClock()
+    bridge = ScriptedBridge(scenario.interface(), clock, lambda time: {})
+    with Runtime(scenario.build(), bridge, period=0.01, clock=clock) as runtime, Recorder(runtime, path):
+        runtime.write({"u.angle": 0.9})
+        runtime.run(cycles=400)
+
+
+def test_log_is_replayed_and_left_with_its_course_as_a_ghost(browser: Browser, tmp_path: Path) -> None:
+    record_swing(tmp_path / "swing.lcm")
+    with view(log=tmp_path / "swing.lcm") as running:
+        opened = browser.new_page(viewport={"width": 1000, "height": 650})
+        opened.set_default_timeout(PATIENCE)
+        opened.goto(running.url)
+        opened.wait_for_selector("body[data-log=recorded][data-frame]", state="attached")
+        assert "swing.lcm: what was recorded" in opened.locator("#vtb-log").inner_text()
+        opened.keyboard.press("Space")
+        drawn(opened, "parseFloat(vtb.clock.textContent) > 0.5")
+        opened.keyboard.press("Space")
+        drawn(opened, "vtb.rate.textContent === 'paused'")
+        assert share(picture(opened), PURPLE) < 1e-4
+        watch(opened, "u.angle")
+        assert opened.locator(".vtb-watched input[type=text]").input_value() == "0.9"
+        opened.fill(".vtb-watched input[type=text]", "-0.9")
+        opened.keyboard.press("Enter")
+        opened.wait_for_selector("body[data-log=simulated]", state="attached")
+        left = running.session.snapshot().time
+        running.session.advance(40)
+        drawn(opened, f"parseFloat(vtb.clock.textContent) > {left + 0.3}")
+        settle(opened)
+        assert share(picture(opened), PURPLE) > 0.001
+        opened.click("#vtb-back-to-log")
+        opened.wait_for_selector("body[data-log=recorded]", state="attached")
+        settle(opened)
+        assert share(picture(opened), PURPLE) < 1e-4
         opened.close()

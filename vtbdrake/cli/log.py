@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,6 +12,35 @@ from vtbdrake.cli.completion import complete_scenario
 from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
 from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
 from vtbdrake.failures import one_line
+
+if TYPE_CHECKING:
+    from vtbdrake.recording import ControlLog
+
+
+def opened_log(log: Path, scenario: str | None) -> ControlLog:
+    """Return a log whose scenario the user has named, since importing it runs its code.
+
+    Raises:
+        click.UsageError: The scenario is another one, or was not named.
+        LogError: The file is no log, or of a script or a notebook.
+    """
+    from vtbdrake.recording.log_reader import read_log
+    from vtbdrake.testbed.scenario import class_name
+    from vtbdrake.testbed.scenario_file import scenario_class
+
+    opened = read_log(log)
+    recorded = opened.header.scenario_name
+    if opened.header.of_main_module:
+        opened.header.make_scenario()  # It raises: the class is in a script or a notebook.
+    if scenario is None and recorded:
+        raise click.UsageError(
+            f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "
+            f"--scenario {recorded}"
+        )
+    if scenario is not None and (requested := class_name(scenario_class(scenario))) != recorded:
+        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
+    return opened
+
 
 _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 
@@ -47,26 +76,13 @@ def replay(
     Example:
       vtbdrake replay run.lcm --scenario vtbdrake_diagrams.manipulator:ManipulatorScenario
     """
-    from vtbdrake.recording.log_reader import read_log
     from vtbdrake.recording.replay import DIFFERENT
     from vtbdrake.recording.replay import replay as replay_log
     from vtbdrake.testbed import DpsAlone
-    from vtbdrake.testbed.scenario import class_name
-    from vtbdrake.testbed.scenario_file import scenario_class
 
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
-    opened = read_log(log)
-    recorded = opened.header.scenario_name
-    if opened.header.of_main_module:
-        opened.header.make_scenario()  # It raises: the class is in a script or a notebook.
-    if scenario is None and recorded:
-        raise click.UsageError(
-            f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "
-            f"--scenario {recorded}"
-        )
-    if scenario is not None and (requested := class_name(scenario_class(scenario))) != recorded:
-        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
+    opened = opened_log(log, scenario)
     target = None if on == "recorded" else DpsAlone(opened.scenario) if on == "dps" else opened.scenario.build()
     report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:

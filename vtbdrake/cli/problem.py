@@ -53,10 +53,11 @@ def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def problem_or_file_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command a scenario and what states a problem, or the file of a problem as ``scenario``."""
-    return scenario_argument(_statement(required=False)(command), parse=_parse_problem, metavar="SCENARIO|PROBLEM.yaml")
+    return scenario_argument(_statement(required=False)(command), parse=parse_problem, metavar="SCENARIO|PROBLEM.yaml")
 
 
-def _parse_problem(text: str) -> Scenario | ProblemFile:
+def parse_problem(text: str) -> Scenario | ProblemFile:
+    """Load a scenario, or the file of a problem."""
     if ":" in text or not text.endswith((".yaml", ".yml")):
         return parse_scenario(text)
     from vtbdrake.optimization import ProblemFile

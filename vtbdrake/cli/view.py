@@ -2,26 +2,61 @@
 
 from __future__ import annotations
 
+import importlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from vtbdrake.cli.log import opened_log
 from vtbdrake.cli.options import Setting, option, parse_url, scenario_argument, set_option, settings, start_option
 from vtbdrake.cli.output import json_option
 from vtbdrake.cli.page import browser_option, page_options, serve
+from vtbdrake.cli.problem import parse_problem
 
 if TYPE_CHECKING:
+    from vtbdrake.optimization import Problem, ProblemFile
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
+def _named_problem(text: str) -> Problem:
+    """Return the problem ``module:name``, or what the function of that name returns."""
+    from vtbdrake.optimization import Problem
+
+    module_name, _, name = text.partition(":")
+    if not (module_name and name):
+        raise click.BadParameter(f"expected MODULE:NAME, a Problem or a function that returns one, not {text!r}")
+    try:
+        problem = getattr(importlib.import_module(module_name), name, None)
+    except ImportError as error:
+        raise click.BadParameter(f"cannot import {module_name}: {error}") from error
+    problem = problem() if callable(problem) else problem
+    if not isinstance(problem, Problem):
+        raise click.BadParameter(f"{text} is no Problem, and no function that returns one")
+    return problem
+
+
 @click.command()
-@scenario_argument
+@partial(scenario_argument, parse=parse_problem, metavar="SCENARIO|PROBLEM.yaml")
 @set_option
 @start_option
+@option(
+    "--problem MODULE:NAME",
+    "The problem of the scenario whose f judges what is driven by hand; or a function that makes it.",
+    parse=_named_problem,
+)
+@option("--log FILE", "Replay this log of the scenario; what is changed goes on in simulation.", type=_FILE)
+@option(
+    "--save-in FOLDER",
+    "The folder of the tests that the page saves.",
+    name="folder",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default=".",
+)
 @page_options
 @option("--vr", "Let headsets that open the page lead the robot by a hand.", is_flag=True)
 @option(
@@ -36,9 +71,12 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 @browser_option
 @json_option
 def view(
-    scenario: Scenario,
+    scenario: Scenario | ProblemFile,
     values: tuple[Setting, ...],
     start: Snapshot | None,
+    problem: Problem | None,
+    log: Path | None,
+    folder: Path,
     page: dict[str, Any],
     vr: bool,
     url: str | None,
@@ -57,22 +95,37 @@ def view(
     Example:
       vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario
       vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario --url tcpq://127.0.0.1:7700
+      vtbdrake view vtbdrake_diagrams.manipulator:ManipulatorScenario --log arm.lcm
     """
+    from vtbdrake.testbed import Scenario
     from vtbdrake.web import view as open_view
     from vtbdrake.web import view_loop
     from vtbdrake.web.tls import Tls
 
     if (certificate or key) and not tls:
         raise click.UsageError("--certificate and --key go with --tls")
+    if not isinstance(scenario, Scenario):
+        if problem is not None:
+            raise click.UsageError(f"{scenario.path} is a problem already: leave --problem out")
+        problem, scenario = scenario.problem, scenario.problem.scenario
     page |= {"tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
     if url and not vr:
-        if values or start is not None or play:
-            raise click.UsageError("a loop is shown as it is: leave --set, --start and --play out, or --url")
+        if values or start is not None or play or problem is not None or log is not None:
+            raise click.UsageError(
+                "a loop is shown as it is: leave --set, --start, --play, --problem and --log out, or --url"
+            )
         with view_loop(scenario, url, **page) as watched:
             serve(watched.url, browser=browser)
         return
-    page |= {"vr": vr, "url": url or ""}
-    with open_view(scenario, start=start, values=settings(values), **page) as running:
+    viewed: Scenario | None = scenario
+    if log is not None:
+        if values or start is not None or vr:
+            raise click.UsageError("--log replays what was recorded: leave out --set, --start and --vr")
+        page |= {"log": opened_log(log, scenario.name())}
+        # The log describes its scenario; fields that were set have to be the recorded ones.
+        viewed = None if scenario.record() == type(scenario)().record() else scenario
+    page |= {"problem": problem, "folder": folder, "vr": vr, "url": url or ""}
+    with open_view(viewed, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()
         serve(running.url, browser=browser)

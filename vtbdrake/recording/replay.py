@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
@@ -34,7 +35,7 @@ from vtbdrake.state import Snapshot, SnapshotError
 from vtbdrake.testbed import DpsAlone, VirtualTestbed, slow_parts
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.interrupt import Interruptible
-from vtbdrake.testbed.switch import COMMAND, Position
+from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE, Position
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +44,7 @@ IDENTICAL, DIFFERENT, NOT_COMPARED = "identical", "different", "not compared"
 Target = VirtualTestbed | DpsAlone
 
 _TICK = "tick"  # key of a sample's number in a result of a slow part
+_KEPT_PERIOD, _MOST_KEPT = 1.0, 500  # s between two states that are kept, and how many
 _BATCH = 250  # cycles; a trajectory source searches all its samples in every step
 _TOLERANCE = 1e-9  # s, of the time of a sample
 
@@ -164,12 +166,22 @@ def _recorded_target(log: ControlLog) -> Target:
     return DpsAlone(scenario) if log.header.target == DPS else scenario.build()
 
 
+class _ReplayState(NamedTuple):
+    """Where a replay stands: the cycles that it has replayed, the steps of the DPS, whether it idles, and its state."""
+
+    cycles: int
+    steps: int
+    idle: bool
+    snapshot: Snapshot
+
+
 class _Replay:
     """A replay cycle by cycle, up to the first gap.
 
     Attributes:
         same_kind: Whether the target is of the recorded kind, testbed or DPS alone.
         errors: Exceptions of the DPS, by the number of the cycle.
+        index: The number of cycles that have been replayed; ``count`` of them can be.
     """
 
     def __init__(self, log: ControlLog, target: Target, values: dict[str, Any], record: Sequence[str]) -> None:
@@ -195,6 +207,7 @@ class _Replay:
             ChangeKind.RESET: lambda values: None,
             ChangeKind.RESULT: self._deliver,
         }
+        self.index = 0
         self.count = n = int(np.searchsorted(log.numbers, log.gaps[0].first)) if log.gaps else len(log)
         self.ended = f"the replay ends where the log lacks {log.gaps[0]}" if log.gaps else ""
         self.times = np.empty(n)
@@ -218,30 +231,72 @@ class _Replay:
     def _time(self, steps: int) -> float:
         return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)
 
+    @cached_property
+    def _vectors(self) -> list[tuple[list[bool], str, np.ndarray]]:
+        """Return where each vector sensor signal has a new value, its name, and its values."""
+        log = self._log
+        return [(_changed(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
+
+    @cached_property
+    def _changes(self) -> Mapping[int, list[Change]]:
+        return self._changes_by_cycle()
+
+    @cached_property
+    def _digested(self) -> set[int]:
+        return {i for i, _ in self._log.digests}
+
     def run(self) -> None:
-        log, feed, context = self._log, self._ports.feed, self._context
-        vectors = [(_changed(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
-        changes = self._changes_by_cycle()
-        digests = {i for i, _ in log.digests}
         with Interruptible() as interruptible:
-            for i in range(self.count):
+            while self.index < self.count:
                 interruptible.raise_interrupt()
-                for changed, name, values in vectors:
-                    if changed[i]:
-                        feed(name, values[i])
-                for name, decode in self._decoders.items():
-                    if event := log.sources[name][i]:
-                        feed(name, decode(event))
-                # After the feed: a switch may let the DPS see it.
-                for change in changes.get(i, ()):
-                    self._apply(change)
-                if not self._idle:
-                    self._step(i)
-                self.times[i] = self._now
-                if i in digests:
-                    self.digests.append((i, self._digest()))
-                for address, read in self._readers.items():
-                    self.record[address].append(read(context))
+                self.advance()
+
+    def advance(self) -> None:
+        """Replay the next cycle."""
+        i, feed = self.index, self._ports.feed
+        for changed, name, values in self._vectors:
+            if changed[i]:
+                feed(name, values[i])
+        for name, decode in self._decoders.items():
+            if event := self._log.sources[name][i]:
+                feed(name, decode(event))
+        # After the feed: a switch may let the DPS see it.
+        for change in self._changes.get(i, ()):
+            self._apply(change)
+        if not self._idle:
+            self._step(i)
+        self.times[i] = self._now
+        if i in self._digested:
+            self.digests.append((i, self._digest()))
+        for address, read in self._readers.items():
+            self.record[address].append(read(self._context))
+        self.index += 1
+
+    def state(self) -> _ReplayState:
+        """Return where the replay stands, for `go_to`."""
+        return _ReplayState(self.index, self._steps, self._idle, self._target.snapshot(self._context))
+
+    def go_to(self, state: _ReplayState) -> None:
+        """Stand again where the replay has stood."""
+        log, stepped = self._log, state.steps > self._log.header.steps
+        self._target.restore(self._context, state.snapshot)
+        self._simulator = self._target.simulator(self._context, restored=log.header.initialized or stepped)
+        self._simulator.set_target_realtime_rate(0.0)
+        for name, values in log.fed.items():
+            if log.sources[name][: state.cycles].any():
+                self._ports.feed(name, values[state.cycles - 1])
+        for name, decode in self._decoders.items():
+            events = log.sources[name][: state.cycles]
+            if events.any():
+                self._ports.feed(name, decode(events[events != 0][-1]))
+        self.index, self._steps, self._idle = state.cycles, state.steps, state.idle
+        self._now, self._next = self._time(self._steps), self._time(self._steps + 1)
+        self._find_outputs()
+
+    @property
+    def context(self) -> Context:
+        """Return the context of the replay."""
+        return self._context
 
     def _step(self, i: int) -> None:
         try:
@@ -340,6 +395,71 @@ class _Replay:
             self._slow_parts[path].deliver(self._context, result[_TICK], arrays)
 
 
+class RewindableReplay:
+    """A replay that stands at any cycle of its log, and can be moved to another one.
+
+    The state before some cycles is kept: going back continues from one of them. With an integrator with error control
+    the DPS then differs from the recorded one by about its accuracy.
+
+    Args:
+        log: The log.
+        testbed: A testbed of its scenario. If the log is of a DPS alone, its simulated world is idle.
+
+    Attributes:
+        log: The log.
+        times: Times of the DPS at the ends of the cycles that can be replayed, in seconds, shape (n,).
+        ended: Why not all cycles of the recorded run can be replayed; empty if all can.
+
+    Raises:
+        LogError: The log is of another scenario, or of another version of it; the error lists the differences.
+    """
+
+    def __init__(self, log: ControlLog, testbed: VirtualTestbed) -> None:
+        self._replay = _Replay(log, testbed, {}, ())
+        self.log = log
+        self.times = log.times[: self._replay.count]
+        self.ended = self._replay.ended or log.incomplete
+        self._every = max(1, round(_KEPT_PERIOD / log.header.period))
+        self._kept = [self._replay.state()]
+
+    @property
+    def context(self) -> Context:
+        """Return the context of the replay, always the same one."""
+        return self._replay.context
+
+    @property
+    def time(self) -> float:
+        """Return the DPS's time, in seconds."""
+        return float(self.context.get_time())
+
+    @property
+    def index(self) -> int:
+        """Return the number of cycles before the present."""
+        return self._replay.index
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether all cycles have been replayed."""
+        return self._replay.index >= self._replay.count
+
+    def advance(self) -> None:
+        """Replay the next cycle."""
+        index = self.index
+        if index % self._every == 0 and index > self._kept[-1].cycles:
+            self._kept.append(self._replay.state())
+            if len(self._kept) > _MOST_KEPT:
+                self._kept, self._every = self._kept[::2], 2 * self._every
+        self._replay.advance()
+
+    def go_to(self, index: int) -> None:
+        """Go to where ``index`` cycles have been replayed."""
+        index = min(max(index, 0), len(self.times))
+        if index < self.index:
+            self._replay.go_to([state for state in self._kept if state.cycles <= index][-1])
+        while self.index < index:
+            self.advance()
+
+
 def _bits(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=float).view(np.uint64)
 
@@ -375,6 +495,8 @@ def _restore(log: ControlLog, target: Target, context: Context) -> None:
             target.restore(context, log.start)
         else:
             _restore_dps(target, context, log.start)
+            if not log.header.idle:  # It has been started before: there is no change of a switch in the log.
+                target.write(context, dict.fromkeys(_switches(target), Position.REAL.number))
     except SnapshotError as error:
         raise LogError(f"the scenario is built in another way than the one of {log.path}: {error}") from error
 
@@ -387,6 +509,12 @@ def _restore_dps(testbed: VirtualTestbed, context: Context, start: Snapshot) -> 
     testbed.restore(context, Snapshot(start.time, {**snapshot.values, **values}, {**snapshot.groups, **groups}))
     commands = [f"{COMMAND}{signal.name}" for signal in testbed.interface.commands]
     testbed.write(context, {a: start[a] for a in commands if a in testbed.variables()})
+
+
+def _switches(testbed: VirtualTestbed) -> list[str]:
+    """Return the addresses of all switches; as variables they can be thrown before anything feeds the real ports."""
+    interface = testbed.interface
+    return [*(f"{T_SENSE}{signal.name}" for signal in interface.sense), *(f"{T_ACT}{s.name}" for s in interface.act)]
 
 
 def _check_fed_by_machine(log: ControlLog) -> None:

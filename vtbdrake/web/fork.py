@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -47,6 +47,11 @@ class Fork:
         testbed.write(self.context, values or {})
         self._simulator = testbed.simulator(self.context, restored=True)
         self.failure = ""
+
+    @property
+    def world(self) -> Context:
+        """Return the context whose world is drawn."""
+        return self.context
 
     @property
     def time(self) -> float:
@@ -96,12 +101,14 @@ class Differences:
 
     Args:
         testbed: The testbed of both contexts.
+        only: Predicate of an address that selects what is compared; by default all.
 
     Attributes:
         first: The differences, in the order of their times.
     """
 
-    def __init__(self, testbed: VirtualTestbed) -> None:
+    def __init__(self, testbed: VirtualTestbed, *, only: Callable[[str], bool] = lambda address: True) -> None:
+        self._only = only
         self._layout = testbed.whole_layout
         # The address of each number; empty where variables are computed from several: `_computed` are compared then.
         self._address = np.full(self._layout.size, "", dtype=object)
@@ -127,7 +134,7 @@ class Differences:
         if "" in addresses:
             addresses |= {a for a, v in self._computed.items() if not np.all(_close(v.get(ours), v.get(theirs)))}
         addresses -= {"", *(difference.address for difference in self.first)}
-        self.first += [Difference(address, float(ours.get_time())) for address in sorted(addresses)]
+        self.first += [Difference(a, float(ours.get_time())) for a in sorted(addresses) if self._only(a)]
 
 
 def _close(a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:

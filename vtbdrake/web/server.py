@@ -160,6 +160,7 @@ class Page:
             "layers": lambda message: session.show(self, message["layers"]),
             "landmarks": lambda message: session.landmarks(message["near"], int(message["count"])),
             "save_test": self._save_test,
+            "go_on": lambda _: session.go_on(),
         }
 
     async def serve(self, server: Server) -> None:
@@ -171,6 +172,7 @@ class Page:
             "variables": dict(self._session.variables),
             "bodies": list(self._session.bodies),
             "vr": server.vr_description(),
+            "log": self._session.log_path,
             "quality": "" if problem is None else problem.objectives[0].name,
             "handles": [handle.description() for handle in self._session.handles.values()],
             "layers": dict(self._session.layers),

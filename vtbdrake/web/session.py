@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot, Variable
     from vtbdrake.testbed import Scenario
     from vtbdrake.visualization.still import Still
+    from vtbdrake.web.recorded_course import RecordedCourse
 
 _Result = TypeVar("_Result")
 
@@ -97,8 +98,10 @@ class Frame:
         failure: Why the simulation has ended; empty while it can go on.
         preview: What the preview has found: ``time``, ``end``, ``refused``; None if there is none.
         comparison: What the course without the last intervention, or the other branch, shows: ``differences`` (address
-            and time), ``failure``, ``branch``; None if there is none.
+            and time), ``failure``, ``branch``, ``recorded``; None if there is none.
         drive: What is driven by hand, see `Driver.status`; None while nothing is.
+        log: Of a `LogSession`: whether the log is replayed (``recorded``), when the simulation has ``left`` it, and a
+            ``notice``.
         layers: What there is to say about each layer that is shown.
         loop: Of a loop that runs in another process: ``ages`` of its sensor signals' last messages (s), ``reasons`` why
             nothing reaches the machine, ``faults`` with the seconds since then; None of a simulation.
@@ -119,6 +122,7 @@ class Frame:
     drive: Mapping[str, Any] | None = None
     layers: Mapping[str, str] = field(default_factory=dict)
     loop: Mapping[str, Any] | None = None
+    log: Mapping[str, Any] | None = None
 
 
 @dataclass
@@ -135,18 +139,19 @@ class _Preview:
 
 
 @dataclass
-class _Comparison:
-    """The course of the simulation without an intervention, and its ghost.
+class Comparison:
+    """Another course beside the simulation, such as the one without an intervention, and its ghost.
 
     Of a branch, the course had been simulated already, perhaps with interventions of its own: it passes through the
     states that were kept of it.
     """
 
-    fork: Fork
+    fork: Fork | RecordedCourse
     differences: Differences
     ghost: Drawing | None
-    later: deque[tuple[float, Snapshot]]
-    is_branch: bool
+    later: deque[tuple[float, Snapshot]] = field(default_factory=deque)
+    is_branch: bool = False
+    is_recorded: bool = False
 
     def advance_to(self, testbed: VirtualTestbed, when: float) -> None:
         while self.later and self.later[0][0] <= when:
@@ -155,7 +160,12 @@ class _Comparison:
 
     def status(self) -> dict[str, Any]:
         differences = [(difference.address, difference.time) for difference in self.differences.first]
-        return {"failure": self.fork.failure, "differences": differences, "branch": self.is_branch}
+        return {
+            "failure": self.fork.failure,
+            "differences": differences,
+            "branch": self.is_branch,
+            **({"recorded": True} if self.is_recorded else {}),
+        }
 
 
 @dataclass
@@ -206,6 +216,7 @@ class Session:
         latest: The last frame.
         variables: What can be watched and set: by address, ``kind``, ``shape``, ``unit``, ``bounds``, ``settable``.
         handles: What can be driven by hand, by address.
+        log_path: Path of the log of a `LogSession`, else empty.
         bodies: Paths in Meshcat of what moves.
         layers: The layers that can be shown: name -> title.
         cameras: The cameras whose images can be shown.
@@ -233,6 +244,7 @@ class Session:
         self.latest: Frame | None = None
         self.variables: Mapping[str, Mapping[str, Any]] = {}
         self.handles: Mapping[str, Handle] = {}
+        self.log_path = ""
         self.bodies: tuple[str, ...] = ()
         self.layers: Mapping[str, str] = {}
         self.cameras: tuple[str, ...] = ()
@@ -322,6 +334,10 @@ class Session:
     def cancel_preview(self) -> None:
         """End the preview."""
         self._do(self._end_preview)
+
+    def go_on(self) -> None:
+        """Go on in simulation from an instant of a log, see `LogSession`; without a log, nothing happens."""
+        self._do(self._leave)
 
     def drive(self, addresses: Collection[str], *, returning: Collection[str] = (), compare: bool = False) -> None:
         """Take over: let hands move commands u or actuators from now on, in a fork.
@@ -461,7 +477,7 @@ class Session:
         self._limits = CommandLimits(self._testbed)
         self._pace, self._playing, self._failure = _Pace(), False, ""
         self._preview: _Preview | None = None
-        self._comparison: _Comparison | None = None
+        self._comparison: Comparison | None = None
         self._driver: Driver | None = None
         self.handles = handles(self._testbed)
         self._readers: dict[str, Callable[..., Any]] = {}
@@ -473,7 +489,7 @@ class Session:
         size = 0.0
         if self._testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
-            self._drawing.fit_camera(self._context, None if self._start is None else camera_of(self._start))
+            self._drawing.fit_camera(self._world, None if self._start is None else camera_of(self._start))
             self.bodies = self._drawing.places
             corners = self._drawing.corners(self._context)
             size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
@@ -484,6 +500,13 @@ class Session:
         self._show(time.monotonic())
 
     def _begin(self) -> None:
+        self._make_context()
+        self._failure = ""
+        self._interventions.forget()
+        self._history.clear()
+        self._kept_at = -inf
+
+    def _make_context(self) -> None:
         self._context = self._testbed.default_context()
         if self._start is not None:
             self._testbed.restore(self._context, self._start)
@@ -491,10 +514,22 @@ class Session:
         self._simulator = self._testbed.simulator(self._context, restored=self._start is not None)
         if self._start is None:
             self._simulator.Initialize()
-        self._failure = ""
-        self._interventions.forget()
-        self._history.clear()
-        self._kept_at = -inf
+
+    @property
+    def _world(self) -> Context:
+        """Return the context whose world is drawn."""
+        return self._context
+
+    def _leave(self) -> None:
+        """Leave a log."""
+
+    def _source(self) -> Mapping[str, Any] | None:
+        """Return what a frame tells of a log."""
+        return None
+
+    def _fork_state(self) -> Snapshot:
+        """Return where a fork of now begins."""
+        return self._testbed.snapshot(self._context)
 
     def _drop(self) -> None:
         """Give up the Meshcat, which must end in the thread that made it, and all that refers to it."""
@@ -593,6 +628,12 @@ class Session:
                 self._history.append((when, self._testbed.snapshot(self._context)))
             self._kept_at = now
 
+    def _reach(self) -> tuple[float, float]:
+        """Return the first and the last time to which the session can go."""
+        if not self._history:
+            return self._context.get_time(), self._context.get_time()
+        return self._history[0][0], self._history[-1][0]
+
     def _run_preview(self, deadline: float) -> None:
         preview = self._preview
         assert preview is not None
@@ -628,11 +669,15 @@ class Session:
             if not self._failure:
                 self._keep(now)
                 self._draw()
-                values = {address: plain(reader(self._context)) for address, reader in self._readers.items()}
+                world = self._world
+                values = {
+                    address: plain(reader(world if address.startswith("sim.") else self._context))
+                    for address, reader in self._readers.items()
+                }
                 warnings = self._limits.violations(self._context)
         except FAILURES as error:  # What draws or is watched cannot be computed in this state.
             self._failure, self._playing = one_line(error), False
-        when, history = self._context.get_time(), self._history
+        when = self._context.get_time()
         frame = Frame(
             number=1 if self.latest is None else self.latest.number + 1,
             time=when,
@@ -641,13 +686,14 @@ class Session:
             rate=self._pace.rate if self._playing else 0.0,
             positions=self._testbed.positions(self._context),
             values=values,
-            history=(history[0][0], history[-1][0]) if history else (when, when),
+            history=self._reach(),
             warnings=tuple(warnings),
             failure=self._failure,
             preview=None if self._preview is None else self._preview.status(),
             comparison=None if self._comparison is None else self._comparison.status(),
             layers=self._layers.notes,
             drive=None if self._driver is None else self._driver.status(),
+            log=self._source(),
         )
         with self._frame_ready:
             self.latest = frame
@@ -655,12 +701,12 @@ class Session:
 
     def _draw(self) -> None:
         if self._drawing is not None:
-            self._drawing.pose(self._context)
+            self._drawing.pose(self._world)
             self._layers.draw(self._context)
         for part in (self._preview, self._comparison):
             if part is not None and part.ghost is not None and not part.fork.failure:
                 try:
-                    part.ghost.pose(part.fork.context)
+                    part.ghost.pose(part.fork.world)
                 except FAILURES as error:  # Its state is not finite.
                     part.fork.failure = one_line(error)
 
@@ -735,7 +781,7 @@ class Session:
         fork = Fork(self._testbed, before)
         name, tint = ("branch", _BRANCH) if is_branch else ("without", _WITHOUT)
         ghost = self._ghost(fork.context, name, tint)
-        self._comparison = _Comparison(fork, Differences(self._testbed), ghost, later, is_branch)
+        self._comparison = Comparison(fork, Differences(self._testbed), ghost, later, is_branch)
 
     def _seek(self, when: float) -> None:
         if not isfinite(when):
@@ -793,7 +839,7 @@ class Session:
         save_course(path, course, self._testbed, task=task, addresses=watched, tolerance=tolerance)
 
     def _begin_preview(self, values: dict[str, Any]) -> None:
-        fork = Fork(self._testbed, self._testbed.snapshot(self._context), values)
+        fork = Fork(self._testbed, self._fork_state(), values)
         ghost = self._preview.ghost if self._preview is not None and not self._preview.refused else None
         if ghost is None:
             self._end_preview()

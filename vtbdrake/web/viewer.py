@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.lazy import extra_module
+from vtbdrake.web.log_session import LogSession
 from vtbdrake.web.session import Session, SessionConfig
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Problem
+    from vtbdrake.recording import ControlLog
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.server import Server
@@ -83,8 +85,9 @@ def view_loop(
 
 
 def view(
-    scenario: Scenario,
+    scenario: Scenario | None = None,
     *,
+    log: ControlLog | str | os.PathLike[str] | None = None,
     start: Snapshot | None = None,
     values: Mapping[str, Any] | None = None,
     config: SessionConfig | None = None,
@@ -99,7 +102,8 @@ def view(
     """Run a testbed in the background, paused, with a page where it is watched and steered.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario; of a problem or a log, it may be left out.
+        log: A log (of a real or a simulated machine) that is replayed, or the path of its file; see `LogSession`.
         start: A snapshot to start from; s0 if left out.
         values: Variables that are set first, by address.
         config: How it runs.
@@ -113,7 +117,8 @@ def view(
         tls: Serve the page by https to other devices; None keeps it to this machine.
 
     Raises:
-        ValueError: The testbed cannot be built, or a value cannot be set.
+        ValueError: The testbed cannot be built, a value cannot be set, or (a `LogError`) the log cannot be replayed.
+        OSError: The log cannot be read.
         PortError: The port is taken.
         BridgeError: There is no bus.
         ModuleNotFoundError: The extra ``web`` is not installed.
@@ -123,12 +128,21 @@ def view(
 
     if url and not vr:
         raise ValueError(f"a url ({url}) needs vr=True: hands lead the robot of the loop there; see also view_loop")
-    session = Session(scenario, start=start, values=values, config=config, problem=problem)
+    if log is not None:
+        if start is not None or values or vr:
+            raise ValueError("a log is replayed as it was recorded: leave out start, values and vr")
+        session: Session = LogSession(log, scenario=scenario, config=config, problem=problem)
+    else:
+        if scenario is None and problem is None:
+            raise ValueError("there is nothing to view: give a scenario, a problem or a log")
+        scenario = scenario or (problem.scenario if problem is not None else None)
+        assert scenario is not None
+        session = Session(scenario, start=start, values=values, config=config, problem=problem)
     with ExitStack() as stack:
         stack.callback(session.close)
         reality = None
         if vr:
-            reality = VirtualReality(ControlledRobot(scenario, url) if url else SimulatedRobot(session))
+            reality = VirtualReality(ControlledRobot(session.scenario, url) if url else SimulatedRobot(session))
             stack.callback(reality.close)
         opened = _served(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls)
         stack.pop_all()

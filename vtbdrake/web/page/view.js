@@ -4,6 +4,7 @@ import { Connection, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
 import { Loop } from "./loop.js";
+import { Recorded } from "./recorded.js";
 import { Keep } from "./keep.js";
 import { VirtualReality } from "./vr.js";
 
@@ -153,7 +154,7 @@ class Page {
     this.variables = {};
     this.frames = 0;
     // Each has a section of the panel in `root`, and is told of the session's messages.
-    this.parts = [new Drive(this), new Layers(this), new Keep(this), new Loop(this), new VirtualReality(this)];
+    this.parts = [new Recorded(this), new Drive(this), new Layers(this), new Keep(this), new Loop(this), new VirtualReality(this)];
     this.#build();
     this.session = new Connection({
       hello: (message) => this.#hello(message),
@@ -384,7 +385,7 @@ class Page {
     else if (preview.refused) this.say(`preview: ${preview.refused}, at ${preview.time.toFixed(2)} s`, "bad", "preview");
     else this.say(`preview until ${preview.time.toFixed(2)} s`, "draft", "preview");
     const rows = comparison?.differences.slice(0, 12) ?? [];
-    const course = comparison?.branch ? "other branch (orange)" : "course without the change (blue)";
+    const course = comparison?.recorded ? "recorded course (purple)" : comparison?.branch ? "other branch (orange)" : "course without the change (blue)";
     const title = rows.length ? `differs first from the ${course}:` : `no difference yet from the ${course}`;
     if (this.differences.rows.length !== (comparison ? rows.length + 1 : 0) || (comparison && this.differences.rows[0].textContent !== title)) {
       const head = element("tr", {}, element("td", { colSpan: 2 }, title));
