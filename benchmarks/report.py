@@ -62,6 +62,10 @@ BENCHMARKS: Registry = {
     "crater_decision_time": "benchmarks.crater:crater_decision_time",
     "scanner_cost": "benchmarks.scanner:scanner_cost",
     "vr_pose_to_command": "benchmarks.vr:vr_pose_to_command",
+    "view_cost": "benchmarks.view:view_cost",
+    "view_states": "benchmarks.view:view_states",
+    "click_p95": "benchmarks.view:click_p95",
+    "preview_latency": "benchmarks.view:preview_latency",
     "localization_update_p50": "benchmarks.localization:localization_update_p50",
 }
 

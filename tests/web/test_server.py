@@ -170,6 +170,14 @@ def test_closed_view_closes_its_pages() -> None:
         ask(base(opened))
 
 
+def test_paused_view_closes_its_pages_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    opened = view(CartPoleScenario())
+    with page(opened, "") as scene:
+        scene.recv(PATIENCE)
+        opened.close()
+    assert capfd.readouterr().err == ""
+
+
 # -- transforms that wait
 
 

@@ -660,7 +660,9 @@ class Session:
     def _show(self, now: float) -> None:
         """Draw, and publish a frame."""
         moves = self._playing or self._preview is not None
-        self._next_frame = now + (1.0 / self.config.frame_rate if moves else _IDLE_PERIOD)
+        period = 1.0 / self.config.frame_rate if moves else _IDLE_PERIOD
+        # From when it was due, so that late frames do not lower the rate.
+        self._next_frame = period + (self._next_frame if now - self._next_frame < period else now)
         values: dict[str, Any] = {}
         warnings: list[str] = []
         try:

@@ -1,0 +1,220 @@
+"""The cost of being watched, and how soon the page shows what happens."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import inf
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved_values, ratio, spread
+from benchmarks.view_client import CHROMIUM, STAMP, click, client, preview, read_states, read_states_in_chromium
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.visualization.drawing import Drawing, Parts
+from vtbdrake.web import View
+from vtbdrake.web.server import Server
+from vtbdrake.web.session import Session, SessionConfig
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
+
+GHOSTS = 10
+ANGLE = "sim.sys.cart_pole.pole_pin.position"
+_NICE = 5
+_LONGEST = 3600.0  # s, for a client
+_DELAY = 4  # frames by which each ghost is behind the one before
+
+
+class CrowdedSession(Session):
+    """A session with ghosts, which follow its robot one behind the other, and a stamp of the time of each frame."""
+
+    def _build(self) -> None:
+        self._ghosts: list[tuple[Drawing, Context]] = []
+        self._past: deque[np.ndarray] = deque(maxlen=_DELAY * GHOSTS)
+        self.drawn = 0
+        super()._build()
+        for k in range(GHOSTS):
+            context = self._testbed.default_context()
+            path = f"crowd/{k}"
+            ghost = Drawing(self._meshcat, self._testbed, context, path, tint="#0072b2", parts=Parts.MOVING)
+            self._ghosts.append((ghost, context))
+
+    def _draw(self) -> None:
+        super()._draw()
+        plant = self._testbed.plant
+        assert plant is not None
+        self._past.appendleft(plant.GetPositions(plant.GetMyContextFromRoot(self._context)))
+        for k, (ghost, context) in enumerate(self._ghosts):
+            late = min(_DELAY * k, len(self._past) - 1)
+            plant.SetPositions(plant.GetMyMutableContextFromRoot(context), self._past[late])
+            ghost.pose(context)
+        self._meshcat.SetTransform(STAMP, RigidTransform([time.monotonic(), 0.0, 0.0]))
+        self.drawn += 1
+
+    def _drop(self) -> None:
+        self._ghosts.clear()  # Meshcat ends in this thread.
+        super()._drop()
+
+
+@contextmanager
+def _served(session: Session) -> Iterator[View]:
+    with View(session, Server(session)) as running:
+        yield running
+
+
+def view_cost(repeats: int = 7, horizon: float = 30.0) -> Benchmark:
+    """A rollout of the space climber with its ten ghosts in a page, against the same rollout without any page.
+
+    Both advance along the same grid, as fast as they can. Frames are drawn by the wall clock, and a client in another
+    process reads and unpacks all of them.
+    """
+    scenario = SpaceClimberScenario()
+    testbed, config = scenario.build(), SessionConfig()
+    with _served(CrowdedSession(scenario, config=config)) as running:
+        session = running.session
+        session.set_speed(inf)
+        with client(read_states, running.url, _LONGEST):
+            while not session.drawn:  # type: ignore[attr-defined]
+                session.advance()
+            watched, headless = interleaved_values(
+                lambda: _watched(session, horizon), lambda: _headless(testbed, horizon, config.step), repeats=repeats
+            )
+            frames = session.drawn  # type: ignore[attr-defined]
+    return Benchmark(
+        name="view_cost",
+        value=ratio(watched, headless),
+        unit="1",
+        goal=1.05,
+        better=LOWER,
+        against="the same rollout without a page",
+        note=f"a simulated second takes {spread(1e3 * watched, unit='ms')} watched and "
+        f"{spread(1e3 * headless, unit='ms')} headless; {frames} frames of {GHOSTS + 1} robots",
+    )
+
+
+def _watched(session: Session, horizon: float) -> float:
+    """Return the wall time of a simulated second in a session, in s."""
+    session.reset()
+    begin, number = time.perf_counter(), 0
+    session.play()
+    while True:
+        frame = session.wait_for_frame(number, 1.0)
+        if frame is not None:
+            number = frame.number
+            if frame.failure:
+                raise RuntimeError(frame.failure)
+            if frame.time >= horizon:
+                took = (time.perf_counter() - begin) / frame.time
+                session.pause()
+                return took
+
+
+def _headless(testbed: VirtualTestbed, horizon: float, step: float) -> float:
+    """Return the wall time of a simulated second along the grid of a session, in s."""
+    simulator = testbed.simulator()
+    begin = time.perf_counter()
+    for k in range(1, round(horizon / step) + 1):
+        simulator.AdvanceTo(k * step)
+    return (time.perf_counter() - begin) / horizon
+
+
+def view_states(seconds: float = 20.0) -> list[Benchmark]:
+    """States that a client handles per second, of eleven robots that move in real time; beside it, their age.
+
+    A state counts when the client has unpacked its last pose. Its age is the time since it was drawn. If there is a
+    Chromium, the same is measured in the page, with the frames that it draws.
+    """
+    session = CrowdedSession(SpaceClimberScenario(), config=SessionConfig(frame_rate=40.0))
+    with _served(session) as running, client(read_states, running.url, seconds) as read:
+        running.session.play()
+        result = read()
+    messages = result["messages"] / seconds
+    note = f"{session.config.frame_rate:g} states/s are drawn of {GHOSTS + 1} robots, {messages:.0f} messages/s"
+    states = Benchmark(
+        name="view_states", value=_rate(result), unit="1/s", goal=30.0, better=HIGHER, against="", note=note
+    )
+    ages = np.array(result["ages"])
+    age = _latency("view_state_age_p95", ages, goal=0.1, against="the instant at which a state is drawn")
+    return [states, age, *(_states_in_chromium(seconds) if CHROMIUM else [])]
+
+
+def _states_in_chromium(seconds: float) -> list[Benchmark]:
+    """Return states and frames per second in a browser, which renders them on the processor; there are no goals."""
+    session = CrowdedSession(SpaceClimberScenario())
+    with _served(session) as running, client(read_states_in_chromium, running.url, seconds) as read:
+        running.session.play()
+        result = read()
+    age = 1e3 * np.percentile(result["ages"], 95.0)
+    note = f"on the processor alone; 95 % of the states are handled within {age:.3g} ms"
+    rates = {"view_states_chromium": _rate(result), "view_frames_chromium": result["drawn"] / seconds}
+    common: dict[str, Any] = {"unit": "1/s", "goal": None, "better": HIGHER, "against": "", "note": note}
+    return [Benchmark(name=name, value=value, **common) for name, value in rates.items()]
+
+
+def _rate(result: dict[str, Any]) -> float:
+    """Return states per second."""
+    arrivals = result["arrivals"]
+    return (len(arrivals) - 1) / (arrivals[-1] - arrivals[0])
+
+
+def click_p95(clicks: int = 200) -> Benchmark:
+    """From a click in the page to its confirmation, while workers with nice 5 compute rollouts on all cores.
+
+    The cart-pole runs in real time in the session, and each click sets one of its variables.
+    """
+    with (
+        _rollouts_on_all_cores() as count,
+        _served(Session(CartPoleScenario())) as running,
+        client(click, running.url, ANGLE, clicks, 0.02) as result,
+    ):
+        times = np.array(result())
+    against = f"{count} workers with nice {_NICE}, which compute rollouts"
+    return _latency("click_p95", times, goal=0.2, against=against)
+
+
+def preview_latency(drags: int = 60) -> Benchmark:
+    """From a draft at a slider to the first pose of its ghost at the client, of the cart-pole in real time."""
+    with _served(Session(CartPoleScenario())) as running, client(preview, running.url, ANGLE, drags, 0.1) as result:
+        times = np.array(result())
+    return _latency("preview_latency", times, goal=0.25, against="")
+
+
+def _latency(name: str, times: np.ndarray, *, goal: float, against: str) -> Benchmark:
+    value = float(np.percentile(times, 95.0))
+    note = f"95 % of {times.size} come sooner; {spread(1e3 * times, unit='ms')}"
+    return Benchmark(name=name, value=value, unit="s", goal=goal, better=LOWER, against=against, note=note)
+
+
+@contextmanager
+def _rollouts_on_all_cores() -> Iterator[int]:
+    """Keep every core busy with rollouts of the space climber, in processes with a lower priority."""
+    processes, count = get_context("spawn"), len(os.sched_getaffinity(0))
+    begun = [processes.Event() for _ in range(count)]
+    workers = [processes.Process(target=_roll_out, args=(event,), daemon=True) for event in begun]
+    for worker in workers:
+        worker.start()
+    try:
+        for event in begun:
+            event.wait()
+        yield count
+    finally:
+        for worker in workers:
+            worker.kill()
+
+
+def _roll_out(begun: Event) -> None:
+    os.nice(_NICE)
+    testbed = SpaceClimberScenario().build()
+    while True:
+        simulator = testbed.simulator()
+        simulator.AdvanceTo(1.0)
+        begun.set()
+        simulator.AdvanceTo(10.0)
