@@ -8,6 +8,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from socket import SHUT_RDWR
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -170,10 +171,15 @@ def test_closed_view_closes_its_pages() -> None:
         ask(base(opened))
 
 
-def test_paused_view_closes_its_pages_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_paused_view_ends_in_silence_after_its_browser(is_killed: bool, capfd: pytest.CaptureFixture[str]) -> None:
     opened = view(CartPoleScenario())
-    with page(opened, "") as scene:
+    with page(opened, "") as scene, page(opened) as session:
         scene.recv(PATIENCE)
+        receive(session, "frame")
+        if is_killed:
+            for socket in (scene, session):
+                socket.socket.shutdown(SHUT_RDWR)
         opened.close()
     assert capfd.readouterr().err == ""
 

@@ -136,11 +136,8 @@ class Host:
         await browser.accept()
         try:
             async with websockets.connect(url, max_size=None, compression=None) as meshcat:
-                drop = asyncio.create_task(_drop_all(browser))
-                try:
-                    await relay(meshcat.recv, browser.send_bytes)
-                finally:
-                    drop.cancel()
+                # Where nothing moves, nothing is sent that could fail: only reading notices that a browser is gone.
+                await first_of(relay(meshcat.recv, browser.send_bytes), _drop_all(browser))
         except CLOSED:
             pass
         with suppress(*CLOSED):
