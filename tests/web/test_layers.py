@@ -5,15 +5,18 @@ from __future__ import annotations
 import io
 import json
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import CameraInfo
 
+from tests.testbed.test_hardware_sim import load
 from tests.visualization.meshcat_page import messages
 from tests.web.test_server import PATIENCE, base, command, cookie, page, receive
 from tests.web.test_session import frame
@@ -207,3 +210,19 @@ def test_server_gives_images_and_layers_to_pages_that_watch() -> None:
         pixels = camera.GetOutputPort("color_image").Eval(camera.GetMyContextFromRoot(context)).data[..., :3]
         error = np.abs(np.asarray(Image.open(io.BytesIO(data))).astype(float) - pixels)
         assert pixels.std() > 10.0 and error.mean() < 3.0
+
+
+def test_frustum_and_image_of_a_camera_of_drake(meshcat: Meshcat, tmp_path: Path) -> None:
+    testbed, context = started(load(tmp_path), 0.1)
+    layers = Layers(meshcat, testbed, 1.0)
+    (camera,) = layers.cameras
+    layers.show(["cameras"])
+    layers.draw(context)
+    matrix = np.array(drawn(meshcat, "set_transform", "cameras")[camera]["matrix"]).reshape(4, 4).T
+    expected = RigidTransform(RollPitchYaw(np.radians([-120.0, 5.0, 125.0])), [1.5, 0.8, 1.25])
+    np.testing.assert_allclose(matrix, expected.GetAsMatrix4(), atol=1e-12)
+    held = testbed.diagram.GetSubsystemByName("sim.sense.camera_0")
+    image = held.GetOutputPort("color_image").Eval(held.GetMyContextFromRoot(context)).data[..., :3]
+    shown = layers.image(camera, context)
+    assert shown.shape == (48, 64, 3) and shown.std() > 1.0
+    assert np.abs(shown.astype(float) - image).mean() < 2.0  # The held one is 0.1 s old at most.

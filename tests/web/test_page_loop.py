@@ -35,7 +35,7 @@ def test_loop_is_watched_until_it_ends(browser: Browser) -> None:
             assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.01  # cart and pole
             assert page.is_disabled("#vtb-act-force") and page.input_value("#vtb-act-force") == "real"
             assert not page.is_visible("#vtb-play") and not page.is_visible("#vtb-history")
-            assert "joint_position" in page.inner_text("#vtb-loop")
+            assert "joint_position" in page.inner_text("#vtb-loop") and page.inner_text("#vtb-age").endswith("ms ago")
             page.fill("#vtb-panel input[type=search]", "u.plan")
             page.click("#vtb-matches li >> text='u.plan'")
             drawn(page, "vtb.watched.get('u.plan').values.length > 0")

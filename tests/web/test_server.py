@@ -188,13 +188,13 @@ def test_paused_view_ends_in_silence_after_its_browser(is_killed: bool, capfd: p
 
 
 def scene_after(messages: list[dict[str, Any]]) -> dict[str, Any]:
-    """The last transform of each path, and the objects, as a browser keeps them."""
+    """The last transform and object of each path, and its properties, as a browser keeps them."""
     scene: dict[str, Any] = {}
     for message in messages:
         if message["type"] == "delete":
             scene = {path: value for path, value in scene.items() if not path.startswith(message["path"])}
         else:
-            scene.setdefault(message["path"], {})[message["type"]] = message["value"]
+            scene.setdefault(message["path"], {})[message["type"], message.get("property")] = message["value"]
     return scene
 
 
@@ -203,8 +203,10 @@ def scene_after(messages: list[dict[str, Any]]) -> dict[str, Any]:
 def test_slow_browser_ends_with_the_same_scene(seed: int) -> None:
     rng, queue, sent, received = random.Random(seed), Newest(), [], []
     for number in range(300):
-        kind = rng.choices(["set_transform", "set_object", "delete"], [20, 2, 1])[0]
-        message = {"type": kind, "path": f"/drake/{rng.choice('ab')}/{rng.choice('xyz')}", "value": number}
+        kind = rng.choices(["set_transform", "set_object", "set_property", "delete"], [20, 2, 4, 1])[0]
+        message = {"type": kind, "path": f"/drake/{rng.choice('ab')}/{rng.choice('xyz')}"}
+        message |= {"property": rng.choice(["scale", "visible"])} if kind == "set_property" else {}
+        message["value"] = number
         if kind == "delete":
             message["path"] = message["path"][:8]
         sent.append(message)
@@ -215,6 +217,21 @@ def test_slow_browser_ends_with_the_same_scene(seed: int) -> None:
         received.append(msgpack.unpackb(queue.get_nowait()))
     assert scene_after(received) == scene_after(sent)
     assert len(received) + queue.replaced == 300 and queue.replaced > 50
+
+
+@pytest.mark.one_python
+def test_arrows_and_scans_do_not_queue_up_for_a_slow_browser() -> None:
+    queue = Newest()
+    for number in range(100):
+        for message in (
+            {"type": "set_transform", "path": "/drake/now/robot", "matrix": [float(number)] * 16},
+            {"type": "set_property", "path": "/drake/layers/forces/arrow", "property": "scale", "value": [1.0, number]},
+            {"type": "set_property", "path": "/drake/layers/forces/arrow", "property": "visible", "value": True},
+            {"type": "set_object", "path": "/drake/layers/laser/points", "object": {"points": b"x" * 10_000}},
+        ):
+            queue.put(msgpack.packb(message))
+    # The first object may need what came before it.
+    assert len(queue) <= 7
 
 
 def test_page_drives_and_a_page_that_is_gone_releases_its_keys(tmp_path: Path) -> None:

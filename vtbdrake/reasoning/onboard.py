@@ -158,10 +158,16 @@ class OnboardReasoner(SlowPart):
         """Keep the last ``count`` decisions that this part makes in simulations, for `decision_shown`."""
         self._decider.remember(count)
 
-    def decision_shown(self, context: Context) -> tuple[Reasoner, Decision] | None:
-        """Return the decision that the ports of ``context`` show, with its reasoner; None if it is not remembered."""
+    def decision_shown(
+        self, context: Context, also: tuple[Reasoner, Decision] | None = None
+    ) -> tuple[Reasoner, Decision] | None:
+        """Return the decision that the ports of ``context`` show, with its reasoner.
+
+        It is None if it is neither remembered nor ``also``: simulations of other contexts make decisions, too.
+        """
         sampled_at, quality = (self.GetOutputPort(name).Eval(context).item() for name in ("sampled_at", _QUALITY))
-        matches = [d for d in self._decider.remembered if (d[1].time, d[1].quality) == (sampled_at, quality)]
+        candidates = [*self._decider.remembered, *([] if also is None else [also])]
+        matches = [each for each in candidates if (each[1].time, each[1].quality) == (sampled_at, quality)]
         return matches[-1] if matches else None
 
     def function_beside(self, period: float) -> SlowFunction:

@@ -281,19 +281,21 @@ class Candidates(Layer):
     def draw(self, context: Context) -> None:
         notes = []
         for name, part in self._reasoners.items():
-            reasoner, decision = part.decision_shown(part.GetMyContextFromRoot(context)) or (None, None)
-            if decision is not self._drawn.get(name):
-                self._drawn[name] = decision
+            drawn = self._drawn.get(name)
+            shown = part.decision_shown(part.GetMyContextFromRoot(context), drawn)
+            if shown is not drawn:
+                self._drawn[name] = shown
                 self._meshcat.Delete(f"{self.path}/{name}")
-                if reasoner is not None and decision is not None:
-                    self._draw_decision(f"{self.path}/{name}", reasoner, decision)
-            if decision is None:
+                if shown is not None:
+                    self._draw_decision(f"{self.path}/{name}", *shown)
+            if shown is None:
                 notes.append(f"{name} has made no decision since this layer is shown")
-            else:
-                notes.append(
-                    f"{name}, {decision.name} = {decision.quality:.4g}: chosen orange, plan in use black, others from "
-                    "violet to yellow"
-                )
+                continue
+            decision = shown[1]
+            notes.append(
+                f"{name}, {decision.name} = {decision.quality:.4g}: chosen orange, plan in use black, others from "
+                "violet to yellow"
+            )
         self.note = "; ".join(notes)
 
     def _draw_decision(self, path: str, reasoner: Reasoner, decision: Decision) -> None:

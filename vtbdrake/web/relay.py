@@ -5,42 +5,45 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 
-_TRANSFORM, _OBJECT = "set_transform", "set_object"
+_TRANSFORM, _OBJECT, _PROPERTY = "set_transform", "set_object", "set_property"
 _HEAD = 1024  # bytes in which type and path of a message stand: objects may be large, and are not unpacked
 
 
 class Newest:
-    """A queue of Meshcat's messages, in which a pose or an object replaces an older one of its path that still waits.
+    """A queue of Meshcat's messages, in which a pose, an object or a property replaces an older one that still waits.
 
-    A transform never overtakes another message: what comes after it may delete its object. An object, such as the
-    points of a scan, overtakes transforms and objects alone.
+    What is replaced keeps its place in the queue. Poses and properties never overtake another object, nor anything a
+    message of another kind: it may delete what they are of.
     """
 
     def __init__(self) -> None:
         self._messages: deque[list[bytes]] = deque()
-        # Those that wait and may be replaced, by path.
-        self._waiting: dict[str, dict[str, list[bytes]]] = {_TRANSFORM: {}, _OBJECT: {}}
+        # Those that wait and may be replaced, by path (and name of the property).
+        self._waiting: dict[str, dict[str, list[bytes]]] = {_TRANSFORM: {}, _OBJECT: {}, _PROPERTY: {}}
         self._arrived = asyncio.Event()
         self.replaced = 0  # number of messages that were never sent
 
     def put(self, data: bytes) -> None:
         """Add a message."""
-        kind, path = _kind_and_path(data)
-        if (waiting := self._waiting.get(kind, {}).get(path)) is not None:
+        kind, place = _kind_and_place(data)
+        if (waiting := self._waiting.get(kind, {}).get(place)) is not None:
             waiting[0] = data
             self.replaced += 1
             return
         entry = [data]
         self._messages.append(entry)
-        if kind != _TRANSFORM:
+        if kind == _OBJECT:
             self._waiting[_TRANSFORM].clear()
-        if kind not in self._waiting:
-            self._waiting[_OBJECT].clear()
+            self._waiting[_PROPERTY].clear()
+        if kind in self._waiting:
+            self._waiting[kind][place] = entry
         else:
-            self._waiting[kind][path] = entry
+            for replaceable in self._waiting.values():
+                replaceable.clear()
         self._arrived.set()
 
     async def get(self) -> bytes:
@@ -56,9 +59,9 @@ class Newest:
     def get_nowait(self) -> bytes:
         """Return the next message; there must be one."""
         entry = self._messages.popleft()
-        kind, path = _kind_and_path(entry[0])
-        if self._waiting.get(kind, {}).get(path) is entry:
-            del self._waiting[kind][path]
+        kind, place = _kind_and_place(entry[0])
+        if self._waiting.get(kind, {}).get(place) is entry:
+            del self._waiting[kind][place]
         return entry[0]
 
 
@@ -89,16 +92,18 @@ async def relay(receive: Callable[[], Awaitable[bytes | str]], send: Callable[[b
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _kind_and_path(data: bytes) -> tuple[str, str]:
-    """Return the type and the path of a message, in which they come first; empty if they do not."""
-    unpacker = msgpack.Unpacker(strict_map_key=False)
+def _kind_and_place(data: bytes) -> tuple[str, str]:
+    """Return the type of a message, and its path (with the name of the property); empty if they do not come first."""
+    unpacker = msgpack.Unpacker()
     unpacker.feed(data[:_HEAD])
+    head: dict[str, Any] = {}
     try:
-        unpacker.read_map_header()
-        names, values = [], []
-        for _ in range(2):
-            names.append(unpacker.unpack())
-            values.append(unpacker.unpack())
+        for _ in range(min(unpacker.read_map_header(), 3 if _PROPERTY.encode() in data[:64] else 2)):
+            name = unpacker.unpack()
+            head[name] = unpacker.unpack()
     except (ValueError, msgpack.OutOfData, msgpack.UnpackException):
         return "", ""
-    return (str(values[0]), str(values[1])) if names == ["type", "path"] else ("", "")
+    kind, path = head.get("type"), head.get("path")
+    if not isinstance(kind, str) or not isinstance(path, str):
+        return "", ""
+    return (kind, f"{path} {head.get('property')}") if kind == _PROPERTY else (kind, path)

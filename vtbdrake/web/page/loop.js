@@ -27,6 +27,8 @@ export class Loop {
     document.body.classList.toggle("vtb-live", Boolean(loop));
     if (!loop) return;
     this.address.textContent = `at ${loop}`;
+    this.age = element("output", { id: "vtb-age", title: "the oldest of the last messages" });
+    document.getElementById("vtb-mode").before(this.age);
     document.getElementById("vtb-reset").title = "let the DPS command again after a fault that is over (r)";
   }
 
@@ -35,11 +37,13 @@ export class Loop {
     document.body.dataset.loop = failure ? "silent" : playing ? "running" : "awaited";
     const item = (text) => element("li", {}, text);
     this.reasons.replaceChildren(...(loop.reasons ?? []).map((reason) => item(`not commanded: ${reason}`)));
+    const ages = Object.entries(loop.ages ?? {});
+    const ago = (age) => (age === null ? "never" : `${(1e3 * age).toFixed(age < 0.1 ? 1 : 0)} ms ago`);
     this.ages.replaceChildren(
-      ...Object.entries(loop.ages ?? {}).map(([signal, age]) =>
-        element("tr", {}, element("td", {}, signal), element("td", {}, age === null ? "never" : `${(1e3 * age).toFixed(age < 0.1 ? 1 : 0)} ms ago`)),
-      ),
+      ...ages.map(([signal, age]) => element("tr", {}, element("td", {}, signal), element("td", {}, ago(age)))),
     );
+    const oldest = ages.some(([, age]) => age === null) ? null : Math.max(...ages.map(([, age]) => age));
+    this.age.textContent = ages.length ? ago(oldest) : "";
     this.faults.replaceChildren(
       ...(loop.faults ?? []).map(([reason, age]) => item(age < OLD ? reason : `${reason} (${age.toFixed(0)} s ago)`)),
     );
