@@ -28,7 +28,7 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
 from vtbdrake.testbed.hand import HandCommand
-from vtbdrake.web import view
+from vtbdrake.web import view_loop
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
 POSES = 400
@@ -145,8 +145,8 @@ def _loop(url: str) -> Iterator[None]:
 def vr_pose_to_command() -> list[Benchmark]:
     """Time from a pose that a headset's page sends to its command u on the bus of the loop, and to that of a release.
 
-    The page is a client without a browser; the server shows a session that runs, and the loop controls a machine
-    process. The loop takes a command of the bus in its next period.
+    The page is a client without a browser; the server shows the loop, which controls a machine process. The loop takes
+    a command of the bus in its next period.
     """
     with ExitStack() as stack:
         hub = stack.enter_context(Hub(port=0))
@@ -186,8 +186,7 @@ def _delays(url: str, listener: Listener) -> list[float]:
     """Return the time from each pose to the first command that is at least as new."""
     # Poses that are late on a busy computer are measured, too, and release nothing.
     with ExitStack() as stack:
-        running = stack.enter_context(view(QuickArm(release_time=5.0), vr=True, url=url))
-        running.session.play()
+        running = stack.enter_context(view_loop(QuickArm(release_time=5.0), url, vr=True))
         headset = Headset(running.url, stack)
         headset.lead()
         height = float(listener.first(0.0, _leads)[1][7])
@@ -202,8 +201,7 @@ def _releases(url: str, listener: Listener) -> dict[str, list[float]]:
     """Return the times from the last pose of a hand to the idle command, by what happens after it."""
     times: dict[str, list[float]] = {"let go": [], "silent": [], "closed": []}
     with ExitStack() as stack:
-        running = stack.enter_context(view(QuickArm(), vr=True, url=url))
-        running.session.play()
+        running = stack.enter_context(view_loop(QuickArm(), url, vr=True))
         headset = Headset(running.url, stack)
         for kind in RELEASES * list(times):
             released = -inf

@@ -27,7 +27,7 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
 from vtbdrake.testbed.hand import HandCommand
-from vtbdrake.web import View, view
+from vtbdrake.web import View, view, view_loop
 from vtbdrake.web.tls import Tls, TlsError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
@@ -174,8 +174,8 @@ def test_robot_that_no_hand_leads_is_an_error() -> None:
         view(CartPoleScenario(), vr=True)
     with pytest.raises(ValueError, match="led_by_hand=true"):
         view(ManipulatorScenario(), vr=True)
-    with pytest.raises(ValueError, match="needs vr=True"):
-        view(CartPoleScenario(), url="tcpq://127.0.0.1:7700")
+    with Hub(port=0) as hub, pytest.raises(ValueError, match=r"hand_command\(\) returns None"):
+        view_loop(CartPoleScenario(), hub.url, vr=True)
 
 
 # -- the machine
@@ -199,7 +199,7 @@ def test_hand_leads_the_arm_of_a_machine_process() -> None:
         def value(address: str) -> np.ndarray:
             return np.asarray(dps.get([address])[address])
 
-        with view(scenario, vr=True, url=hub.url) as running:
+        with view_loop(scenario, hub.url, vr=True) as running:
             headset = Headset(running)
             headset.lead(1.0)
             start = value("dps.impl.tip_pose").reshape(3, 4)[:, 3]
@@ -211,10 +211,10 @@ def test_hand_leads_the_arm_of_a_machine_process() -> None:
             headset.close()  # The page is gone.
             becomes(lambda: np.array_equal(value("u.hand"), REST))
         steps = runtime.steps
-        becomes(lambda: runtime.steps > steps + 1000)
+        becomes(lambda: runtime.steps > steps + 300)
         assert not runtime.guards.latched and runtime.active == ("joint_torque",)
         velocity = np.array(runtime.bridge.sensed["joint_velocity"].value)
-        assert np.abs(velocity).max() < 0.02
+        assert np.abs(velocity).max() < 0.05
         # What the machine's own encoders say, by Drake's kinematics.
         testbed = scenario.build()
         plant = testbed.plant
@@ -226,7 +226,7 @@ def test_hand_leads_the_arm_of_a_machine_process() -> None:
 
 
 def test_loop_that_does_not_answer_cannot_be_led() -> None:
-    with Hub(port=0) as hub, view(PatientArm(), vr=True, url=hub.url) as running:
+    with Hub(port=0) as hub, view_loop(PatientArm(), hub.url, vr=True) as running:
         headset = Headset(running)
         headset.send({"do": "arm"})
         assert "start vtbdrake run" in headset.error()

@@ -108,8 +108,8 @@ def view(
         if problem is not None:
             raise click.UsageError(f"{scenario.path} is a problem already: leave --problem out")
         problem, scenario = scenario.problem, scenario.problem.scenario
-    page |= {"tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
-    if url and not vr:
+    page |= {"vr": vr, "tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
+    if url:
         if values or start is not None or play or problem is not None or log is not None:
             raise click.UsageError(
                 "a loop is shown as it is: leave --set, --start, --play, --problem and --log out, or --url"
@@ -124,7 +124,7 @@ def view(
         page |= {"log": opened_log(log, scenario.name())}
         # The log describes its scenario; fields that were set have to be the recorded ones.
         viewed = None if scenario.record() == type(scenario)().record() else scenario
-    page |= {"problem": problem, "folder": folder, "vr": vr, "url": url or ""}
+    page |= {"problem": problem, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()

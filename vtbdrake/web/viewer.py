@@ -58,7 +58,13 @@ class View:
 
 
 def view_loop(
-    scenario: Scenario, url: str, *, port: int = 0, hosts: Collection[str] = (), tls: Tls | None = None
+    scenario: Scenario,
+    url: str,
+    *,
+    port: int = 0,
+    hosts: Collection[str] = (),
+    vr: bool = False,
+    tls: Tls | None = None,
 ) -> View:
     """Show a loop that runs in another process, such as ``vtbdrake run``, through its live values.
 
@@ -67,19 +73,26 @@ def view_loop(
         url: LCM URL of its bus.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
+        vr: Let headsets that open the page lead the robot of the loop, see `Scenario.hand_command`.
         tls: Serve the page by https to other devices; None keeps it to this machine.
 
     Raises:
         ValueError: The testbed cannot be built.
         PortError: The port is taken.
+        BridgeError: There is no bus, and ``vr`` needs one.
         ModuleNotFoundError: The extra ``web`` is not installed.
     """
     _check_extra()
     from vtbdrake.web.loop import LoopSession
+    from vtbdrake.web.vr import ControlledRobot, VirtualReality
 
     with ExitStack() as stack:
         session = stack.enter_context(LoopSession(scenario, url))
-        opened = _served(session, port=port, hosts=hosts, tls=tls)
+        reality = None
+        if vr:
+            reality = VirtualReality(ControlledRobot(scenario, url))
+            stack.callback(reality.close)
+        opened = _served(session, port=port, hosts=hosts, vr=reality, tls=tls)
         stack.pop_all()
         return opened
 
@@ -96,7 +109,6 @@ def view(
     port: int = 0,
     hosts: Collection[str] = (),
     vr: bool = False,
-    url: str = "",
     tls: Tls | None = None,
 ) -> View:
     """Run a testbed in the background, paused, with a page where it is watched and steered.
@@ -111,23 +123,18 @@ def view(
         folder: Where the page saves tests.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
-        vr: Let headsets that open the page lead the robot, see `Scenario.hand_command`.
-        url: With ``vr``, the LCM URL of a bus: hands lead the robot that a loop (``vtbdrake run``) controls there,
-            instead of the simulated one.
+        vr: Let headsets that open the page lead the simulated robot, see `Scenario.hand_command`.
         tls: Serve the page by https to other devices; None keeps it to this machine.
 
     Raises:
         ValueError: The testbed cannot be built, a value cannot be set, or (a `LogError`) the log cannot be replayed.
         OSError: The log cannot be read.
         PortError: The port is taken.
-        BridgeError: There is no bus.
         ModuleNotFoundError: The extra ``web`` is not installed.
     """
     _check_extra()
-    from vtbdrake.web.vr import ControlledRobot, SimulatedRobot, VirtualReality
+    from vtbdrake.web.vr import SimulatedRobot, VirtualReality
 
-    if url and not vr:
-        raise ValueError(f"a url ({url}) needs vr=True: hands lead the robot of the loop there; see also view_loop")
     if log is not None:
         if start is not None or values or vr:
             raise ValueError("a log is replayed as it was recorded: leave out start, values and vr")
@@ -142,7 +149,7 @@ def view(
         stack.callback(session.close)
         reality = None
         if vr:
-            reality = VirtualReality(ControlledRobot(session.scenario, url) if url else SimulatedRobot(session))
+            reality = VirtualReality(SimulatedRobot(session))
             stack.callback(reality.close)
         opened = _served(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls)
         stack.pop_all()
