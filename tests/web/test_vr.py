@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 from websockets.exceptions import InvalidStatus
 
 from tests.web.test_server import PATIENCE, base, page
@@ -28,11 +29,15 @@ from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
 from vtbdrake.testbed.hand import HandCommand
 from vtbdrake.web import View, view, view_loop
+from vtbdrake.web.hand import HandError, HandMessage
 from vtbdrake.web.tls import Tls, TlsError
+from vtbdrake.web.vr import Robot, VirtualReality
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.leading import REST
 from vtbdrake_diagrams.manipulator.motions import Motion
+
+TOOL = RigidTransform([0.1, 0.2, 0.3])
 
 
 @dataclass
@@ -176,6 +181,92 @@ def test_robot_that_no_hand_leads_is_an_error() -> None:
         view(ManipulatorScenario(), vr=True)
     with Hub(port=0) as hub, pytest.raises(ValueError, match=r"hand_command\(\) returns None"):
         view_loop(CartPoleScenario(), hub.url, vr=True)
+
+
+class Toy(Robot):
+    """A robot that keeps what it is sent, and can be in trouble."""
+
+    def __init__(self) -> None:
+        super().__init__(PatientArm())
+        self.sent: list[dict[str, Any]] = []
+        self.reason, self.is_deaf = "", False
+        self.closed = False
+
+    def read(self, addresses: tuple[str, ...]) -> dict[str, Any]:
+        return {self.command.pose: np.eye(3, 4), **self.command.ready}
+
+    def send(self, commands: Any) -> None:
+        if self.is_deaf:
+            raise HandError("nobody listens")
+        self.sent.append(dict(commands))
+
+    def trouble(self) -> str:
+        return self.reason
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_robot_in_trouble_is_released_and_not_armed() -> None:
+    robot = Toy()
+    reality = VirtualReality(robot)
+
+    def take() -> None:
+        reality.arm()
+        for grip in (False, True):
+            reality.receive("A", HandMessage(time.monotonic(), None, {"left": TOOL}, {"left": grip}, {"left": ()}))
+        becomes(lambda: reality.status.leading and robot.sent[-1]["hand"][0] == 1.0)
+
+    take()
+    robot.reason = "the fallbacks command: position is stale"
+    becomes(lambda: not reality.status.armed and robot.sent[-1]["hand"][0] == 0.0)
+    assert reality.status.notice == robot.reason
+    with pytest.raises(HandError, match="stale"):
+        reality.arm()
+    robot.reason = ""
+    take()
+    robot.is_deaf = True  # It is told that it is released as soon as it listens again.
+    becomes(lambda: not reality.status.armed)
+    assert reality.status.notice == "nobody listens"
+    robot.is_deaf = False
+    becomes(lambda: bool(robot.sent[-1]["hand"][0] == 0.0))
+    take()
+    reality.close()
+    assert robot.closed and robot.sent[-1]["hand"][0] == 0.0
+
+
+def test_page_that_hangs_is_released_and_a_headset_that_sleeps_is_disarmed() -> None:
+    robot = Toy()
+    robot.command = replace(robot.command, release_time=0.3)
+    reality = VirtualReality(robot)
+    reality.arm()
+    notices = []
+    for grip in (False, True):
+        reality.receive("A", HandMessage(time.monotonic(), None, {"left": TOOL}, {"left": grip}, {"left": ()}))
+    becomes(lambda: reality.status.leading)
+    becomes(lambda: not reality.status.leading)
+    notices.append(reality.status.notice)
+    assert reality.status.armed
+    becomes(lambda: not reality.status.armed)
+    notices.append(reality.status.notice)
+    reality.close()
+    assert "no pose for 300 ms" in notices[0] and "silent for 2 s" in notices[1]
+
+
+def test_head_and_buttons_are_commands_of_their_own() -> None:
+    robot = Toy()
+    robot.command = replace(robot.command, head="head", buttons="buttons")
+    robot.idle = {**robot.idle, "head": np.zeros(7), "buttons": np.zeros(3)}
+    reality = VirtualReality(robot)
+    reality.arm()
+    for grip in (False, True):
+        message = HandMessage(time.monotonic(), TOOL, {"left": TOOL}, {"left": grip}, {"left": (0.5, 1.0)})
+        reality.receive("A", message)
+    becomes(lambda: reality.status.leading and robot.sent[-1]["hand"][0] == 1.0)
+    np.testing.assert_array_equal(robot.sent[-1]["head"], [1, 0, 0, 0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(robot.sent[-1]["buttons"], [0.5, 1.0, 0.0])
+    reality.close()
+    assert not robot.sent[-1]["head"].any() and not robot.sent[-1]["buttons"].any()
 
 
 # -- the machine

@@ -64,6 +64,13 @@ class LoopSession(Session):
         self._ended.set()
         self._thread.join()
 
+    @property
+    def trouble(self) -> str:
+        """Return why commands do not reach the machine: a loop that is silent, or its fallbacks; empty if they do."""
+        status = self._status
+        latched = [] if status is None else [f"the fallbacks command: {text}" for text in status.latched]
+        return self._motion.trouble or "; ".join(latched)
+
     # -- commands
 
     def write(self, values: Mapping[str, Any], *, compare: bool = False) -> None:

@@ -87,10 +87,11 @@ def view_loop(
     from vtbdrake.web.vr import ControlledRobot, VirtualReality
 
     with ExitStack() as stack:
-        session = stack.enter_context(LoopSession(scenario, url))
+        session = LoopSession(scenario, url)
+        stack.callback(session.close)
         reality = None
         if vr:
-            reality = VirtualReality(ControlledRobot(scenario, url))
+            reality = VirtualReality(ControlledRobot(scenario, url, trouble=lambda: session.trouble))
             stack.callback(reality.close)
         opened = _served(session, port=port, hosts=hosts, vr=reality, tls=tls)
         stack.pop_all()

@@ -109,8 +109,9 @@ class Robot(ABC):
     def send(self, commands: Mapping[str, Any]) -> None:
         """Give values of commands u, by name."""
 
-    def keep(self) -> None:  # noqa: B027 - most need nothing
-        """Keep the connection to the robot; called in each turn."""
+    def trouble(self) -> str:
+        """Return why the robot is not to be led now; empty if it may. Called in each turn."""
+        return ""
 
     def close(self) -> None:  # noqa: B027
         """End the connection to the robot."""
@@ -134,6 +135,10 @@ class SimulatedRobot(Robot):
     def send(self, commands: Mapping[str, Any]) -> None:
         self._session.write({f"{COMMAND}{name}": value for name, value in commands.items()})
 
+    def trouble(self) -> str:
+        frame = self._session.latest
+        return "" if frame is None else frame.failure
+
 
 class ControlledRobot(Robot):
     """A robot that a loop (``vtbdrake run``) controls: it receives commands u over LCM, and answers what it is asked.
@@ -141,6 +146,7 @@ class ControlledRobot(Robot):
     Args:
         scenario: The scenario, whose protocol has a channel for each of the commands.
         url: The LCM URL of the bus.
+        trouble: Returns why commands do not reach the machine; empty if they do.
 
     Raises:
         ValueError: The protocol has no channel for a command.
@@ -149,8 +155,9 @@ class ControlledRobot(Robot):
 
     is_real = True
 
-    def __init__(self, scenario: Scenario, url: str) -> None:
+    def __init__(self, scenario: Scenario, url: str, *, trouble: Callable[[], str] = str) -> None:
         super().__init__(scenario)
+        self._trouble = trouble
         signals = {signal.name: signal for signal in scenario.interface().commands}
         self._encoders = {
             name: (map.channel, map.encoder([signals[signal] for signal in map.signals]))
@@ -185,8 +192,9 @@ class ControlledRobot(Robot):
             if not self._link.publish((channel, encode({name: np.atleast_1d(np.asarray(value, float))}, self._utime))):
                 raise HandError(f"the bus {self._url} takes no commands: is the hub running?")
 
-    def keep(self) -> None:
-        self._link.receive(0.0, _BURST)
+    def trouble(self) -> str:
+        self._link.receive(0.0, _BURST)  # It keeps the connection.
+        return self._trouble()
 
     def close(self) -> None:
         self._link.close()
@@ -300,7 +308,8 @@ class VirtualReality:
         """Give the command of this instant: while a hand leads, and once when it has let go."""
         lead = self._lead
         try:
-            self._robot.keep()
+            if reason := self._robot.trouble():
+                lead.disarm(reason)
             command = lead.command(time.monotonic())
             if lead.leading or not self._released:
                 self._released = False
@@ -326,6 +335,8 @@ class VirtualReality:
         return commands
 
     def _arm(self) -> None:
+        if reason := self._robot.trouble():
+            raise HandError(reason)
         self._robot.begin()
         self._lead.arm()
 
