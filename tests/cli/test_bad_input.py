@@ -1,5 +1,6 @@
 """Everything that a user can get wrong is one line on stderr, and an exit code."""
 
+import socket
 from pathlib import Path
 
 import pytest
@@ -174,3 +175,10 @@ def test_a_quality_that_fails_everywhere_is_told_below_the_table() -> None:
 def test_traceback_on_request() -> None:
     result = run("--traceback", "variables", "none.yaml")
     assert type(result.exception).__name__ == "ScenarioError"
+
+
+def test_a_port_that_is_taken_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        message = error_of("view", PENDULUM, "--port", port, "--no-browser")
+    assert f"port {port} cannot be used" in message and "or 0 for any that is free" in message

@@ -240,6 +240,26 @@ def test_saved_snapshot_opens_with_the_same_camera(page: Page, running: View, br
         second.close()
 
 
+def test_tab_that_stands_still_catches_up_and_holds_nobody_up(page: Page, running: View, browser: Browser) -> None:
+    page.click("#vtb-play")
+    drawn(page, "parseFloat(vtb.clock.textContent) > 0.1")
+    browser_side = page.context.new_cdp_session(page)
+    browser_side.send("Debugger.enable")
+    browser_side.send("Debugger.pause")  # Neither timers nor messages run.
+    number = running.session.latest.number if running.session.latest is not None else 0
+    other = browser.new_page()
+    other.set_default_timeout(PATIENCE)
+    other.goto(running.url)
+    other.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+    drawn(other, "vtb.frames > 3")
+    other.close()
+    assert running.session.wait_for_frame(number + 30, PATIENCE / 1e3) is not None
+    running.session.pause()
+    browser_side.send("Debugger.resume")
+    time = running.session.snapshot().time
+    drawn(page, f"vtb.clock.textContent === '{time:.3f} s' && vtb.rate.textContent === 'paused'")
+
+
 def test_closed_session_is_told(page: Page, running: View) -> None:
     running.close()
     drawn(page, "document.body.dataset.session === 'ended'")

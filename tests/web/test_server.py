@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import random
 import urllib.error
@@ -20,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from vtbdrake.web import View, view
 from vtbdrake.web.host import PortError
-from vtbdrake.web.relay import Newest
+from vtbdrake.web.relay import Newest, relay
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 ANGLE = "sim.sys.cart_pole.pole_pin.position"
@@ -171,6 +172,21 @@ def test_closed_view_closes_its_pages() -> None:
         ask(base(opened))
 
 
+def test_page_that_does_not_read_holds_nobody_up() -> None:
+    with view(CartPoleScenario()) as running, page(running, ""), page(running) as hung:
+        receive(hung, "frame")
+        assert command(hung, "play") == ""
+        # From here on, neither its scene nor its frames are read; it still steers.
+        with page(running) as other:
+            first = receive(other, "frame")
+            assert not first["steers"]
+            while receive(other, "frame")["time"] < first["time"] + 0.5:
+                pass
+            assert command(other, "take over") == "" and command(other, "pause") == ""
+            when = running.session.snapshot().time
+            assert running.session.snapshot().time == when
+
+
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_paused_view_ends_in_silence_after_its_browser(is_killed: bool, capfd: pytest.CaptureFixture[str]) -> None:
     opened = view(CartPoleScenario())
@@ -196,6 +212,28 @@ def scene_after(messages: list[dict[str, Any]]) -> dict[str, Any]:
         else:
             scene.setdefault(message["path"], {})[message["type"], message.get("property")] = message["value"]
     return scene
+
+
+@pytest.mark.one_python
+def test_poses_for_a_browser_that_hangs_take_no_memory() -> None:
+    poses = [{"type": "set_transform", "path": f"/drake/{number % 5}", "matrix": [number]} for number in range(5000)]
+    messages, awake, sent = iter([*poses, {"type": "delete", "path": "/end"}]), asyncio.Event(), []
+
+    async def receive() -> bytes:
+        message = next(messages, None)
+        if message is None:
+            awake.set()
+            await asyncio.Event().wait()
+        return msgpack.packb(message)  # type: ignore[no-any-return]
+
+    async def send(data: bytes) -> None:
+        await awake.wait()
+        sent.append(msgpack.unpackb(data))
+        if sent[-1]["type"] == "delete":
+            raise OSError("the browser is gone")
+
+    asyncio.run(asyncio.wait_for(relay(receive, send), PATIENCE))
+    assert sent[-6:-1] == poses[-5:] and len(sent) <= 7  # At most one was under way.
 
 
 @pytest.mark.one_python
