@@ -4,6 +4,7 @@ import { element, number } from "./common.js";
 
 const INK = "#1c2329", SOFT = "#5d6870", LINE = "#d9dee2", BAD = "#b2182b", BEST = "#d6604d", DROPPED = "#9aa3a9";
 const MARGIN = { left: 62, right: 14, top: 10, bottom: 34 };
+const MANY = 3000; // points that are drawn as dots
 const REACH = 14; // px: how near the pointer must be to a point
 const VIRIDIS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 
@@ -55,12 +56,15 @@ export class Scale {
   }
 }
 
-// What the charts have in common: a canvas of the size of its place, drawn at most once per animation frame.
+// What the charts have in common: a canvas of the size of its place, drawn at most once per animation frame. The points
+// are drawn once, on a layer of their own; over it lies what follows the pointer.
 class Chart {
   // `height` is a part of the window's; `drags` tells what a drag draws at present: "box", "target" or nothing.
   constructor(id, { height, onpoint, onleave, onclick, ondrag, drags = () => "" }) {
     Object.assign(this, { part: height, onpoint, onclick, ondrag, drags });
     this.canvas = element("canvas", { id, className: "vtb-chart", tabIndex: 0 });
+    this.layer = document.createElement("canvas");
+    this.pointed = -1;
     this.draws = 0;
     this.canvas.addEventListener("pointermove", (event) => this.#move(event));
     this.canvas.addEventListener("pointerleave", () => onleave?.());
@@ -99,30 +103,48 @@ class Chart {
     this.redraw();
   }
 
+  // Marks a point, -1 for none.
+  point(index) {
+    this.pointed = index;
+    this.redraw();
+  }
+
   redraw() {
     this.frame ??= requestAnimationFrame(() => {
       this.frame = null;
       const ratio = devicePixelRatio, width = this.canvas.clientWidth;
-      if (!width) return;
+      if (!width || !this.data) return;
       this.width = width;
       this.height = Math.max(110, Math.round(this.part * innerHeight));
       this.canvas.style.height = `${this.height}px`;
       const size = [Math.round(width * ratio), Math.round(this.height * ratio)];
-      if (this.canvas.width !== size[0] || this.canvas.height !== size[1]) [this.canvas.width, this.canvas.height] = size;
-      const pen = this.canvas.getContext("2d");
+      if (this.layer.width !== size[0] || this.layer.height !== size[1]) {
+        for (const canvas of [this.canvas, this.layer]) [canvas.width, canvas.height] = size;
+        this.stale = true;
+      }
+      if (this.stale) this.draw(this.#pen(this.layer, ratio));
+      this.stale = false;
+      const pen = this.#pen(this.canvas, 1);
+      pen.drawImage(this.layer, 0, 0);
       pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-      pen.clearRect(0, 0, width, this.height);
-      pen.font = "11px system-ui, sans-serif";
-      this.draw(pen);
+      this.overlay(pen);
       this.canvas.dataset.draws = ++this.draws;
     });
+  }
+
+  #pen(canvas, ratio) {
+    const pen = canvas.getContext("2d");
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, this.width, this.height);
+    pen.font = "11px system-ui, sans-serif";
+    return pen;
   }
 }
 
 // Points over two axes. `data` is {x, y: arrays of values, color: index -> colour, kind: array, best, line: [[x, y], ...]}.
 export class Scatter extends Chart {
   show(data, xScale, yScale) {
-    Object.assign(this, { data, xScale, yScale });
+    Object.assign(this, { data, xScale, yScale, stale: true });
     this.redraw();
   }
 
@@ -157,7 +179,6 @@ export class Scatter extends Chart {
   }
 
   draw(pen) {
-    if (!this.data) return;
     const { grid, x, kind, line, best, marks = [], regions = [] } = this.data;
     if (grid?.mean) this.#cells(pen, grid);
     this.#axes(pen);
@@ -173,17 +194,21 @@ export class Scatter extends Chart {
       line.forEach(([a, b], k) => pen[k ? "lineTo" : "moveTo"](this.x(a), this.y(b)));
       pen.stroke();
     }
-    const size = x.length > 3000 ? 2 : 3.5;
+    const many = x.length > MANY, size = many ? 1.5 : 3.5;
     for (let k = 0; k < x.length; k++) {
-      point(pen, this.x(x[k]), this.y(this.#height(k)), size, kind[k], this.data.color(k), !!grid?.mean);
+      point(pen, this.x(x[k]), this.y(this.#height(k)), size, kind[k], this.data.color(k), many ? "dot" : grid?.mean ? "framed" : "");
     }
     if (best >= 0) ring(pen, this.x(x[best]), this.y(this.#height(best)), 8, BEST);
-    if (this.data.pointed >= 0) ring(pen, this.x(x[this.data.pointed]), this.y(this.#height(this.data.pointed)), 7, "#cc3399");
     for (const { at, tint, shape } of marks) mark(pen, this.x(at[0]), this.y(at[1]), tint, shape);
+    pen.restore();
+  }
+
+  overlay(pen) {
+    const { x } = this.data, k = this.pointed;
+    if (k >= 0 && k < x.length) ring(pen, this.x(x[k]), this.y(this.#height(k)), 7, "#cc3399");
     const shape = this.pressed && this.dragged && this.drags();
     if (shape === "box") this.#box(pen, ...this.pressed, ...this.dragged);
     if (shape === "target") mark(pen, ...this.dragged, "#0b6e99", "target");
-    pen.restore();
   }
 
   #box(pen, x0, y0, x1, y1) {
@@ -236,7 +261,7 @@ export class Scatter extends Chart {
 // One line per trial over all parameters and qualities, side by side. `data` is {columns: arrays, color, kind, order}.
 export class Parallel extends Chart {
   show(data, scales) {
-    Object.assign(this, { data, scales });
+    Object.assign(this, { data, scales, stale: true });
     this.redraw();
   }
 
@@ -267,15 +292,13 @@ export class Parallel extends Chart {
   }
 
   draw(pen) {
-    if (!this.data) return;
-    const { columns, color: tint, order, pointed, best } = this.data;
+    const { columns, color: tint, order, best } = this.data;
     pen.globalAlpha = Math.min(1, Math.max(0.06, 150 / order.length));
     pen.lineWidth = 1;
     for (const k of order) this.#line(pen, columns, k, tint(k));
     pen.globalAlpha = 1;
     pen.lineWidth = 2.5;
     if (best >= 0) this.#line(pen, columns, best, BEST);
-    if (pointed >= 0) this.#line(pen, columns, pointed, "#cc3399");
     this.scales.forEach((scale, axis) => {
       const at = this.#x(axis);
       pen.fillStyle = SOFT;
@@ -287,6 +310,11 @@ export class Parallel extends Chart {
       pen.fillStyle = INK;
       pen.fillText(fitted(pen, scale.label, (this.width - 48) / this.scales.length), at + shift, this.height - 5);
     });
+  }
+
+  overlay(pen) {
+    pen.lineWidth = 2.5;
+    if (this.pointed >= 0 && this.pointed < this.data.kind.length) this.#line(pen, this.data.columns, this.pointed, "#cc3399");
   }
 
   #line(pen, columns, k, tint) {
@@ -311,7 +339,7 @@ function fitted(pen, text, width) {
   return `…${shown}`;
 }
 
-function point(pen, x, y, size, kind, tint, framed) {
+function point(pen, x, y, size, kind, tint, style) {
   if (kind === "failed") {
     pen.strokeStyle = BAD;
     pen.lineWidth = 1.5;
@@ -321,6 +349,11 @@ function point(pen, x, y, size, kind, tint, framed) {
     pen.moveTo(x - size, y + size);
     pen.lineTo(x + size, y - size);
     pen.stroke();
+    return;
+  }
+  if (style === "dot") {
+    pen.fillStyle = kind === "broken" ? "#f4a582" : kind === "dropped" ? DROPPED : tint;
+    pen.fillRect(x - size, y - size, 2 * size, 2 * size);
     return;
   }
   pen.beginPath();
@@ -342,7 +375,7 @@ function point(pen, x, y, size, kind, tint, framed) {
   }
   pen.fillStyle = tint;
   pen.fill();
-  if (framed) {
+  if (style === "framed") {
     pen.strokeStyle = "rgba(255,255,255,0.8)";
     pen.lineWidth = 0.8;
     pen.stroke();

@@ -406,7 +406,7 @@ class Page {
     const quality = this.qualities.length > 1 ? Number(this.quality.value) : 0;
     const { kinds: kind, values, points } = this.trials;
     const shade = this.shades(quality);
-    const common = { kind, best: this.best, pointed: this.pointed, color: (k) => color(shade(values[quality][k])) };
+    const common = { kind, best: this.best, color: (k) => color(shade(values[quality][k])) };
     if (this.view === "landscape") this.#drawLandscape(quality, shade, common);
     if (this.view === "parallel") {
       const order = kind.map((_, k) => k).sort((a, b) => (shade(values[quality][a]) || 0) - (shade(values[quality][b]) || 0));
@@ -481,7 +481,7 @@ class Page {
     if (k === this.pointed) return;
     this.pointed = k;
     this.#describe(k);
-    this.#draw();
+    for (const chart of [...Object.values(this.views), this.history]) chart.point(k);
     this.wanted = k;
     this.pointTimer ??= setTimeout(() => {
       this.pointTimer = null;
