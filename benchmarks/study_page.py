@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -83,17 +84,21 @@ def study_page_open(repeats: int = 3) -> Benchmark:
 
 
 def study_page_cost(rollouts: int = 200, repeats: int = 3) -> Benchmark:
-    """CPU time of a study and of the process of its page, over that of the study alone; it runs on all cores.
+    """CPU time of a study and of the process of its page, over that of the study, which runs on all cores.
 
-    The page's process is ``vtbdrake study open``, with a client that reads as a browser does. Wall times are printed.
+    The page's process is ``vtbdrake study open``, with a client that reads as a browser does. Both are measured while
+    the study runs. Printed beside it: the same study without a page. The CPU times of two equal studies differ by more
+    than a page takes, so that the ratio of these says less.
     """
+    shares: list[float] = []
     walls: dict[bool, list[float]] = {True: [], False: []}
 
     def cpu(watched: bool) -> float:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "a.db"
             call = [sys.executable, "-c", _STUDY, str(path), str(rollouts)]
-            with subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as study:
+            pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+            with subprocess.Popen(call, text=True, cwd=ROOT, **pipes) as study:
                 assert study.stdin is not None and study.stdout is not None
                 study.stdout.readline()
                 with _page(path) if watched else _nobody() as page:
@@ -102,18 +107,21 @@ def study_page_cost(rollouts: int = 200, repeats: int = 3) -> Benchmark:
                     study.stdin.flush()
                     used, wall = map(float, study.stdout.readline().split())
                     walls[watched].append(wall)
-                    return used + _cpu_time(page) - before
+                    if watched:
+                        shares.append((_cpu_time(page) - before) / used)
+                    return used
 
-    with_page, alone = interleaved_values(lambda: cpu(True), lambda: cpu(False), repeats=repeats)
+    watched, alone = interleaved_values(lambda: cpu(True), lambda: cpu(False), repeats=repeats)
     return Benchmark(
         name="study_page_cost",
-        value=float(np.median(with_page) / np.median(alone)),
+        value=1.0 + float(np.median(shares)),
         unit="1",
         goal=COST_GOAL,
         better=LOWER,
-        against="the same study without a page",
-        note=f"CPU time {spread(with_page)} with the page, {spread(alone)} without; wall time "
-        f"{spread(np.array(walls[True]))} and {spread(np.array(walls[False]))}",
+        against="the study without its page",
+        note=f"shares of the page {spread(100.0 * np.array(shares), unit='%')}; CPU time of the study "
+        f"{spread(watched)} with the page, {spread(alone)} without; wall time {spread(np.array(walls[True]))} and "
+        f"{spread(np.array(walls[False]))}",
     )
 
 

@@ -20,7 +20,7 @@ from vtbdrake.optimization.steering import StudySearch
 from vtbdrake.optimization.study_file import Mark, StudyFile
 from vtbdrake.rollout.task import FAILED
 
-_POLL = 0.1  # s
+_POLL = 0.2  # s
 _SHARE = 0.004  # of a core, that the reading takes at most
 _SIGN_OF_LIFE = 1.0  # s between two looks at whether a process runs the study
 _RATE_OVER = 60  # rollouts over which their rate is measured
