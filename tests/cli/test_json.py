@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 import numpy as np
+import pytest
 
 from tests.cli.program import ACROBOT, ANGLE, PENDULUM, RATE, ROOT, run
 from tests.recording.servo import Servo
@@ -80,6 +81,20 @@ def test_an_error_is_an_object_on_stderr() -> None:
         (error,) = parsed(program.stderr)
         assert program.stdout == "" and message in error["error"]
         assert error["exit_code"] == program.exit_code == 2
+
+
+def test_an_interruption_is_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vtbdrake.testbed.load_scenario", interrupt)
+    program = run("variables", PENDULUM, "--json")
+    assert parsed(program.stderr) == [{"error": "interrupted", "exit_code": 1}] and program.exit_code == 1
+
+
+def test_a_schema_is_an_object_in_one_line() -> None:
+    for arguments in (["variables", PENDULUM], ["campaign"], ["study", "run"]):
+        assert result(*arguments, "--schema")["type"] == "object"
 
 
 def test_a_failure_is_an_object_behind_the_result() -> None:

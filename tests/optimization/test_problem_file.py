@@ -152,6 +152,7 @@ def test_the_schema_accepts_what_can_be_loaded(tmp_path: Path) -> None:
         ("math:hypot", "math:hypo", 15, "no function 'hypo'"),
         (f"  small: {{{ANGLE}", f"  small: {{{DAMPING}", 4, "is a parameter, so that no condition can set it"),
         (f"  small: {{{ANGLE}", "  small: {sim.sys.nothing", 11, "sim.sys.nothing"),
+        ("budget: {rollouts: 8}", "budget: 5", 20, "budget is a mapping of rollouts, seconds, target, not 5"),
         ("cvar:0.5", "cvar:2", 16, "the level of cvar is a number in (0, 1]"),
         ("PendulumScenario", "PendulumScenari", 2, "has no scenario 'PendulumScenari'"),
         ("executor: serial", "executor: cloud", 21, "must be one of auto, serial"),

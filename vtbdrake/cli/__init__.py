@@ -124,6 +124,10 @@ def _reported(ctx: click.Context) -> Iterator[None]:
         yield
     except click.exceptions.NoArgsIsHelpError:
         raise
+    except (KeyboardInterrupt, click.Abort) as error:
+        if not json_requested():
+            raise
+        raise FailedError("interrupted") from error
     except click.UsageError as error:
         path = error.ctx.command_path if error.ctx is not None else ctx.command_path
         raise BadInputError(one_line(f"{error.format_message()} ('{path} --help' shows an example)")) from error

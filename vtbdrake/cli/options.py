@@ -333,12 +333,15 @@ _field_option = option(
 def schema_option(load: Callable[[], dict[str, Any]]) -> Callable[[Any], Any]:
     """Return the option ``--schema``, which prints the JSON Schema of a command's file instead of running it."""
 
-    def show(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
+    def show_schema(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
+        from vtbdrake.cli.output import show
+
         if is_requested and not ctx.resilient_parsing:
-            click.echo(json.dumps(load(), indent=2))
+            described = load()
+            show(json.dumps(described, indent=2), described)
             ctx.exit()
 
-    settings: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": show}
+    settings: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": show_schema}
     return option("--schema", "Print the JSON Schema of the YAML file.", **settings)
 
 

@@ -73,7 +73,8 @@ def variables(scenario: Scenario, match: str, as_schema: bool, by_source: bool) 
     from vtbdrake.argument_checks import suggestion
 
     if as_schema:
-        click.echo(json.dumps(schema(type(scenario)), indent=2))
+        described = schema(type(scenario))
+        show(json.dumps(described, indent=2), described)
         return
     testbed = scenario.build()
     listed = testbed.variables()

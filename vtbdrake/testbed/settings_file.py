@@ -55,6 +55,8 @@ class Lines:
             return f"{self._path}: {text}"
         mentioned = _ENTRY.sub(r".\1", text).partition("did you mean")[0]
         places = [(mentioned.find(name), -len(name), line) for name, line in self._texts.items() if name in mentioned]
+        if (key := text.partition(" ")[0]) in self._names:
+            places.append((0, -len(key), self._names[key]))
         line = f"line {min(places)[2]}: " if places else ""
         return f"{self._path}: {line}{text}"
 
