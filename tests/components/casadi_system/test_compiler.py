@@ -118,6 +118,18 @@ def test_a_compiler_that_fails_leaves_nothing_behind(cache, monkeypatch):
     np.testing.assert_allclose(_eval(CasadiSystem(_function(), compile=True), np.zeros(3), np.ones(3))[3], 1.0)
 
 
+def test_a_damaged_library_is_compiled_again(cache):
+    # In another process: here, a library that is loaded is not read again.
+    script = "import tests.components.casadi_system.test_compiler as t\nt.CasadiSystem(t._function(), compile=True)"
+    subprocess.run([sys.executable, "-c", script], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    (library,) = (cache / "cache").rglob("*.so")
+    library.write_bytes(library.read_bytes()[:500])
+    machine, interpreted = CasadiSystem(_function(), compile=True), CasadiSystem(_function())
+    x, u = np.arange(3.0), np.ones(3)
+    np.testing.assert_array_equal(_eval(machine, x, u), _eval(interpreted, x, u))
+    assert _runs(cache) == 2
+
+
 def test_python_inside_a_function_cannot_be_compiled(cache):
     class Doubled(casadi.Callback):
         def __init__(self):

@@ -54,7 +54,16 @@ def compiled(function: casadi.Function) -> casadi.Function:
     with _ONE_AT_A_TIME:
         if not library.exists():
             compile_library(source, library)
-    return casadi.external(function.name(), str(library))
+        try:
+            return casadi.external(function.name(), str(library))
+        except RuntimeError as error:
+            _log.warning("%s is damaged, and compiled again: %s", library, str(error).splitlines()[-1])
+            library.unlink(missing_ok=True)
+            compile_library(source, library)
+    try:
+        return casadi.external(function.name(), str(library))
+    except RuntimeError as error:
+        raise CompilerError(f"what {command[0]} makes cannot be loaded: {str(error).splitlines()[-1]}") from None
 
 
 def compiled_if_possible(function: casadi.Function) -> casadi.Function:
