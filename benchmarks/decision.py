@@ -1,8 +1,9 @@
-"""Benchmark of the time that a decision takes beyond its rollouts."""
+"""Benchmarks of the time that a decision takes beyond its rollouts."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -13,6 +14,8 @@ from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Belief, BeliefToStart, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Quality, RolloutRunner
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 AHEAD = "sim.sys.climber.base.x"
@@ -26,6 +29,43 @@ def _begin_in_workers(reasoner: Reasoner, testbed: VirtualTestbed, context: Cont
     start = reasoner.belief_to_start.start(Belief.of(testbed, context))
     results = dict(reasoner.executor.run(reasoner.task, [{}] * WORKERS, start=start))
     return time.perf_counter() - begin - max(result.wall_time for result in results.values())
+
+
+def decision_overhead_compiled(decisions: int = 200, rollouts: int = 32) -> Benchmark:
+    """Milliseconds of processor time that a decision of the cart-pole takes beyond its compiled rollouts.
+
+    All is done by the process that decides: the belief, the method, the rollouts of the mental testbed, the choice.
+    """
+    scenario = CartPoleScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    mental = scenario.mental().build()
+    with make_reasoner(scenario, rollouts=rollouts, executor="compiled") as reasoner:
+        decision = reasoner.decide(testbed, context)
+        bare = mental.compiled(
+            horizon=scenario.duration, sample_period=reasoner.task.sample_period, outputs=["plant.state"]
+        )
+        plans = {"u.plan": np.array([candidate.values["u.plan"] for candidate in decision.candidates])}
+        bare(plans)
+        parts = [partial(reasoner.decide, testbed, context), partial(bare, plans)]
+        times = np.array([[_processor_time(part) for part in parts] for _ in range(decisions)]) * 1e3
+    ours = times[:, 0] - times[:, 1]
+    return Benchmark(
+        name="decision_overhead_compiled",
+        value=float(np.median(ours)),
+        unit="ms",
+        goal=1.0,
+        better=LOWER,
+        against="the compiled rollouts of the same decisions",
+        note=f"processor time, {spread(ours, unit='ms')}; a decision takes {np.median(times[:, 0]):.3g} ms, its "
+        f"{rollouts} rollouts of {scenario.duration:g} s {np.median(times[:, 1]):.2g} ms",
+    )
+
+
+def _processor_time(function: Callable[[], object]) -> float:
+    begin = time.process_time()
+    function()
+    return time.process_time() - begin
 
 
 def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:

@@ -30,6 +30,7 @@ BENCHMARKS: Registry = {
     "casadi_system": "benchmarks.casadi_system:casadi_system",
     "image_switch": "benchmarks.image_switch:image_switch",
     "decision_overhead": "benchmarks.decision:decision_overhead",
+    "decision_overhead_compiled": "benchmarks.decision:decision_overhead_compiled",
     "predictive_sampling": "benchmarks.predictive_sampling:predictive_sampling",
     "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
     "compiled_testbed": "benchmarks.compiled_testbed:compiled_testbed",

@@ -94,7 +94,7 @@ class Push(AddressedSystem):
             prerequisites_of_calc={self.numeric_parameter_ticket(self._push.index)},
         )
 
-    def equations(self, context: Context, varied: frozenset[str]) -> PushEquations:
+    def compiled_equations(self, context: Context, varied: frozenset[str]) -> PushEquations:
         """Return the equations for a compiled testbed."""
         from vtbdrake_diagrams.manipulator.compiled import PushEquations
 

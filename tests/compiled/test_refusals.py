@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus, LeafSystem, System
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Gain, Integrator, ZeroOrderHold
 
 from vtbdrake.compiled import (
@@ -58,11 +58,10 @@ def alone(*systems: System) -> Diagram:
 
 
 def compiled(diagram: Diagram, outputs: tuple[str, ...] = (), **options) -> CompiledRollouts:
-    context = diagram.CreateDefaultContext()
     return CompiledRollouts(
         diagram,
         collect(diagram),
-        context,
+        options.pop("context", None) or diagram.CreateDefaultContext(),
         horizon=1.0,
         sample_period=0.1,
         outputs=outputs,
@@ -128,6 +127,50 @@ def test_wrong_equations_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CompiledDifferenceError, match=r"state of part0 differs .* by 1e-07 at t = 0.1 s"):
         compiled(alone(Squares()))
     compiled(alone(Squares()), check=False)
+
+
+class MoreSquares(Squares):
+    """Computes something else than its base class, as the equations of that cannot tell."""
+
+
+def test_a_subclass_is_not_its_base(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Squares, SquaresEquations)
+    with pytest.raises(UnsupportedTestbedError, match="part0: MoreSquares is a LeafSystem in Python"):
+        compiled(alone(MoreSquares()))
+
+
+class Watchdog(LeafSystem):
+    """Has no state, but may end a simulation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclarePeriodicPublishEvent(0.1, 0.0, lambda context: EventStatus.ReachedTermination(self, "over"))
+
+
+def test_what_may_end_a_simulation_is_named() -> None:
+    with pytest.raises(UnsupportedTestbedError, match="part0: Watchdog is a LeafSystem in Python"):
+        compiled(alone(Watchdog()))
+
+
+class OwnSquares(Squares):
+    def compiled_equations(self, context: Context, varied: frozenset[str]) -> Equations:
+        return SquaresEquations(self, context, varied)
+
+
+def test_a_system_may_have_its_equations() -> None:
+    assert compiled(alone(OwnSquares()), outputs=("part0.x",))().outputs["part0.x"][0, 1] == 0.5**2 + 0.1
+
+
+def test_a_value_fixed_at_an_input_is_compiled_in() -> None:
+    diagram = alone(ZeroOrderHold(0.1, 1))
+    hold = diagram.GetSubsystemByName("part0")
+    contexts = [diagram.CreateDefaultContext() for _ in range(2)]
+    for value, context in enumerate(contexts):
+        hold.get_input_port().FixValue(hold.GetMyContextFromRoot(context), [3.0 + value])
+    rollouts = compiled(diagram, ("part0.y",), context=contexts[0])
+    assert rollouts().outputs["part0.y"][0, -1, 0] == 3.0
+    with pytest.raises(UnsupportedTestbedError, match="the value fixed at the input port u of part0 differs"):
+        rollouts(context=contexts[1])
 
 
 class Started(Squares):

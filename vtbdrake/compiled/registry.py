@@ -39,8 +39,8 @@ EQUATIONS: dict[type, type[Equations]] = {
 }
 """The equations of each class of systems, to which others can be added: ``EQUATIONS[TheirSystem] = MyEquations``.
 
-A system of your own may rather have a method ``equations(context, varied)`` that returns them. A class that is not
-here, and none of whose bases is, is compiled if Drake converts it to symbolic expressions.
+A system of your own may rather have a method ``compiled_equations(context, varied)`` that returns them. A class that is
+not here is compiled if Drake converts it to symbolic expressions.
 """
 
 
@@ -50,12 +50,12 @@ def equations_of(system: System, context: Context, varied: frozenset[str]) -> Eq
     Raises:
         UnsupportedTestbedError: There are none.
     """
-    if hasattr(system, "equations"):
-        equations: Equations = system.equations(context, varied)
+    if hasattr(system, "compiled_equations"):
+        equations: Equations = system.compiled_equations(context, varied)
         return equations
-    for kind in type(system).__mro__:
-        if kind in EQUATIONS:
-            return EQUATIONS[kind](system, context, varied)
+    # A subclass may compute something else.
+    if type(system) in EQUATIONS:
+        return EQUATIONS[type(system)](system, context, varied)
     if is_python(system) and system.ToSymbolicMaybe() is None:
         raise refusal(system, f"is a LeafSystem in Python: {REMEDY}")
     return SymbolicEquations(system, context, varied)

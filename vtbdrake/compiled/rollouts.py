@@ -22,6 +22,7 @@ from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.compiled.walker import MEMORY, Walker
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.state import Variables
+from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.instants import sample_instants, sample_times
 
 _log = logging.getLogger(__name__)
@@ -96,26 +97,28 @@ class CompiledRollouts:
             measures: Functions of outputs that are recorded as well: name -> (function, addresses of its arguments).
             timings: (period, offset) of all periodic events; by default those of the compiled systems.
         """
-        self.walker = Walker(diagram, context.Clone(), variables, parameters)
         self.parameters, self.outputs = tuple(parameters), tuple(outputs)
+        self._measures = dict(measures or {})
+        self._translate = TRANSLATIONS[compile]
+        self._workers = workers
+        # One thread at a time: CasADi counts the references to its expressions without atomics.
+        with making():
+            self.walker = Walker(diagram, context.Clone(), variables, parameters)
+            self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
+            self._w = casadi.SX.sym("w", max(1, self.walker.noise))
+            self._recorded = self._recorded_values()
+            self._shapes = self._output_shapes(variables)
+            self._record = casadi.Function("record", [self._z, self._time], [self._recorded], {"cse": True})
         for address in parameters:
             self.walker.place(address)
         self.times = sample_times(horizon, sample_period)
         by_default = [(timing.period, timing.offset) for timing in self.walker.timings]
         self._timings = by_default if timings is None else list(timings)
-        self._measures = dict(measures or {})
-        self._translate = TRANSLATIONS[compile]
-        self._workers = workers
         self._z0 = self.walker.read(self.walker.context)
         self._overruns = [
             b.entries.start for b in self.walker.blocks.values() if b.kind == MEMORY and b.name == OVERRUN
         ]
-        self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
-        self._w = casadi.SX.sym("w", max(1, self.walker.noise))
-        self._recorded = self._recorded_values()
-        self._shapes = self._output_shapes(diagram, variables)
         self._updates: dict[tuple[int, ...], casadi.Function] = {}
-        self._record = casadi.Function("record", [self._z, self._time], [self._recorded], {"cse": True})
         self._programs: dict[tuple[int, tuple[tuple[int, ...], ...]], _Program] = {}
         self._last_schedule: tuple[float, list[Instant]] = np.nan, []
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
@@ -260,7 +263,7 @@ class CompiledRollouts:
     def _addresses(self) -> list[str]:
         return list(dict.fromkeys([*self.outputs, *(a for _, of in self._measures.values() for a in of)]))
 
-    def _output_shapes(self, diagram: Diagram, variables: Variables) -> dict[str, tuple[int, ...]]:
+    def _output_shapes(self, variables: Variables) -> dict[str, tuple[int, ...]]:
         shapes: dict[str, tuple[int, ...]] = {}
         for address in self.outputs:
             if address in variables:
@@ -286,7 +289,7 @@ class CompiledRollouts:
         return self._updates[due]
 
     def _program(self, instants: Sequence[Instant]) -> _Program:
-        with self._lock:
+        with self._lock, making():
             dues = tuple(dict.fromkeys(instant.updates for instant in instants if instant.updates))
             needed = len(instants)
             for (count, covered), program in self._programs.items():

@@ -23,7 +23,7 @@ from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Unsuppo
 from vtbdrake.compiled.registry import equations_of
 from vtbdrake.state import AddressError, Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
-from vtbdrake.state.systems import class_name, is_plant, is_scene_graph, leaves, read_group, write_group
+from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, read_group, write_group
 from vtbdrake.state.variables import Place
 
 MEMORY, EXTRA = "memory", "extra"
@@ -81,16 +81,24 @@ class Walker:
         self._paths = {system: path for path, system in leaves(diagram)}
         self._systems = {path: system for system, path in self._paths.items()}
         self.equations: dict[str, Equations] = {}
+        self._fixed_inputs: dict[tuple[str, int], Array] = {}
         self.uncovered: dict[str, str] = {}
         whole = [variables[address].address.partition("[")[0] for address in varied]
-        refused = []
+        refused = [
+            f"{path}: {class_name(system)} has continuous state: give it a time step, or write its update as a "
+            "casadi.Function"
+            for path, system in self._systems.items()
+            if system.GetMyContextFromRoot(context).num_continuous_states()
+        ]
+        if refused:  # Quickly, before equations are written.
+            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
         for path, system in self._systems.items():
             try:
                 names = frozenset(filter(None, (self._within(path, address) for address in whole)))
                 self.equations[path] = self._equations_of(path, system, names)
             except UnsupportedTestbedError as error:
                 self.uncovered[path] = str(error)
-                if _has_state(system):
+                if _matters(system):
                     refused.append(f"{path}: {error}")
         if refused:
             raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
@@ -139,6 +147,14 @@ class Walker:
                 raise UnsupportedTestbedError(
                     f"{path} differs from what was compiled, such as a mass, a locked joint or the position of a "
                     "switch: compile the testbed in this context"
+                )
+        for (path, number), value in self._fixed_inputs.items():
+            other = self._fixed_value(context, path, number)
+            if other is None or not np.array_equal(value, other):
+                name = self._systems[path].get_input_port(number).get_name()
+                raise UnsupportedTestbedError(
+                    f"the value fixed at the input port {name} of {path} differs from what was compiled: compile the "
+                    "testbed in this context"
                 )
 
     def place(self, address: str) -> slice:
@@ -240,22 +256,24 @@ class Walker:
 
     def fixed_input(self, path: str, number: int) -> Expression | None:
         """Return the value that is fixed at an input port to which nothing is connected, if any."""
+        value = self._fixed_value(self.context, path, number)
+        if value is None:
+            return None
+        self._fixed_inputs[path, number] = value
+        return casadi.SX(casadi.DM(value))
+
+    def _fixed_value(self, context: Context, path: str, number: int) -> Array | None:
         system = self._systems[path]
-        leaf_context = system.GetMyContextFromRoot(self.context)
+        leaf_context = system.GetMyContextFromRoot(context)
         port = system.get_input_port(number)
         if port.get_data_type() != PortDataType.kVectorValued or not port.HasValue(leaf_context):
             return None
-        return casadi.SX(casadi.DM(port.Eval(leaf_context)))
+        return np.array(port.Eval(leaf_context))
 
     # -- how it is done
 
     def _equations_of(self, path: str, system: System, names: frozenset[str]) -> Equations:
         leaf_context = system.GetMyContextFromRoot(self.context)
-        if leaf_context.num_continuous_states():
-            raise UnsupportedTestbedError(
-                f"{class_name(system)} has continuous state: give it a time step, or write its update as a "
-                "casadi.Function"
-            )
         if is_scene_graph(system):
             raise UnsupportedTestbedError("geometry is not compiled")
         return equations_of(system, leaf_context, names)
@@ -440,10 +458,15 @@ class _Reading(At):
         return int(self._evaluation.walker.equations[self._path].system.GetInputPort(port).get_index())
 
 
-def _has_state(system: System) -> bool:
-    """Return whether a system has state of its own, so that a compiled Diagram without it would be another one."""
+def _matters(system: System) -> bool:
+    """Return whether a compiled Diagram without a system could be another one, though no other system reads it.
+
+    So it is with state, and with events of a user's system in Python, which may end a simulation.
+    """
     if is_scene_graph(system):
         return False
+    if is_python(system) and not type(system).__module__.startswith("vtbdrake."):
+        return True
     context = system.CreateDefaultContext()
     return bool(context.num_continuous_states() or context.num_discrete_state_groups() or context.num_abstract_states())
 

@@ -66,6 +66,8 @@ class Evaluator:
         self._round = round_size
         self._conditions = range(len(problem.conditions))
         self._signs = np.array([quality.sign for quality in problem.objectives])
+        self._minimize = [quality.minimize for quality in problem.objectives]
+        self._bounds = [quality.bound(problem.task.horizon) for quality in problem.objectives]
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
         self._allows: Callable[[Point], bool] = lambda _: True
         # Independent of the known ones, of which a resumed study has more.
@@ -182,9 +184,9 @@ class Evaluator:
         values, violations = aggregate(
             outcomes,
             risk=self._problem.risk,
-            minimize=[quality.minimize for quality in self._problem.objectives],
+            minimize=self._minimize,
             constraints=constraints,
-            bounds=[quality.bound(self._problem.task.horizon) for quality in self._problem.objectives],
+            bounds=self._bounds,
         )
         return Evaluation(point, values, violations, exact=exact)
 

@@ -113,13 +113,12 @@ class Parameter(_Addressed):
     def from_unit(self, u: float) -> float | int:
         """Return the value at ``u`` in [0, 1] of the range; each value of an integer has an equal share."""
         u = min(max(float(u), 0.0), 1.0)
+        if not (self.integer or self.log):
+            return min(max(self.lower + u * (self.upper - self.lower), self.lower), self.upper)
         if self.integer and not self.log:
             count = int(self.upper) - int(self.lower) + 1
             return int(self.lower) + min(int(u * count), count - 1)
-        if self.log:
-            value = math.exp(math.log(self.lower) + u * (math.log(self.upper) - math.log(self.lower)))
-        else:
-            value = self.lower + u * (self.upper - self.lower)
+        value = math.exp(math.log(self.lower) + u * (math.log(self.upper) - math.log(self.lower)))
         value = min(max(value, self.lower), self.upper)
         return round(value) if self.integer else value
 

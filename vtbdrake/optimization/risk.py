@@ -127,6 +127,12 @@ def aggregate(
     Returns:
         The qualities, larger is better (a cost is negated), and the worst violation of each constraint.
     """
+    outcome = outcomes[0]
+    if len(outcomes) == 1 and outcome is not None and isinstance(risk, Mean | Worst | _Level):
+        # Each of these risks of one quality is that quality.
+        qualities = [outcome.value, *outcome.measures[: len(minimize) - 1]]
+        signed = (-quality if cost else quality for quality, cost in zip(qualities, minimize, strict=True))
+        return tuple(signed), tuple(outcome.measures[len(minimize) - 1 :][:constraints])
     values = []
     for k, (cost, bound) in enumerate(zip(minimize, bounds, strict=True)):
         qualities = [bound if o is None else o.value if k == 0 else o.measures[k - 1] for o in outcomes]

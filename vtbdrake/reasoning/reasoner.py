@@ -52,8 +52,9 @@ class SearchConfig:
         pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
             one before its round of 8 candidates, if there is one sample or the risk is ``worst``. Methods that learn
             from all points, such as CEM and MPPI, propose other candidates with pruning than without.
-        executor: Where the rollouts run, see `Problem.sweep`. ``auto`` takes processes if a system in Python has work
-            to do, else threads.
+        executor: Where the rollouts run, see `Problem.sweep`. ``auto`` compiles the mental testbed if that is possible
+            and equal to Drake's as far as is checked; else it takes processes if a system in Python has work to do,
+            and threads otherwise. The log tells, and ``RolloutResult.computed``.
         workers: Number of threads or processes; by default the number of cores.
         time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
             By default the horizon, but at least 10 s.
@@ -166,7 +167,8 @@ class Reasoner:
         self.solver(0.0, budget=affordable).close()
         self._workers = checked_workers(search.workers)
         self._owned = not isinstance(search.executor, Executor)
-        self.executor = _make_executor(search, self.problem, budget)
+        compiled = self._compiled_executor() if search.executor == "auto" and search.time_limit is None else None
+        self.executor = compiled or _make_executor(search, self.problem, budget)
         if search.pruning is not None or budget.seconds is not None:
             self._check_executor()
         # Of a Ctrl-C between two lines it may be left behind: the same thread takes it again.
@@ -174,6 +176,21 @@ class Reasoner:
         self._warm = False
         self._has_warned = False
         self._closed = False
+
+    def _compiled_executor(self) -> Executor | None:
+        """Return the executor of the compiled testbed, if it is equal to the mental testbed as far as was checked."""
+        # Imported here: without it, a reasoner needs no CasADi.
+        from vtbdrake.rollout.compiled import CompiledExecutor
+
+        executor = CompiledExecutor(self.problem.testbed, workers=self._search.workers)
+        try:
+            executor.prepare(self.task, [dict.fromkeys(self.space.addresses)])
+        except (ValueError, ArithmeticError) as error:
+            _log.info("the mental testbed is simulated in Drake: %s", error)
+            executor.close()
+            return None
+        _log.info("decisions are computed in the compiled testbed, which was compared with Drake's")
+        return executor
 
     def __repr__(self) -> str:
         return f"Reasoner({self.problem!r}, {self.budget!r})"

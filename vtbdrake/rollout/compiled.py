@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from math import isfinite
 
 import casadi
 import numpy as np
@@ -167,11 +167,14 @@ class _CompiledTask:
             workers=workers,
         )
         self._start_context = StartContext(testbed, s0, testbed.copier_from(testbed))
+        self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
 
     def varies(self, addresses: frozenset[str]) -> bool:
         """Return whether variables can be varied without compiling again."""
-        return all(self._rollouts.walker.can_vary(address) for address in addresses)
+        if addresses not in self._varies:
+            self._varies[addresses] = all(self._rollouts.walker.can_vary(address) for address in addresses)
+        return self._varies[addresses]
 
     def run(self, points: Sequence[Parameters], starts: Sequence[Start | None]) -> list[RolloutResult | None]:
         """Return the results of the points; None for those that only Drake can make."""
@@ -205,8 +208,15 @@ class _CompiledTask:
         if self._last_start is None or self._last_start[0] is not start:
             self._start_context.set(start)
             context = self._start_context.context
-            self._last_start = start, self._rollouts.z_of(context), context.get_time()
+            z = self._rollouts.walker.read(context) if self._is_compiled(start) else self._rollouts.z_of(context)
+            self._last_start = start, z, context.get_time()
         return self._last_start[1:]
+
+    def _is_compiled(self, start: Start | None) -> bool:
+        """Return whether a start has no part in which it could differ from what is compiled in."""
+        if start is None or start.contents.names != self._testbed.start_layout.names:
+            return False
+        return self.varies(frozenset(start.values))
 
     def _result(self, point: Parameters, outputs: Mapping[str, np.ndarray], wall_time: float) -> RolloutResult | None:
         """Return the result of a rollout from what was recorded; None if f fails, so that Drake tells how."""
@@ -223,10 +233,18 @@ class _CompiledTask:
             return None
         samples = [sampled[:count] for sampled in samples]
         record = {address: outputs[address][:count] for address in task.record}
-        result = result_of_samples(task, dict(point), times[:count], samples, record, end=HORIZON)
-        if not np.isfinite([*result.measures, *([result.value] if task.quality is not None else [])]).all():
-            return None
-        return replace(result, wall_time=wall_time, computed=COMPILED)
+        result = result_of_samples(
+            task,
+            dict(point),
+            times[:count],
+            samples,
+            record,
+            end=HORIZON,
+            wall_time=wall_time,
+            computed=COMPILED,
+        )
+        numbers = (*result.measures, result.value) if task.quality is not None else result.measures
+        return result if all(map(isfinite, numbers)) else None
 
     def _samples(self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], count: int) -> np.ndarray:
         """Return the samples of a measure, shape (count,) or more; after ``count`` they do not matter."""

@@ -509,6 +509,8 @@ def result_of_samples(
     end: str,
     message: str = "",
     reachable: float | None = None,
+    wall_time: float = np.nan,
+    computed: str = "drake",
 ) -> RolloutResult:
     """Return the outcome of a rollout, equations (14) to (17), from what was sampled.
 
@@ -521,6 +523,8 @@ def result_of_samples(
         end: Why it ended, if no sample has exceeded the threshold.
         message: The reason.
         reachable: For a pruned rollout, the best that it could still have reached.
+        wall_time: Wall time in seconds.
+        computed: How it was computed, see `RolloutResult`.
     """
     f = task.quality
     of_quality = samples[0] if f is not None else np.array([])
@@ -551,6 +555,8 @@ def result_of_samples(
         times=times,
         quality=f.quality(of_quality) if f is not None else np.array([]),
         record=record,
+        wall_time=wall_time,
+        computed=computed,
     )
 
 

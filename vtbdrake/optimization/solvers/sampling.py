@@ -54,7 +54,7 @@ class SamplingSolver(Solver):
 
     def _next(self) -> list[Point]:
         self._U = np.vstack([self._mu, self._draw((self.population - 1, self.search.size))])
-        return [self.search.point(u) for u in self._U]
+        return self.search.points(self._U)
 
     def _draw(self, shape: tuple[int, int]) -> np.ndarray:
         """Return points of the distribution, clipped to the unit cube."""

@@ -7,13 +7,13 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import isinf, isnan
+from math import isfinite, isnan
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 import numpy as np
 
-from vtbdrake.optimization.parameter import Choice, Dimension
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 
 # A point s^0: one value per parameter, in their order.
 Point = tuple[Any, ...]
@@ -37,7 +37,7 @@ class PointValues:
     def failed(self) -> bool:
         """Return whether the point has no value because a simulation failed."""
         # An infinite bound is no failure: it belongs to a dropped point of which little is known.
-        return any(isnan(value) or (self.exact and isinf(value)) for value in self.values)
+        return any(not isfinite(value) and (self.exact or isnan(value)) for value in self.values)
 
     @property
     def feasible(self) -> bool:
@@ -183,7 +183,15 @@ class Search:
 
     def point(self, u: Any) -> Point:
         """Return the point at ``u`` in the unit cube, shape (n,); coordinates outside are clipped."""
-        return tuple(parameter.from_unit(x) for parameter, x in zip(self.space, u, strict=True))
+        # As Python's numbers, with which the parameters compute faster than with numpy's.
+        return tuple(parameter.from_unit(x) for parameter, x in zip(self.space, np.asarray(u).tolist(), strict=True))
+
+    def points(self, U: np.ndarray) -> list[Point]:
+        """Return the points at ``U`` in the unit cube, shape (N, n)."""
+        if not all(isinstance(p, Parameter) and p.is_continuous and not p.log for p in self.space):
+            return [self.point(u) for u in U]
+        lower, upper = np.array([p.ends for p in self.space if isinstance(p, Parameter)]).T
+        return list(map(tuple, np.clip(lower + np.clip(U, 0.0, 1.0) * (upper - lower), lower, upper).tolist()))
 
     def unit(self, point: Point) -> np.ndarray:
         """Return a point in the coordinates of the unit cube, shape (n,)."""
