@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.program import ROOT, error_of, run
+from tests.cli.program import ANGLE, PENDULUM, ROOT, error_of, run
 
 pytestmark = pytest.mark.one_python
 
@@ -54,6 +54,31 @@ def test_scenarios_of_the_folder_and_of_the_testbeds(tmp_path: Path) -> None:
     assert completed("vtbdrake view vtbdrake_diagrams.cart_pole:", tmp_path) == ["CartPoleScenario"]
     (tmp_path / "heavy.yaml").write_text("")
     assert completed("vtbdrake rollout robots:RobotScenario@h", tmp_path) == ["heavy.yaml"]
+
+
+def answers(line: str, folder: Path) -> list[str]:
+    """Return what the program answers to bash."""
+    asked = subprocess.run(
+        [sys.executable, "-c", "from vtbdrake.cli import main; main(prog_name='vtbdrake')"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "_VTBDRAKE_COMPLETE": "bash_complete", "COMP_LINE": line},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return asked.stdout.split()
+
+
+def test_parameters_of_a_study_and_files(tmp_path: Path) -> None:
+    begin = (PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--quality", ANGLE, "--rollouts", 1)
+    assert run("study", "run", tmp_path / "a.db", *begin, "--executor", "serial", "--solver", "random").exit_code == 0
+    assert answers("vtbdrake study try a.db sim", tmp_path) == [f"plain,{ANGLE}"]
+    assert answers("vtbdrake study freeze a.db ", tmp_path) == [f"plain,{ANGLE}"]
+    (tmp_path / "gait.yaml").write_text("")
+    assert answers("vtbdrake study run a.db ga", tmp_path) == ["plain,gait.yaml"]
+    assert answers("vtbdrake study freeze gait.yaml ", tmp_path) == []
+    for line in ("rollout x:Y --save ", "view x:Y --start ", "study run ", "export a.lcm "):
+        assert answers(f"vtbdrake {line}", tmp_path) == ["file,"]
 
 
 def test_no_command_needs_drake_to_be_completed() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,6 +33,33 @@ def complete_scenario(ctx: click.Context, parameter: click.Parameter, incomplete
     else:
         names = sorted({*_scenarios(Path.cwd(), ""), *_scenarios_of(_TESTBEDS)})
     return [CompletionItem(name) for name in names if name.startswith(incomplete)]
+
+
+def complete_file(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Let the shell complete the name of a file."""
+    return [CompletionItem(incomplete, type="file")]
+
+
+def complete_scenario_or_file(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the scenarios, and the YAML files of a folder."""
+    if ":" in incomplete:
+        return complete_scenario(ctx, parameter, incomplete)
+    folder = Path(incomplete).parent
+    names = [str(path) for path in sorted(folder.glob("*")) if path.suffix in (".yaml", ".yml")]
+    files = [CompletionItem(name) for name in names if name.startswith(incomplete)]
+    return [*complete_scenario(ctx, parameter, incomplete), *files]
+
+
+def complete_parameter(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the addresses of the parameters of the study in the argument ``file``."""
+    file = Path(str(ctx.params.get("file", "")))
+    try:
+        with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as study:
+            ((record,),) = study.execute("SELECT value FROM meta WHERE key = 'problem'")
+            addresses = [described["address"] for described in json.loads(record)["parameters"]]
+    except (sqlite3.Error, ValueError, KeyError, TypeError):  # It is no study.
+        return []
+    return [CompletionItem(address) for address in addresses if address.startswith(incomplete)]
 
 
 def _scenarios_of(package: str) -> Iterator[str]:

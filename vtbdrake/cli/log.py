@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.cli import FailedError
-from vtbdrake.cli.completion import complete_scenario
+from vtbdrake.cli.completion import complete_file, complete_scenario
 from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
 from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
 from vtbdrake.failures import one_line
@@ -105,7 +105,7 @@ def _parse_export(text: str) -> Path:
 
 @click.command()
 @_log
-@click.argument("out", callback=converted(_parse_export))
+@click.argument("out", callback=converted(_parse_export), shell_complete=complete_file)
 @json_option
 def export(log: Path, out: Path) -> None:
     """Write a LOG as MCAP (for Foxglove), CSV or Parquet.

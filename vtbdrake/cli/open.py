@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.cli import FailedError
-from vtbdrake.cli.options import option, output, parse_scenario, parse_snapshot
+from vtbdrake.cli.completion import complete_file
+from vtbdrake.cli.options import converted, option, output, parse_scenario, parse_snapshot
 from vtbdrake.cli.output import json_option, show, write_whole
 from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.failures import one_line
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command("open")
-@click.argument("snapshot", metavar="FILE.vtb", callback=lambda _context, _parameter, text: parse_snapshot(text))
+@click.argument("snapshot", metavar="FILE.vtb", callback=converted(parse_snapshot), shell_complete=complete_file)
 @option(
     "--scenario SCENARIO",
     "The scenario, if it is not one of vtbdrake's: MODULE:CLASS or MODULE:CLASS@FILE.yaml.",

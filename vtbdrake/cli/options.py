@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import click
 
-from vtbdrake.cli.completion import complete_scenario
+from vtbdrake.cli.completion import complete_file, complete_scenario
 from vtbdrake.settings import declared_settings
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ def option(
     metavar = usage.removeprefix(" ".join(names)).strip() or None
     if parse is not None:
         settings["callback"] = converted(parse)
+    if metavar in ("FILE", "SNAPSHOT", "OTHER"):
+        settings.setdefault("shell_complete", complete_file)
     return click.option(*names, *([name] if name else []), metavar=metavar, help=text, **settings)
 
 
@@ -292,13 +294,18 @@ def settings(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def scenario_argument(
-    command: Callable[..., Any], *, parse: Callable[[str], Any] = parse_scenario, metavar: str | None = None
+    command: Callable[..., Any],
+    *,
+    parse: Callable[[str], Any] = parse_scenario,
+    complete: Callable[..., Any] = complete_scenario,
+    metavar: str | None = None,
 ) -> Callable[..., Any]:
     """Give a command its argument ``scenario``, with the fields that ``--field`` sets.
 
     Args:
         command: The command.
         parse: Loads the scenario, or what the command accepts instead.
+        complete: Completes it in a shell.
         metavar: What the command accepts, for its help.
     """
 
@@ -310,7 +317,7 @@ def scenario_argument(
             scenario = scenario.with_fields(settings(scenario_fields))
         return command(scenario=scenario, **others)
 
-    argument = click.argument("scenario", callback=converted(parse), shell_complete=complete_scenario, metavar=metavar)
+    argument = click.argument("scenario", callback=converted(parse), shell_complete=complete, metavar=metavar)
     return argument(_field_option(with_scenario))
 
 

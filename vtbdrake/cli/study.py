@@ -12,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 from vtbdrake.cli import FailedError
+from vtbdrake.cli.completion import complete_file, complete_parameter
 from vtbdrake.cli.options import (
     converted,
     grouped,
@@ -50,7 +51,12 @@ _trust_option = option(
     multiple=True,
 )
 _point = click.argument(
-    "point", nargs=-1, required=True, callback=converted(parse_field), metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]"
+    "point",
+    nargs=-1,
+    required=True,
+    callback=converted(parse_field),
+    metavar="ADDRESS=VALUE [ADDRESS=VALUE ...]",
+    shell_complete=complete_parameter,
 )
 
 
@@ -82,7 +88,7 @@ def _schema() -> dict[str, Any]:
 
 
 @study.command()
-@click.argument("file", callback=converted(output()))
+@click.argument("file", callback=converted(output()), shell_complete=complete_file)
 @problem_or_file_options
 @option(
     "--vary ADDRESS=LOWER:UPPER[:log][:integer]",
@@ -255,7 +261,7 @@ def _described(study: Study) -> dict[str, Any]:
 
 
 _by = option("--by NAME", "Who makes the change.  [default: your login name]")
-_address = click.argument("address")
+_address = click.argument("address", shell_complete=complete_parameter)
 
 
 def _intervene(file: Path, kind: str, by: str | None, **payload: Any) -> None:
@@ -308,7 +314,12 @@ def stop(file: Path, by: str | None) -> None:
 
 @study.command("range")
 @_file
-@click.argument("limits", callback=converted(parse_limits), metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]")
+@click.argument(
+    "limits",
+    callback=converted(parse_limits),
+    metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]",
+    shell_complete=complete_parameter,
+)
 @_by
 @json_option
 def range_(file: Path, limits: tuple[str, dict[str, Any]], by: str | None) -> None:
@@ -322,7 +333,7 @@ def range_(file: Path, limits: tuple[str, dict[str, Any]], by: str | None) -> No
 
 @study.command()
 @_file
-@click.argument("parameter", metavar="ADDRESS[=VALUE]")
+@click.argument("parameter", metavar="ADDRESS[=VALUE]", shell_complete=complete_parameter)
 @_by
 @json_option
 def freeze(file: Path, parameter: str, by: str | None) -> None:
@@ -352,6 +363,7 @@ def unfreeze(file: Path, address: str, by: str | None) -> None:
     required=True,
     callback=converted(parse_limits),
     metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
+    shell_complete=complete_parameter,
 )
 @_by
 @json_option
@@ -420,7 +432,7 @@ def aspiration(file: Path, targets: tuple[str, ...], by: str | None) -> None:
 
 @study.command()
 @_file
-@click.argument("new_file", callback=converted(output()))
+@click.argument("new_file", callback=converted(output()), shell_complete=complete_file)
 @option("--without NUMBER", "Leave out this intervention. May be repeated.", type=int, multiple=True)
 @_trust_option
 @executor_options
