@@ -97,6 +97,25 @@ def test_arrows_of_a_resting_cube_carry_its_weight(meshcat: Meshcat, model: str)
     assert not drawn(meshcat, "set_object", "forces")
 
 
+def test_what_a_log_has_not_measured_is_not_shown(meshcat: Meshcat) -> None:
+    testbed, context = started(SatelliteScenario(), 0.1)
+    world = testbed.default_context()
+    testbed.write(world, {"sim.sys.servicer.base.pose": [1.0, 2.0, 3.0, 0.0, 0.0, 0.0]})
+    layers = Layers(meshcat, testbed, 1.0)
+    layers.show(["forces", "cameras", "laser"])
+    layers.draw(context, world)
+    (place,) = (np.array(m["matrix"])[12:15] for m in drawn(meshcat, "set_transform", "cameras").values())
+    assert np.linalg.norm(place - [1.0, 2.0, 3.0]) < 2.0  # on the servicer of the world that is shown
+    layers.draw(context, context)
+    (other,) = (np.array(m["matrix"])[12:15] for m in drawn(meshcat, "set_transform", "cameras").values())
+    assert np.linalg.norm(other - [1.0, 2.0, 3.0]) > 2.0
+    assert "not simulated" not in layers.notes["forces"]
+    layers.draw(context, world)
+    assert "it was not simulated" in layers.notes["forces"] and "it was not simulated" in layers.notes["laser"]
+    with pytest.raises(LayerError, match="it was not simulated"):
+        layers.image("sim.sense.docking_camera", context, world)
+
+
 def test_ghost_is_where_the_dps_believes_the_robot_to_be(meshcat: Meshcat) -> None:
     testbed, context = started(CartPoleScenario(), 0.1)
     state = np.array(testbed.read(context, PERCEIVED))

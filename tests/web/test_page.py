@@ -193,6 +193,12 @@ def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View,
     page.select_option("#vtb-sense-joint_position", "real")
     drawn(page, "vtb.switches.textContent.includes('nothing feeds real.sense.joint_position')")
     drawn(page, "document.querySelector('#vtb-sense-joint_position').value === 'sim'")
+    page.select_option("#vtb-sense", "real")  # all signals of the side
+    drawn(page, "document.querySelector('#vtb-sense').parentElement.textContent.includes('nothing feeds real.sense')")
+    drawn(page, "document.querySelector('#vtb-sense').value === 'sim' && vtb.mode.textContent === 'sim'")
+    page.select_option("#vtb-act-force", "twin")
+    drawn(page, "vtb.mode.textContent === 'mixed'")
+    assert running.session.latest.positions["act"] == {"force": "twin"}
     second = browser.new_page()
     second.goto(running.url)
     second.wait_for_selector("#vtb-take")

@@ -85,6 +85,9 @@ class Layer(ABC):
 
     name: ClassVar[str]
     title: ClassVar[str]
+    # Whether it is about the world, not about the DPS; and whether it is measured in a simulation of the world.
+    is_of_world: ClassVar[bool] = False
+    is_measured: ClassVar[bool] = False
 
     def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float) -> None:
         self._meshcat, self._testbed, self._size = meshcat, testbed, size
@@ -115,6 +118,7 @@ class ContactForces(Layer):
     """The contact forces of the plant as arrows, by Drake's `ContactVisualizer`."""
 
     name, title = "forces", "contact forces"
+    is_of_world = is_measured = True
 
     def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float) -> None:
         super().__init__(meshcat, testbed, size)
@@ -155,6 +159,7 @@ class Frusta(Layer):
     """What the cameras can see: the pyramid of each one's image."""
 
     name, title = "cameras", "camera frusta"
+    is_of_world = True
 
     def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float) -> None:
         super().__init__(meshcat, testbed, size)
@@ -179,6 +184,7 @@ class LaserPoints(Layer):
     """The points of the last scan of each laser scanner."""
 
     name, title = "laser", "laser points"
+    is_of_world = is_measured = True
 
     def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float) -> None:
         super().__init__(meshcat, testbed, size)
@@ -388,18 +394,25 @@ class Layers:
             if name not in self._shown:
                 self._shown[name] = self._kinds[name](self._meshcat, self._testbed, self._size)
 
-    def draw(self, context: Context) -> None:
-        """Show the state of a root context; a layer that cannot be drawn is removed until it can, with the reason."""
+    def draw(self, context: Context, world: Context | None = None) -> None:
+        """Show a state; a layer that cannot be drawn is removed until it can, with the reason.
+
+        Args:
+            context: The root context of the DPS.
+            world: The root context of the world, if that is another one: in a log, the world is what the DPS believed.
+        """
         for name, layer in self._shown.items():
             try:
-                layer.draw(context)
+                _refuse_unmeasured(layer.is_measured, context, world)
+                layer.draw(world if world is not None and layer.is_of_world else context)
                 self._failures.pop(name, None)
             except FAILURES as error:
                 self._failures[name] = one_line(error)
                 layer.clear()
 
-    def image(self, camera: str, context: Context) -> NDArray[np.uint8]:
-        """Return the present colour image of a camera, (height, width, 3)."""
+    def image(self, camera: str, context: Context, world: Context | None = None) -> NDArray[np.uint8]:
+        """Return the present colour image of a camera, (height, width, 3); see `draw`."""
+        _refuse_unmeasured(True, context, world)
         if camera not in self._cameras:
             raise LayerError(f"there is no camera {camera!r}; there are: {', '.join(self._cameras) or 'none'}")
         system = self._cameras[camera]
@@ -410,6 +423,11 @@ class Layers:
         """Return identity and position of the objects of the world models that are shown, the nearest to a point."""
         layer = self._shown.get(Landmarks.name)
         return layer.names(near, count) if isinstance(layer, Landmarks) else []
+
+
+def _refuse_unmeasured(is_measured: bool, context: Context, world: Context | None) -> None:
+    if is_measured and world is not None and world is not context:
+        raise LayerError("it was not simulated: the world of this log is what the DPS believed of it")
 
 
 def cameras(testbed: VirtualTestbed) -> dict[str, System]:

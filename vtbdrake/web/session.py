@@ -418,7 +418,7 @@ class Session:
         Raises:
             LayerError: The testbed has no such camera.
         """
-        return self._do(lambda: self._layers.image(camera, self._context))
+        return self._do(lambda: self._layers.image(camera, self._context, self._world))
 
     def landmarks(self, near: ArrayLike, count: int = 40) -> list[tuple[str, list[float]]]:
         """Return identity and position in m of the objects of the shown world models, the nearest to a point."""
@@ -704,7 +704,7 @@ class Session:
     def _draw(self) -> None:
         if self._drawing is not None:
             self._drawing.pose(self._world)
-            self._layers.draw(self._context)
+            self._layers.draw(self._context, self._world)
         for part in (self._preview, self._comparison):
             if part is not None and part.ghost is not None and not part.fork.failure:
                 try:

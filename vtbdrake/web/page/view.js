@@ -396,20 +396,8 @@ class Page {
 
   #showSwitches(positions) {
     for (const [side, signals] of Object.entries(positions)) {
-      for (const [signal, position] of Object.entries(signals)) {
-        const id = `vtb-${side}-${signal}`;
-        let chosen = document.getElementById(id);
-        if (!chosen) {
-          const places = side === "sense" ? ["sim", "real"] : ["sim", "real", "twin"];
-          chosen = element("select", { id, onchange: () => this.#throw(chosen, side, signal) }, ...places.map((p) => element("option", {}, p)));
-          const reason = element("small", { className: "bad" });
-          this.switches.append(element("div", { className: "vtb-switch" }, element("label", { htmlFor: id }, `T_${side}.${signal}`), chosen, reason));
-        }
-        if (document.activeElement === chosen) continue;
-        if (![...chosen.options].some(({ value }) => value === position)) chosen.append(element("option", {}, position));
-        chosen.value = position;
-        chosen.disabled = Boolean(this.loop);
-      }
+      if (Object.keys(signals).length > 1) this.#showSwitch(`vtb-${side}`, side, null, Object.values(signals));
+      for (const [signal, position] of Object.entries(signals)) this.#showSwitch(`vtb-${side}-${signal}`, side, signal, [position]);
     }
     const [senses, acts] = ["sense", "act"].map((side) => [...new Set(Object.values(positions[side] ?? {}))]);
     const mode = senses.length > 1 || acts.length > 1 ? "mixed" : MODES[[senses[0] ?? "sim", acts[0] ?? senses[0] ?? "sim"]];
@@ -417,9 +405,26 @@ class Page {
     this.mode.dataset.mode = this.mode.textContent;
   }
 
+  // The switch of a signal, or of all signals of a side.
+  #showSwitch(id, side, signal, positions) {
+    let chosen = document.getElementById(id);
+    if (!chosen) {
+      const places = side === "sense" ? ["sim", "real"] : ["sim", "real", "twin"];
+      chosen = element("select", { id, onchange: () => this.#throw(chosen, side, signal) }, ...places.map((p) => element("option", {}, p)));
+      const label = element("label", { htmlFor: id }, signal ? `T_${side}.${signal}` : `T_${side}, all signals`);
+      this.switches.append(element("div", { className: "vtb-switch" }, label, chosen, element("small", { className: "bad" })));
+    }
+    if (document.activeElement === chosen) return;
+    const position = new Set(positions).size > 1 ? "mixed" : positions[0];
+    let option = [...chosen.options].find(({ value }) => value === position);
+    if (!option) chosen.append((option = element("option", { hidden: true }, position)));
+    option.selected = true;
+    chosen.disabled = Boolean(this.loop);
+  }
+
   #throw(chosen, side, signal) {
     const reason = chosen.parentElement.querySelector("small");
-    this.session.ask("switch", { [side]: { [signal]: chosen.value } }).then(
+    this.session.ask("switch", { [side]: signal ? { [signal]: chosen.value } : chosen.value }).then(
       () => (reason.textContent = ""),
       (error) => (reason.textContent = error.message),
     );
