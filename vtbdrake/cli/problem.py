@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.cli import FailedError
+from vtbdrake.cli.completion import complete_scenario_or_file
 from vtbdrake.cli.options import (
     LazyChoice,
     Setting,
@@ -53,7 +54,8 @@ def problem_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def problem_or_file_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command a scenario and what states a problem, or the file of a problem as ``scenario``."""
-    return scenario_argument(_statement(required=False)(command), parse=parse_problem, metavar="SCENARIO|PROBLEM.yaml")
+    stated, metavar = _statement(required=False)(command), "SCENARIO|PROBLEM.yaml"
+    return scenario_argument(stated, parse=parse_problem, complete=complete_scenario_or_file, metavar=metavar)
 
 
 def parse_problem(text: str) -> Scenario | ProblemFile:
