@@ -11,7 +11,7 @@ import pytest
 from vtbdrake.compiled import UnsupportedTestbedError
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
-from vtbdrake.reasoning import Budget
+from vtbdrake.reasoning import Budget, SearchConfig
 from vtbdrake.rollout import Constraint, Cutoff, Pruning, Quality, RolloutResult, RolloutTask, SerialExecutor
 from vtbdrake.rollout.compiled import CompiledExecutor
 from vtbdrake.rollout.executor import run_rollouts
@@ -177,6 +177,25 @@ def test_decisions_are_the_same() -> None:
     assert decisions[0].quality == pytest.approx(decisions[1].quality, rel=1e-11)
     computed = {r.computed for candidate in decisions[1].candidates for r in candidate.rollouts}
     assert computed == {"compiled"}
+
+
+def test_auto_compiles_the_mental_testbed() -> None:
+    testbed = SCENARIO.build()
+    with make_reasoner(SCENARIO, rollouts=4) as reasoner:
+        decision = reasoner.decide(testbed, testbed.default_context())
+    assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {"compiled"}
+
+
+def test_auto_takes_drake_where_nothing_can_be_compiled(caplog: pytest.LogCaptureFixture) -> None:
+    testbed = SCENARIO.build()
+    search = SearchConfig(method="random", pruning=Pruning(), workers=1)
+    with (
+        caplog.at_level("INFO"),
+        make_reasoner(SCENARIO, rollouts=4, search=search) as reasoner,
+    ):
+        decision = reasoner.decide(testbed, testbed.default_context())
+    assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {"drake"}
+    assert "the mental testbed is simulated in Drake: compiled rollouts cannot do what pruning= asks for" in caplog.text
 
 
 def test_a_decision_within_wall_time() -> None:

@@ -206,6 +206,29 @@ class CompiledRollouts:
             start += size
         return CompiledBatch(self.times, outputs, final, valid)
 
+    def expressions(self, values: Mapping[str, casadi.MX]) -> dict[str, casadi.MX]:
+        """Return the outputs of one rollout as expressions, for CasADi's solvers and its derivatives.
+
+        They are interpreted, and so slower than a call.
+
+        Args:
+            values: Address -> an expression of its value, a column; the rest is as in the compiled context.
+
+        Returns:
+            Address -> the recorded values, shape (size, m): one column per sample.
+
+        Raises:
+            ValueError: An address cannot be varied.
+        """
+        z = casadi.MX(self._z0)
+        for address, value in values.items():
+            z[self.walker.place(address)] = value
+        _, recorded = self.function(z, *self.arguments())
+        samples = [k for k, i in enumerate(self.schedule_at(self.walker.context.get_time())) if i.is_sample]
+        sizes = [int(np.prod(shape, dtype=int)) for shape in self._shapes.values()]
+        parts = casadi.vertsplit(recorded[:, samples], np.cumsum([0, *sizes]).tolist())
+        return dict(zip(self._shapes, parts, strict=True))
+
     def advanced(self, z: Array, instant: Instant) -> Array:
         """Return z, shape (nz,), after what happens at an instant; it is interpreted."""
         w = np.zeros(self._w.numel())
