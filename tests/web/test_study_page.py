@@ -264,6 +264,28 @@ def test_study_on_a_read_only_disk_is_shown_and_refuses_changes() -> None:
             assert reader.ask("try", point=[1.0, 0.0])["values"]
 
 
+def test_long_rollout_keeps_nobody_waiting() -> None:
+    study = cart_pole_problem(horizon=3600.0, sample_period=1.0).study()
+    with study.view() as view, page(view) as socket:
+        reader = Reader(socket).until("new", 0)
+        for number, command in enumerate(("try", "try", "show"), 1):
+            point = {"point": [1.0, 0.1 * number]} | ({"role": "pointed"} if command == "show" else {})
+            socket.send(json.dumps({"id": 1000 + number, "do": command, **point}))
+        # These are answered while the worker is busy; and the page closes, whose worker is busy still.
+        reader.ask("time", time=0.1)
+        reader.ask("intervene", kind="budget", payload={"rollouts": 17})
+
+
+def test_removed_file_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    cart_pole_problem().study(path).close()
+    with view_study(path) as view, page(view) as socket:
+        reader = Reader(socket).until("new", 0)
+        path.unlink()
+        while "has been removed or replaced" not in reader.status["message"]:
+            reader.read()
+
+
 def test_file_that_is_no_study_is_refused(tmp_path: Path, finished: Path) -> None:
     text = tmp_path / "text.db"
     text.write_text("no study " * 100)

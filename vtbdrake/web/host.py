@@ -149,10 +149,18 @@ async def send(browser: WebSocket, message: Mapping[str, Any]) -> None:
     await browser.send_text(json.dumps(message, allow_nan=False))
 
 
-async def answer_commands(browser: WebSocket, carry_out: Callable[[Mapping[str, Any]], Awaitable[Any]]) -> None:
-    """Carry out the commands of a page, one after another, and answer each with its result or its error."""
-    while True:
-        text = await browser.receive_text()
+async def answer_commands(
+    browser: WebSocket, carry_out: Callable[[Mapping[str, Any]], Awaitable[Any]], *, together: bool = False
+) -> None:
+    """Carry out the commands of a page, and answer each with its result or its error.
+
+    Args:
+        browser: The connection to the page.
+        carry_out: Carries out a command, and returns its result.
+        together: Whether a command need not wait for the one before it.
+    """
+
+    async def answer(text: str) -> None:
         number, error, result = None, "", None
         try:
             message = json.loads(text)
@@ -161,6 +169,24 @@ async def answer_commands(browser: WebSocket, carry_out: Callable[[Mapping[str, 
         except (ValueError, LookupError, TypeError, AttributeError) as failure:
             error = one_line(failure)
         await send(browser, {"type": "answer", "id": number, "error": error, "result": result})
+
+    async def answer_if_open(text: str) -> None:
+        with suppress(*CLOSED):
+            await answer(text)
+
+    tasks: set[asyncio.Task[None]] = set()
+    try:
+        while True:
+            text = await browser.receive_text()
+            if together:
+                task = asyncio.create_task(answer_if_open(text))
+                tasks.add(task)
+                task.add_done_callback(tasks.discard)
+            else:
+                await answer(text)
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 async def first_of(*tasks: Coroutine[Any, Any, None]) -> None:

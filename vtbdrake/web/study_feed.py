@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 from vtbdrake.failures import one_line
@@ -88,6 +89,7 @@ class StudyFeed:
         self._closed = threading.Event()
         self._version: tuple[int, int] | None = None
         self._message = ""
+        self._identity = None if file.path is None else _identity(file.path)
         self._read()
         self.status = self._look()
         self._thread = threading.Thread(target=self._watch, name="vtbdrake study feed", daemon=True)
@@ -199,6 +201,8 @@ class StudyFeed:
     def _look(self) -> Status:
         try:
             sessions, running = self._file.sessions(), self._file.is_running
+            if self._file.path is not None and _identity(self._file.path) != self._identity:
+                self._message = f"{self._file.path} has been removed or replaced: open it again"
         except StudyError as error:
             self._message, sessions, running = one_line(error), [], False
         last = sessions[-1] if sessions else None
@@ -236,6 +240,15 @@ def _equal(before: Sequence[Trial], after: Sequence[Trial]) -> int:
     return next(
         (k for k, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), min(len(before), len(after))
     )
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from another one at its place; None if there is none."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_dev, stat.st_ino
 
 
 def _finite(value: float) -> float | None:

@@ -105,6 +105,8 @@ class StudyView:
         if self.simulator is not None:
             self.simulator.close()
         self.scene.close()
+        if self.study.path is not None:
+            self.study.close()
 
     def _stated(self, problem: Problem | None) -> Problem | None:
         try:
@@ -139,7 +141,7 @@ class StudyView:
         """
         if not self.resume_command:
             raise StudyError(f"only the program that began the study can resume it: {self.obstacle}")
-        if self.study.is_running:
+        if self.study.is_running or (self.runner is not None and self.runner.poll() is None):
             raise StudyError("the study is running")
         if self.study.search.budget is None:
             raise StudyError("the study has no budget of rollouts: give it one first")
@@ -200,7 +202,7 @@ class _StudyPage:
             fields = {key: value for key, value in message.items() if key not in ("id", "do")}
             return await run_in_threadpool(self._commands[name], **fields)
 
-        await first_of(tell(), answer_commands(self._browser, carry_out))
+        await first_of(tell(), answer_commands(self._browser, carry_out, together=True))
 
     def _hello(self) -> dict[str, Any]:
         view, record = self._view, self._study.record

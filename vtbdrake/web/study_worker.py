@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ _Kind = TypeVar("_Kind")
 
 # Rollouts that are kept: some tens of megabytes.
 _KEPT = 200
+_TRIED, _POINTED = "tried", "pointed"
 
 
 class PointError(ValueError):
@@ -74,8 +74,8 @@ class PointSimulator:
         self._executor = ProcessExecutor(1)
         self._executor.start_workers(1)
         self._rollouts: LruDict[RolloutKey, PointRollout] = LruDict(_KEPT)
-        self._jobs: deque[tuple[Callable[[], object], Future[object]]] = deque()
-        self._pointed: tuple[Callable[[], object], Future[object]] | None = None
+        # The newest of each kind that waits; what is tried comes first.
+        self._waiting: dict[str, tuple[Callable[[], object], Future[object]]] = {}
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="vtbdrake points", daemon=True)
@@ -97,8 +97,8 @@ class PointSimulator:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+        self._executor.close()  # This ends a rollout under way, too.
         self._thread.join()
-        self._executor.close()
 
     def rollout(self, point: Point, *, condition: int) -> PointRollout:
         """Return the rollout of a point under a condition, computed if it is not kept.
@@ -110,28 +110,24 @@ class PointSimulator:
         with self._changed:
             if (rollout := self._rollouts.use((point, condition))) is not None:
                 return rollout
-        future: Future[object] = Future()
-        with self._changed:
-            if self._pointed is not None:
-                self._pointed[1].cancel()
-            self._pointed = (lambda: self._simulate(point, condition), future)
-            self._changed.notify_all()
-        return self._result(future, PointRollout)
+        return self._result(_POINTED, lambda: self._simulate(point, condition), PointRollout)
 
     def attempt(self, point: Point) -> Tried:
         """Evaluate a point under all conditions.
 
         Raises:
-            PointError: The worker is lost.
+            PointError: Another point is tried instead, or the worker is lost.
         """
+        return self._result(_TRIED, lambda: self._evaluate(point), Tried)
+
+    def _result(self, name: str, action: Callable[[], object], kind: type[_Kind]) -> _Kind:
+        """Return the result of an action in the thread of the worker, which replaces one of that name that waits."""
         future: Future[object] = Future()
         with self._changed:
-            self._jobs.append((lambda: self._evaluate(point), future))
+            if name in self._waiting:
+                self._waiting[name][1].cancel()
+            self._waiting[name] = action, future
             self._changed.notify_all()
-        return self._result(future, Tried)
-
-    @staticmethod
-    def _result(future: Future[object], kind: type[_Kind]) -> _Kind:
         try:
             result = future.result()
         except CancelledError:
@@ -144,16 +140,12 @@ class PointSimulator:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._jobs or self._pointed)
+                self._changed.wait_for(lambda: self._closed or self._waiting)
                 if self._closed:
-                    for _, future in (*self._jobs, *([self._pointed] if self._pointed else [])):
+                    for _, future in self._waiting.values():
                         future.cancel()
                     return
-                if self._jobs:
-                    action, future = self._jobs.popleft()
-                else:
-                    assert self._pointed is not None
-                    (action, future), self._pointed = self._pointed, None
+                action, future = self._waiting.pop(_TRIED if _TRIED in self._waiting else _POINTED)
             if not future.set_running_or_notify_cancel():
                 continue
             try:

@@ -219,7 +219,9 @@ class Page {
     for (const [key, chart] of Object.entries(this.views)) chart.canvas.hidden = key !== name;
     for (const button of this.switch.children) button.classList.toggle("chosen", button.id === `vtb-view-${name}`);
     this.selectors.hidden = name === "pareto";
-    for (const part of [this.xAxis, this.yAxis, this.model.parentElement]) part.hidden = name !== "landscape";
+    const axes = this.parameters.length;
+    this.xAxis.hidden = name !== "landscape" || axes < 1;
+    for (const part of [this.yAxis, this.model.parentElement]) part.hidden = name !== "landscape" || axes < 2;
     this.#draw();
   }
 
@@ -438,6 +440,7 @@ class Page {
 
   #drawLandscape(quality, shade, common) {
     const { points, values } = this.trials;
+    if (!this.parameters.length) return;
     const single = this.parameters.length === 1;
     const [x, y] = [Number(this.xAxis.value), single ? -1 : Number(this.yAxis.value)];
     const grid = this.grid && this.model.checked && this.grid.key === `${x} ${y} ${quality}` ? this.grid : null;
@@ -502,7 +505,7 @@ class Page {
         this.#legend("pointed", true);
         this.#extend(shown.duration);
         document.body.dataset.pointed = k;
-        if (shown.message) this.pointedText.append(` ${shown.message}`);
+        if (shown.message && this.trials.kinds[k] !== "failed") this.pointedText.append(` ${shown.message}`);
       })
       .catch((error) => k === this.pointed && this.pointedText.append(` ${error.message}`));
   }
@@ -520,8 +523,8 @@ class Page {
   }
 
   #click(k, values) {
-    if (this.view === "landscape" && this.tryByClick.checked && !this.sections.try.hidden && this.parameters.length > 1) {
-      const [x, y] = [Number(this.xAxis.value), Number(this.yAxis.value)];
+    if (this.view === "landscape" && this.tryByClick.checked && !this.sections.try.hidden) {
+      const [x, y] = [Number(this.xAxis.value), this.parameters.length > 1 ? Number(this.yAxis.value) : -1];
       this.setDraft(this.draft.map((old, i) => (i === x ? values[0] : i === y ? values[1] : old)));
       return this.attempt();
     }
