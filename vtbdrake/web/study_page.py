@@ -128,10 +128,14 @@ class StudyView:
     @property
     def resume_command(self) -> list[str]:
         """Return the command that resumes the study in a process of its own; empty if only its program can do so."""
+        return self.command("continue")
+
+    def command(self, name: str, *arguments: str) -> list[str]:
+        """Return a command of the study whose problem the file states; empty if it does not."""
         if not self.restatable:
             return []
         trust = [word for module in self.trusted for word in ("--trust", module)]
-        return [sys.executable, "-m", "vtbdrake", "study", "continue", str(self.study.path), *trust]
+        return [sys.executable, "-m", "vtbdrake", "study", name, str(self.study.path), *trust, *arguments]
 
     def resume(self) -> None:
         """Resume the study in a process of its own, which goes on when the page ends.
@@ -224,6 +228,7 @@ class _StudyPage:
             "obstacle": view.obstacle,
             "changes": view.code_changes,
             "command": shlex.join(view.resume_command),
+            "replay": shlex.join(view.command("replay", "NEW.db", "--without")),
         }
 
     def _news(self) -> list[dict[str, Any]]:
@@ -255,7 +260,7 @@ class _StudyPage:
             "solver": search.solver,
             "aspiration": search.aspiration,
             "paused": search.paused,
-            "interventions": [intervention.to_dict() for intervention in status.interventions[-_LISTED:]],
+            "interventions": [{**i.to_dict(), "text": i.text} for i in status.interventions[-_LISTED:]],
         }
 
     # -- commands

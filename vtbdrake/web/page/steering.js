@@ -2,6 +2,8 @@
 
 import { element, number } from "./common.js";
 
+const CONTROLS = ["pause", "resume", "stop"]; // the points do not depend on these
+
 export class Steering {
   constructor(page) {
     this.page = page;
@@ -168,30 +170,33 @@ export class Steering {
   }
 
   #showChanges(interventions) {
-    const rows = [...interventions].reverse().map(({ number: place, time, name, kind, payload, batch }) =>
+    const rows = [...interventions].reverse().map(({ number: place, time, name, kind, text, batch }) =>
       element(
         "tr",
         {},
         element("td", {}, place),
         element("td", { title: time }, new Date(time).toLocaleTimeString()),
         element("td", {}, name),
-        element("td", {}, `${kind} ${payloadText(payload)}`),
-        element("td", {}, batch === null ? element("button", { title: "it has had no effect yet", onclick: () => this.page.do("remove", { number: place }) }, "take back") : `since batch ${batch}`),
+        element("td", {}, text),
+        element("td", {}, ...(batch === null ? [this.#takeBack(place)] : [`since batch ${batch} `, this.#undo(place, kind)])),
       ),
     );
     this.changes.replaceChildren(...(rows.length ? rows : [element("tr", {}, element("td", {}, "nothing has been changed"))]));
+  }
+
+  #takeBack(place) {
+    return element("button", { title: "it has had no effect yet", onclick: () => this.page.do("remove", { number: place }) }, "take back");
+  }
+
+  // What has had an effect is undone by a study of its own, which repeats this one without it.
+  #undo(place, kind) {
+    const { replay } = this.page.hello;
+    if (!replay || CONTROLS.includes(kind)) return "";
+    const tell = () => this.page.note(`repeat the study without it: ${replay} ${place}`, "undo");
+    return element("button", { onclick: tell }, "undo");
   }
 }
 
 const valueText = (value) => (typeof value === "number" ? number(value) : value === null ? "open" : String(value));
 
 const regionText = (region) => Object.entries(region).map(([address, side]) => `${address} ${side.map(valueText).join(" to ")}`).join(", ");
-
-function payloadText(payload) {
-  return Object.entries(payload)
-    .map(([key, value]) => {
-      if (key === "point" || key === "region") return Object.entries(value).map(([address, v]) => `${address.split(".").at(-1)} ${[v].flat().map(valueText).join(" to ")}`).join(", ");
-      return key === "address" || key === "solver" ? value : `${key} ${[value].flat().map(valueText).join(", ")}`;
-    })
-    .join(" ");
-}

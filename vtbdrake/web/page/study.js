@@ -96,8 +96,8 @@ class Page {
     document.title = `${hello.name}: study`;
     this.#build();
     document.body.dataset.page = "open";
-    if (!hello.simulates) this.#note(`no rollouts are shown: ${hello.obstacle}`, "obstacle");
-    if (hello.changes.length) this.#note(`the code has changed since: ${hello.changes.join("; ")}`, "changes");
+    if (!hello.simulates) this.note(`no rollouts are shown: ${hello.obstacle}`, "obstacle");
+    if (hello.changes.length) this.note(`the code has changed since: ${hello.changes.join("; ")}`, "changes");
   }
 
   #build() {
@@ -244,7 +244,7 @@ class Page {
   }
 
   // Shows a message until it is clicked.
-  #note(text, kind) {
+  note(text, kind) {
     const shown = this.say(text, "", kind);
     Object.assign(shown, { title: "a click hides it", onclick: () => shown.remove() });
   }
