@@ -23,6 +23,7 @@ from tests.optimization.studies import (
 )
 from vtbdrake.optimization import Choice, Parameter, Problem, Study, StudyError
 from vtbdrake.rollout import Quality, SerialExecutor
+from vtbdrake.visualization.study_plots import Points
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -221,6 +222,7 @@ def test_a_forbidden_point_is_no_longer_the_best_until_it_is_allowed():
     number = study.intervene("forbid", region=region).number
     others = [trial for trial in study.trials if trial != best]
     assert study.best == min(others, key=lambda trial: trial.value)
+    assert Points.of(study).best(study, 0) == study.best
     study.intervene("allow", number=number)
     assert study.best == best
 
@@ -291,6 +293,23 @@ def test_a_finished_study_goes_on_with_a_larger_budget(tmp_path, caplog):
         study.run(rollouts=15, **SERIAL)
         assert len(study) == 30 and "the budget of 30 rollouts (intervention 1) holds" in caplog.text
         assert table(study.replay(reuse=False, executor="serial", progress=False)) == table(study)
+
+
+def test_a_pause_that_came_too_late_can_be_taken_back():
+    """Within the last batch, which the budget cuts, someone pauses."""
+    study = pendulum_problem(conditions=[{DAMPING: 0.1 * k} for k in range(4)]).study(solver="cmaes", seed=1)
+
+    class Pausing(SerialExecutor):
+        def run(self, task, points):
+            study.pause()
+            return super().run(task, points)
+
+    study.run(rollouts=10, racing=False, executor=Pausing(), progress=False)
+    assert study.reason == "budget" and study.search.paused
+    study.resume()
+    assert not study.search.paused
+    with pytest.raises(ValueError, match="the study is not paused"):
+        study.resume()
 
 
 def test_a_smaller_budget_ends_the_run():

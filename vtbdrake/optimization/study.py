@@ -29,7 +29,7 @@ from vtbdrake.optimization.identity import (
 from vtbdrake.optimization.parameter import Choice, Dimension, checked_point, point_text
 from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.statement import statement
-from vtbdrake.optimization.steering import CONTROLS, STOP, TRY, StudySearch, check_arguments
+from vtbdrake.optimization.steering import CONTROLS, PAUSE, RESUME, STOP, TRY, StudySearch, check_arguments
 from vtbdrake.optimization.study_file import StudyError, StudyFile
 from vtbdrake.optimization.study_run import BUDGET, SOLVER, TARGET, StudyRun, check_budget
 from vtbdrake.optimization.sweep import borrowed
@@ -352,9 +352,9 @@ class Study:
         sessions = self._file.sessions()
         reason = sessions[-1]["reason"] if sessions else None
         waiting = any(intervention.kind == "budget" for intervention in self._file.interventions(waiting=True))
-        if kind in (TRY, "budget") or waiting or reason not in (BUDGET, TARGET, SOLVER):
+        if kind in (RESUME, TRY, "budget") or waiting or reason not in (BUDGET, TARGET, SOLVER):
             return
-        if kind in CONTROLS or reason == BUDGET:
+        if kind == PAUSE or reason == BUDGET:
             raise StudyError(
                 f"{self.path or 'the study'} is finished (its last run ended by {reason}, with {len(self)} rollouts): "
                 "give it a larger budget first"

@@ -79,9 +79,12 @@ class Points:
         return Points(feasible, broken, dropped, failed)
 
     def best(self, study: Study, quality: int) -> Trial | None:
-        """Return the best point in one quality; None if no point keeps the constraints."""
+        """Return the best point in one quality; None if no point keeps the constraints and is allowed."""
         sign = study.signs[quality]
-        return max(self.feasible, key=lambda trial: sign * trial.values[quality], default=None)
+        allows = study.search.allows
+        return max(
+            (t for t in self.feasible if allows(t.point)), key=lambda trial: sign * trial.values[quality], default=None
+        )
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
