@@ -95,3 +95,11 @@ def test_scenario_of_the_package_needs_no_trust(tmp_path: Path) -> None:
     )
     again = restated(stated.study(tmp_path / "study.db").record)
     assert again.scenario == stated.scenario
+
+
+@pytest.mark.one_python
+def test_scenario_that_cannot_be_built_any_more_is_told() -> None:
+    record = pendulum_problem().study().record
+    record["problem"] = {**record["problem"], "horizon": -1.0}
+    with pytest.raises(StatementError, match="cannot be stated with today's code: .*horizon"):
+        restated(record)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import isinf
 from typing import Any
 
+from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.optimization.identity import dimensions
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import RISKS, CVaR, Quantile, Risk
@@ -54,6 +55,20 @@ def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Probl
         StatementError: The file does not tell enough, a module is not trusted, or the problem cannot be stated with
             today's code.
     """
+    check_statement(record, trusted=trusted)
+    described, stated = record["problem"], record["statement"]
+    try:
+        return _stated(described, described["scenario"]["scenario"], stated)
+    except FAILURES as error:
+        raise StatementError(f"its problem cannot be stated with today's code: {one_line(error)}") from error
+
+
+def check_statement(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> None:
+    """Check that the record of a study tells enough for `restated`, whose arguments these are; nothing is built.
+
+    Raises:
+        StatementError: The file does not tell enough, or a module is not trusted.
+    """
     stated, described = record.get("statement"), record["problem"]
     if stated is None:
         raise StatementError("the file was written by an earlier vtbdrake and does not tell how to build its testbed")
@@ -67,10 +82,6 @@ def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Probl
         raise StatementError(f"the function {unnamed[0]} is one of a script, a notebook or a lambda")
     scenario_name = described["scenario"]["scenario"]
     _refuse_strangers([scenario_name, *stated["functions"]], trusted)
-    try:
-        return _stated(described, scenario_name, stated)
-    except (ValueError, KeyError, TypeError) as error:
-        raise StatementError(f"its problem cannot be stated with today's code: {error}") from error
 
 
 def _refuse_strangers(names: Sequence[str], trusted: Sequence[str]) -> None:

@@ -12,10 +12,10 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
+from functools import cached_property
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.failures import one_line
@@ -24,7 +24,7 @@ from vtbdrake.optimization import Choice, Problem, Study, StudyError
 from vtbdrake.optimization.identity import code_changes, describe
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers import known_solvers
-from vtbdrake.optimization.statement import StatementError, restated
+from vtbdrake.optimization.statement import StatementError, check_statement, restated
 from vtbdrake.optimization.study_file import StudyFile
 from vtbdrake.web.study_feed import StudyFeed
 from vtbdrake.web.study_model import Surrogate
@@ -57,7 +57,7 @@ class StudyView:
 
         self.study = Study(file)
         self.trusted = tuple(trusted)
-        self.obstacle = ""
+        self.obstacle, self._untold = "", "it is in memory"
         self.runner: subprocess.Popen[bytes] | None = None
         # Whether others can state the problem again, from the file alone.
         self.restatable = False
@@ -109,16 +109,18 @@ class StudyView:
             self.study.close()
 
     def _stated(self, problem: Problem | None) -> Problem | None:
+        """Return the problem; state it again from the file if it is not known."""
         try:
-            again = restated(self.study.record, trusted=self.trusted) if self.study.path is not None else None
-            self.restatable = again is not None
+            if self.study.path is not None:
+                check_statement(self.study.record, trusted=self.trusted)
+                self.restatable = True
+            return problem or restated(self.study.record, trusted=self.trusted)
         except StatementError as error:
-            again, self.obstacle = None, one_line(error)
-        if problem is not None:
-            self.obstacle = ""
-        return problem or again
+            self._untold = one_line(error)
+            self.obstacle = "" if problem is not None else self._untold
+            return problem
 
-    @property
+    @cached_property
     def code_changes(self) -> list[str]:
         """Return how the code of the problem has changed since the file was written, each as a phrase."""
         if self.problem is None:
@@ -144,7 +146,7 @@ class StudyView:
             StudyError: The study is running, or only its program can resume it.
         """
         if not self.resume_command:
-            raise StudyError(f"only the program that began the study can resume it: {self.obstacle}")
+            raise StudyError(f"only the program that began the study can resume it: {self._untold}")
         if self.study.is_running or (self.runner is not None and self.runner.poll() is None):
             raise StudyError("the study is running")
         if self.study.search.budget is None:
@@ -281,10 +283,10 @@ class _StudyPage:
         result = rollout.result
         return {
             "duration": float(result.times[-1]) if len(result.times) else 0.0,
-            "t_star": None if np.isnan(result.t_star) else result.t_star,
+            "t_star": _finite(result.t_star),
             "end": result.end,
             "message": result.message or message,
-            "seconds": None if np.isnan(result.wall_time) else result.wall_time,
+            "seconds": _finite(result.wall_time),
         }
 
     def _try(self, *, point: Any, condition: int = 0) -> dict[str, Any]:
@@ -296,8 +298,8 @@ class _StudyPage:
         return {
             **shown,
             "point": self._as_numbers(place),
-            "values": [None if np.isnan(value) else value for value in evaluation.values],
-            "violations": [None if np.isnan(value) else value for value in evaluation.violations],
+            "values": [_finite(value) for value in evaluation.values],
+            "violations": [_finite(value) for value in evaluation.violations],
             "kind": "failed" if evaluation.failed else "feasible" if evaluation.feasible else "broken",
             "message": "; ".join(tried.messages) or shown["message"],
         }
@@ -339,6 +341,10 @@ class _StudyPage:
     def _as_numbers(self, point: Sequence[Any]) -> list[float]:
         pairs = zip(self._study.parameters, point, strict=True)
         return [p.options.index(p.as_value(v)) if isinstance(p, Choice) else v for p, v in pairs]
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def _described(parameters: Sequence[Dimension], units: Sequence[str]) -> list[dict[str, Any]]:
