@@ -203,3 +203,24 @@ def test_a_decision_within_wall_time() -> None:
     context = testbed.default_context()
     with make_reasoner(SCENARIO, executor="compiled", budget=Budget(rollouts=20, seconds=60.0)) as reasoner:
         assert reasoner.decide(testbed, context).health.rollouts == 20
+
+
+def test_studies_and_boundaries_are_the_same() -> None:
+    problem = Problem(
+        scenario=SCENARIO,
+        parameters=[Parameter("u.plan[3]", 0.0, 60.0)],
+        quality=Quality(height, "plant.state"),
+        horizon=0.6,
+        threshold=0.02,
+        conditions=[{"sim.sys.cart_pole.pole_pin.velocity": speed} for speed in (0.0, 0.1)],
+    )
+    studies = {
+        executor: problem.study(solver="CEM", seed=1).run(rollouts=24, executor=executor, progress=False)
+        for executor in ("serial", "compiled")
+    }
+    points = [[trial.point for trial in study.trials] for study in studies.values()]
+    values = [[trial.values for trial in study.trials] for study in studies.values()]
+    np.testing.assert_allclose(points[0], points[1], rtol=1e-9)
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
+    boundaries = [problem.boundary(resolution=2.0, coarse=20.0, executor=executor) for executor in studies]
+    assert str(boundaries[0]) == str(boundaries[1])
