@@ -1,4 +1,4 @@
-"""How long the calibration of an arm takes: 18 numbers from a recording of a minute at 1 kHz, beside MuJoCo's sysid."""
+"""How long the calibration of an arm takes: 18 numbers from a recording of 10 s at 1 kHz, beside MuJoCo's sysid."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
 from vtbdrake_diagrams.manipulator.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
 
-SECONDS = 60.0
+SECONDS = 10.0
 WINDOW = 200
 """Steps of a rollout of MuJoCo's: longer ones run away from the recording."""
 RECORD = {POSITION: "dps.env.joint_position", TORQUE: "dps.joint_torque"}
