@@ -19,6 +19,7 @@ from vtbdrake.recording.recorder import Recorder
 from vtbdrake.state import Snapshot
 from vtbdrake.web import View, view
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cube_toss import CubeTossScenario
 
 # Tints of the ghosts.
 GREEN, BLUE, YELLOW = np.array([0, 158, 115]), np.array([0, 114, 178]), np.array([230, 159, 0])
@@ -187,6 +188,24 @@ def test_camera_follows_a_body(page: Page) -> None:
     moved, after = page.evaluate(offset)
     assert abs(moved[0] - place[0]) > 0.005
     np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_robot_that_has_moved_away_is_in_view(browser: Browser) -> None:
+    # A tossed cube: a page that opens after a second shows it, and follows it.
+    velocity = [0.0, 0.0, 0.0, 4.0, 0.0, 4.9]
+    with view(CubeTossScenario(), values={"sim.sys.cube.velocity": velocity}) as opened:
+        opened.session.advance(round(1.0 / opened.session.config.step))
+        page = browser.new_page(viewport={"width": 1000, "height": 650})
+        page.set_default_timeout(PATIENCE)
+        page.goto(opened.url)
+        page.wait_for_function("window.vtb && vtb.followed")
+        target, place, distance = page.evaluate("""() => {
+            const { camera, controls } = viewer;
+            return [controls.target.toArray(), vtb.place, camera.position.distanceTo(controls.target)];
+        }""")
+        assert place[0] > 3.0 and distance < 2.0
+        assert np.linalg.norm(np.subtract(target, place)) < 0.3 * distance
+        page.close()
 
 
 def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:

@@ -72,7 +72,7 @@ class Drawing:
         if testbed.scene_graph is None:
             raise ValueError(f"{testbed!r} has no SceneGraph, so that there is nothing to draw")
         self.path = path
-        self._meshcat, self._scene_graph = meshcat, testbed.scene_graph
+        self._meshcat, self._scene_graph, self._plant = meshcat, testbed.scene_graph, testbed.plant
         query = self._query(context)
         inspector = query.inspector()
         self._frames: list[tuple[FrameId, str]] = []
@@ -102,6 +102,16 @@ class Drawing:
     def places(self) -> tuple[str, ...]:
         """Return the paths of the moving frames."""
         return tuple(place for _, place in self._frames)
+
+    @property
+    def floating(self) -> str:
+        """Return the path of the body that floats, if there is one only: the base of a robot that walks away."""
+        plant = self._plant
+        if plant is None:
+            return ""
+        bases = plant.GetFloatingBaseBodies()
+        floating = [place for frame, place in self._frames if plant.GetBodyFromFrameId(frame).index() in bases]
+        return floating[0] if len(bases) == len(floating) == 1 else ""
 
     def pose(self, context: Context, *, time_in_recording: float | None = None) -> None:
         """Show the poses of a root context of the testbed; of a recording, at a time in seconds."""

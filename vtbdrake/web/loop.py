@@ -45,7 +45,7 @@ class LoopSession(Session):
         url: LCM URL of its bus.
 
     Attributes:
-        latest, variables, bodies, layers, cameras, handles, meshcat_url: As of a `Session`.
+        latest, variables, bodies, followed, layers, cameras, handles, meshcat_url: As of a `Session`.
 
     Raises:
         ValueError: The testbed cannot be built.
@@ -148,11 +148,11 @@ class LoopSession(Session):
         self._context = testbed.default_context()
         self._meshcat = make_meshcat()
         self.meshcat_url = self._meshcat.web_url()
-        self._drawing = None
+        self._drawing, self.bodies, self.followed = None, tuple[str, ...](), ""
         if testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, testbed, self._context, "now")
             self._drawing.fit_camera(self._context)
-            self.bodies = self._drawing.places
+            self.bodies, self.followed = self._drawing.places, self._drawing.floating
         dps = {a: v for a, v in testbed.variables().items() if a.startswith(("dps.", "u.")) or a == "time"}
         self.variables = {address: describe(variable) for address, variable in dps.items()}
         self._ports = frozenset(a for a in testbed.addresses() if a.startswith("dps."))

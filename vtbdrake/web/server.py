@@ -171,6 +171,7 @@ class Page:
             "scenario": self._session.scenario.name(),
             "variables": dict(self._session.variables),
             "bodies": list(self._session.bodies),
+            "followed": self._session.followed,
             "vr": server.vr_description(),
             "log": self._session.log_path,
             "quality": "" if problem is None else problem.objectives[0].name,

@@ -218,6 +218,7 @@ class Session:
         handles: What can be driven by hand, by address.
         log_path: Path of the log of a `LogSession`, else empty.
         bodies: Paths in Meshcat of what moves.
+        followed: The one that the camera follows at first, or nothing.
         layers: The layers that can be shown: name -> title.
         cameras: The cameras whose images can be shown.
         meshcat_url: Address of the Meshcat that shows the testbed; it has no protection of its own.
@@ -246,6 +247,7 @@ class Session:
         self.handles: Mapping[str, Handle] = {}
         self.log_path = ""
         self.bodies: tuple[str, ...] = ()
+        self.followed = ""
         self.layers: Mapping[str, str] = {}
         self.cameras: tuple[str, ...] = ()
         self.meshcat_url = self.loop_url = ""
@@ -491,6 +493,7 @@ class Session:
             self._drawing = Drawing(self._meshcat, self._testbed, self._context, "now")
             self._drawing.fit_camera(self._world, None if self._start is None else camera_of(self._start))
             self.bodies = self._drawing.places
+            self.followed = "" if self._start is not None and camera_of(self._start) else self._drawing.floating
             corners = self._drawing.corners(self._context)
             size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
         self._layers = Layers(self._meshcat, self._testbed, size)

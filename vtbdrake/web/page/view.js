@@ -224,6 +224,8 @@ class Page {
     this.loop = message.loop;
     for (const part of this.parts) part.hello(message);
     this.follow.append(...bodies.map((path) => element("option", { value: path }, path.replace(/^now\//, ""))));
+    this.follow.value = message.followed;
+    this.followed = undefined;
     this.title.textContent = scenario.split(":").at(-1);
     this.title.title = scenario;
     document.title = this.title.textContent;
@@ -440,13 +442,23 @@ class Page {
 
   // Called in each animation frame: what it follows keeps its place in the picture.
   followBody() {
+    requestAnimationFrame(() => this.followBody());
     const name = this.follow.value;
     if (name) {
       const { object } = viewer.scene_tree.find(["drake", ...name.split("/")]);
       const place = object.matrixWorld.elements.slice(12, 15);
+      const { camera, controls } = viewer;
+      if (this.followed === undefined) {
+        if (!place.some((value) => value)) return; // It has not been placed yet.
+        const middle = controls.target.toArray();
+        const away = Math.hypot(...place.map((value, i) => value - middle[i]));
+        // The camera was put where the robot began, which may have walked away since.
+        this.place = away > 0.3 * camera.position.distanceTo(controls.target) ? middle : place;
+        this.followed = name;
+      }
       if (this.followed === name) {
         const [x, y, z] = place.map((value, i) => value - this.place[i]);
-        for (const point of [viewer.camera.position, viewer.controls.target]) {
+        for (const point of [camera.position, controls.target]) {
           point.x += x;
           point.y += y;
           point.z += z;
@@ -455,7 +467,6 @@ class Page {
       this.place = place;
     }
     this.followed = name;
-    requestAnimationFrame(() => this.followBody());
   }
 }
 
