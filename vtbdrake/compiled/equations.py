@@ -95,6 +95,10 @@ class At(ABC):
         """Return a parameter that is none of a numeric group; see `Equations.extras`."""
 
     @abstractmethod
+    def shared(self, name: str, make: Callable[[], Any]) -> Any:
+        """Return what ``make`` returns, made once for all outputs and the update of this instant."""
+
+    @abstractmethod
     def draw(self, name: str) -> Expression:
         """Return random numbers, shape (n, 1); in an update only; see `Equations.draws`."""
 

@@ -62,10 +62,9 @@ class PlantEquations(Equations):
 
     def _reactions(self, at: At) -> Callable[[int], Expression]:
         """Return the reaction forces of the present step, by the place of the joint among those of the plant."""
-        model, plant = self._model, self._plant
-        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
-        vdot = model.acceleration(q, v, self._torque(at), period=plant.time_step())
-        reaction = model.reactions(q, v, vdot, self._applied(at))
+        plant = self._plant
+        q, v, vdot = self._motion(at)
+        reaction = self._model.reactions(q, v, vdot, self._applied(at))
 
         def at_place(place: int) -> Expression:
             (F,) = self._substituted([casadi.densify(reaction(plant.get_joint(plant.GetJointIndices()[place])))], at)
@@ -73,15 +72,21 @@ class PlantEquations(Equations):
 
         return at_place
 
+    def _motion(self, at: At) -> tuple[Expression, Expression, Expression]:
+        """Return q, v and vdot of the present step, in terms of the model's inputs."""
+        model = self._model
+        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
+        period = self._plant.time_step()
+        vdot = at.shared("vdot", lambda: model.acceleration(q, v, self._torque(at), period=period))
+        return q, v, vdot
+
     def update(self, at: At) -> dict[int | str, Expression]:
         model, period = self._model, self._plant.time_step()
-        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
-        q_next, v_next = model.step(q, v, self._torque(at), period)
+        q, v, vdot = self._motion(at)
+        v_next = v + period * vdot
+        q_next = q + period * model.qdot(q, v_next)
         beyond = model.overrun(q, v_next, period)
-        x_next, beyond = model.substituted(
-            [casadi.densify(casadi.vertcat(q_next, v_next)), beyond],
-            {address: at.extra(address) for address in self.extras},
-        )
+        x_next, beyond = self._substituted([casadi.densify(casadi.vertcat(q_next, v_next)), beyond], at)
         return {0: x_next, OVERRUN: casadi.fmax(at.memory(OVERRUN), beyond)}
 
     def compiled_in(self, context: Context) -> bytes:

@@ -386,6 +386,7 @@ class Evaluation:
         self.walker, self.z, self.time, self.w = walker, z, time, w
         self._values: dict[tuple[str, str], Expression] = {}
         self._under_way: list[tuple[str, str]] = []
+        self.shared: dict[tuple[str, str], Any] = {}
 
     def update(self, path: str) -> dict[int | str, Expression]:
         """Return what an update of the system at a path returns."""
@@ -443,6 +444,12 @@ class _Reading(At):
 
     def extra(self, name: str) -> Expression:
         return self._entries(EXTRA, name)
+
+    def shared(self, name: str, make: Callable[[], Any]) -> Any:
+        shared, key = self._evaluation.shared, (self._path, name)
+        if key not in shared:
+            shared[key] = make()
+        return shared[key]
 
     def draw(self, name: str) -> Expression:
         assert self._evaluation.w is not None
