@@ -53,7 +53,10 @@ _GHOST_OPACITY = 0.45
 # Of the wall time between two frames, what a simulation and a preview may take at most.
 _SHARE = 0.8
 
-# Wall time between frames while nothing moves.
+# Of the wall time, what frames take at most while time runs as fast as it can.
+_SHOWN_SHARE = 0.02
+
+# Wall time between frames while nothing moves, and the most that `_SHOWN_SHARE` makes of it.
 _IDLE_PERIOD = 0.2
 
 
@@ -703,6 +706,9 @@ class Session:
         with self._frame_ready:
             self.latest = frame
             self._frame_ready.notify_all()
+        if self._playing and self._pace.speed == inf:
+            took = time.monotonic() - now
+            self._next_frame = max(self._next_frame, now + min(took / _SHOWN_SHARE, _IDLE_PERIOD))
 
     def _draw(self) -> None:
         if self._drawing is not None:
