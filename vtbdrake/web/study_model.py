@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -38,9 +39,10 @@ class Surrogate:
         self._thread.shutdown()
 
     def grid(self, trials: Sequence[Trial], x: str, y: str, *, quality: int, at: Trial) -> dict[str, Any]:
-        """Return the grid: ``mean``, rows over y of columns over x, or None if nothing is known; and ``x``, ``y``.
+        """Return the grid: ``mean``, ``x``, ``y`` and ``seconds``.
 
-        The latter are the centres of the cells, in the parameters' units; of a choice the numbers of its options.
+        ``mean`` has rows over y of columns over x; it is None if nothing is known. ``x`` and ``y`` are the centres of
+        the cells in the parameters' units, of a choice the numbers of its options. ``seconds`` is the CPU time.
 
         Args:
             trials: All trials so far.
@@ -52,6 +54,7 @@ class Surrogate:
         return self._thread.submit(self._grid, trials, x, y, quality=quality, at=at).result()
 
     def _grid(self, trials: Sequence[Trial], x: str, y: str, *, quality: int, at: Trial) -> dict[str, Any]:
+        begin = time.thread_time()
         parameters = self._study.parameters
         search = Search(parameters, objectives=len(self._signs), constraints=self._constraints)
         solver = Bayesian(search, name="bayesian", memory=_POINTS)
@@ -67,6 +70,7 @@ class Surrogate:
             "x": [_number(columns, centre) for centre in u],
             "y": [_number(rows, centre) for centre in v],
             "mean": mean.tolist() if np.isfinite(mean).all() else None,
+            "seconds": time.thread_time() - begin,
         }
 
     def _selected(self, trials: Sequence[Trial]) -> list[Trial]:

@@ -175,7 +175,7 @@ export class Steering {
         "tr",
         {},
         element("td", {}, place),
-        element("td", { title: time }, new Date(time).toLocaleTimeString()),
+        element("td", { title: time }, new Date(time).toTimeString().slice(0, 8)),
         element("td", {}, name),
         element("td", {}, text),
         element("td", {}, ...(batch === null ? [this.#takeBack(place)] : [`since batch ${batch} `, this.#undo(place, kind)])),

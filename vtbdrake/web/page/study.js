@@ -103,7 +103,8 @@ class Page {
   #build() {
     const choice = (id, title, texts, value) =>
       element("select", { id, title, onchange: () => this.#draw() }, ...texts.map((text, k) => element("option", { value: k, selected: k === value }, text)));
-    const labels = this.parameters.map(({ address }) => address);
+    const brief = this.parameters.map(({ address }) => short(address));
+    const labels = new Set(brief).size === brief.length ? brief : this.parameters.map(({ address }) => address);
     const events = {
       onpoint: (k) => this.point(k),
       onleave: () => this.point(-1),
@@ -292,6 +293,7 @@ class Page {
   }
 
   #showStatus(status) {
+    const ended = this.#running && status.state !== "running";
     this.status = status;
     const { state, reason, message, rollouts, budget, left, rate, solver, paused, interventions } = status;
     const method = this.trials.methods.at(-1);
@@ -317,6 +319,7 @@ class Page {
     this.#showFailures();
     this.steering.show(status);
     this.#renewBest();
+    if (ended) this.#draw(); // The model need not rest any more.
     document.body.dataset.state = state;
     document.body.dataset.rollouts = rollouts;
   }
