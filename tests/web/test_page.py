@@ -292,7 +292,8 @@ def test_closed_session_is_told(page: Page, running: View) -> None:
 
 
 def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path) -> None:
-    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0), folder=tmp_path) as running:
+    study = tmp_path / "tilt.db"
+    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0), study=study, folder=tmp_path) as running:
         opened = browser.new_page(viewport={"width": 1280, "height": 800})
         opened.set_default_timeout(PATIENCE)
         # A gamepad that the test holds: Chromium asks for it in each poll.
@@ -326,6 +327,8 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path)
         opened.wait_for_selector("#vtb-drive-begin")
         assert -1.0 <= running.session.snapshot()["u.angle"] < -0.1
         opened.click("#vtb-keep summary")
+        opened.click("text=store the drive as a trial of tilt.db")
+        drawn(opened, "vtb.messages.textContent.includes('stored as the driven trial 1 of tilt.db')")
         opened.fill("#vtb-test-name", "to_the_left")
         opened.click("#vtb-save-test")
         drawn(opened, "vtb.messages.textContent.includes('test_to_the_left.py')")

@@ -26,7 +26,7 @@ from vtbdrake.cli.options import (
     schema_option,
     settings,
 )
-from vtbdrake.cli.output import emit, json_option, say, table, write_csv
+from vtbdrake.cli.output import emit, json_option, number, say, table, write_csv
 from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.cli.problem import (
     executor_options,
@@ -246,9 +246,15 @@ def show(file: Path, csv: Path | None) -> None:
             header = ["waiting", *(parameter.address for parameter in opened.parameters)]
             rows = [[str(number), *map(str, point.values())] for number, point in queue.items()]
             say("\n" + table(header, rows))
+        drives = [
+            {"number": d.number, "by": d.name, "value": d.outcome.value, "end": d.outcome.end, "start": d.parameters}
+            for d in opened.driven
+        ]
+        for trial in opened.driven:
+            say(f"driven by {trial.name} ({trial.number}): {number(trial.outcome.value)}, {trial.outcome.end}")
         for key, value in attributes.items():
             say(f"attribute {key}: {json.dumps(value)}")
-        emit({**_described(opened), "waiting": queue, "attributes": attributes})
+        emit({**_described(opened), "waiting": queue, "driven": drives, "attributes": attributes})
         if csv is not None:
             write_csv(csv, opened.to_dict())
 

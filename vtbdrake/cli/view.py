@@ -49,6 +49,11 @@ def _named_problem(text: str) -> Problem:
     "The problem of the scenario whose f judges what is driven by hand; or a function that makes it.",
     parse=_named_problem,
 )
+@option(
+    "--study FILE",
+    "The study in which the page stores drives, marked as driven. Without --problem, the problem is that of the study.",
+    type=click.Path(dir_okay=False, path_type=Path),
+)
 @option("--log FILE", "Replay this log of the scenario; what is changed goes on in simulation.", type=_FILE)
 @option(
     "--save-in FOLDER",
@@ -75,6 +80,7 @@ def view(
     values: tuple[Setting, ...],
     start: Snapshot | None,
     problem: Problem | None,
+    study: Path | None,
     log: Path | None,
     folder: Path,
     page: dict[str, Any],
@@ -110,9 +116,9 @@ def view(
         problem, scenario = scenario.problem, scenario.problem.scenario
     page |= {"vr": vr, "tls": Tls(name=tls, certificate=certificate, key=key) if tls else None}
     if url:
-        if values or start is not None or play or problem is not None or log is not None:
+        if values or start is not None or play or any((problem, study, log)):
             raise click.UsageError(
-                "a loop is shown as it is: leave --set, --start, --play, --problem and --log out, or --url"
+                "a loop is shown as it is: leave --set, --start, --play, --problem, --study and --log out, or --url"
             )
         with view_loop(scenario, url, **page) as watched:
             serve(watched.url, browser=browser)
@@ -124,7 +130,7 @@ def view(
         page |= {"log": opened_log(log, scenario.name())}
         # The log describes its scenario; fields that were set have to be the recorded ones.
         viewed = None if scenario.record() == type(scenario)().record() else scenario
-    page |= {"problem": problem, "folder": folder}
+    page |= {"problem": problem, "study": study, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()

@@ -32,7 +32,7 @@ from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.pickled_task import pack
 from vtbdrake.rollout.recorded_motion import MotionPlayer
 from vtbdrake.rollout.task import catches
-from vtbdrake.rollout.testbeds import Testbeds, split
+from vtbdrake.rollout.testbeds import FIELD, Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.state.variables import overlap
 from vtbdrake.testbed import Scenario, VirtualTestbed
@@ -298,6 +298,21 @@ class Problem:
             raise ValueError("the ranges belong to other parameters than those of the problem")
         other._check_addresses()
         return other
+
+    def values_in(self, snapshot: Snapshot) -> dict[str, Any]:
+        """Return the values of the parameters in a state of the problem's testbed, by address.
+
+        Unlike those of a point, they may lie outside the ranges.
+
+        Raises:
+            SnapshotError: The snapshot is of another scenario.
+        """
+        context, fields = self.testbed.default_context(), self.scenario.record()
+        self.testbed.restore(context, snapshot)
+        return {
+            p.address: fields[p.address.removeprefix(FIELD)] if p.is_field else self.testbed.read(context, p.address)
+            for p in self.parameters
+        }
 
     def _condition(self, number: int) -> Condition:
         count, index = len(self.conditions), as_whole("the number of a condition", number)

@@ -12,6 +12,7 @@ from typing import Any
 from vtbdrake.failures import safe_text
 from vtbdrake.optimization.solvers.solver import Point, PointValues
 from vtbdrake.rollout import RolloutResult
+from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import FAILED
 
 # How a point came out beside `FAILED`: it keeps the constraints, it breaks one, or racing dropped it.
@@ -113,3 +114,24 @@ class Intervention:
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON data."""
         return {**asdict(self), "time": self.time.isoformat(), "payload": dict(self.payload)}
+
+
+@dataclass(frozen=True)
+class DrivenTrial:
+    """A rollout of a study's problem that somebody has driven; no solver learns from it.
+
+    Attributes:
+        number: Number in the file.
+        time: When it was stored, in UTC.
+        name: Who stored it.
+        parameters: The values of the study's parameters where it began, address -> value.
+        outcome: Its outcome.
+        course: What was set when: ``course.rollout(problem.task)`` computes the rollout again, bit for bit.
+    """
+
+    number: int
+    time: datetime
+    name: str
+    parameters: Mapping[str, Any]
+    outcome: Outcome
+    course: Course

@@ -27,14 +27,16 @@ from vtbdrake.optimization.identity import (
     versions,
 )
 from vtbdrake.optimization.parameter import Choice, Dimension, checked_point, point_text
-from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
+from vtbdrake.optimization.records import DrivenTrial, Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.statement import statement
 from vtbdrake.optimization.steering import CONTROLS, PAUSE, RESUME, STOP, TRY, StudySearch, check_arguments
 from vtbdrake.optimization.study_file import StudyError, StudyFile
 from vtbdrake.optimization.study_run import BUDGET, SOLVER, TARGET, StudyRun, check_budget
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Executor, RolloutResult
+from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import catches
+from vtbdrake.testbed.addressed import record_differences
 
 if TYPE_CHECKING:
     import optuna
@@ -504,6 +506,36 @@ class Study:
         for condition, result in enumerate(results):
             self._file.add(tuple(values.values()), condition, Outcome.of(result))
         return self.intervene(TRY, point=values, by=by)
+
+    def add_driven(
+        self, course: Course, result: RolloutResult, *, parameters: Mapping[str, Any], by: str | None = None
+    ) -> DrivenTrial:
+        """Store a rollout that somebody has driven, such as one of a session of the live page.
+
+        It stands beside the trials, marked as driven: no solver learns from it, and it is no point's best. Its course
+        computes it again, bit for bit.
+
+        Args:
+            course: What was set when.
+            result: The rollout of the study's problem along it.
+            parameters: The values of the study's parameters where it began, address -> value.
+            by: As in `intervene`.
+
+        Raises:
+            ValueError: A parameter is missing, or the course is one of another scenario.
+        """
+        addresses = [parameter.address for parameter in self.parameters]
+        if set(parameters) != set(addresses):
+            raise ValueError(f"a driven trial has values of {', '.join(addresses)}, not of {', '.join(parameters)}")
+        if differing := record_differences(self._meta["problem"]["scenario"], course.start.scenario, where="there"):
+            raise ValueError(f"the course is one of another scenario ({'; '.join(differing)})")
+        values = plain({address: parameters[address] for address in addresses}, "the parameters of a driven trial")
+        return self._file.add_drive(values, Outcome.of(result), course, name=safe_text(by) if by else _user())
+
+    @property
+    def driven(self) -> tuple[DrivenTrial, ...]:
+        """Return the rollouts that somebody has driven, in their order; see `add_driven`."""
+        return tuple(self._file.drives())
 
     def edit(self, number: int, point: Any) -> None:
         """Replace a point of the `queue`.

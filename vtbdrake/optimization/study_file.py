@@ -14,16 +14,17 @@ import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from itertools import chain
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
-from vtbdrake.optimization.records import Intervention, Outcome, RolloutKey, Trial
+from vtbdrake.optimization.records import DrivenTrial, Intervention, Outcome, RolloutKey, Trial
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.write_ahead_log import lost_writes
+from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import QUALITY_FAILED
 
 VERSION = 3
@@ -41,6 +42,8 @@ _TABLES = {
     "gradients": "point TEXT PRIMARY KEY, gradient TEXT",
     # What people change; ``batch`` is NULL while a change waits for the batch on which it has an effect.
     "interventions": "number INTEGER PRIMARY KEY, time TEXT, name TEXT, kind TEXT, payload TEXT, batch INTEGER",
+    # Rollouts that somebody has driven, beside those of the points.
+    "drives": "number INTEGER PRIMARY KEY, time TEXT, name TEXT, parameters TEXT, outcome TEXT, course TEXT",
     "sessions": "number INTEGER PRIMARY KEY, started TEXT, ended TEXT, reason TEXT, versions TEXT, revision TEXT",
     # The user's attributes of a point, or of the study if the point is empty.
     "attributes": "point TEXT, key TEXT, value TEXT",
@@ -135,6 +138,9 @@ class StudyFile:
         if verdict != "ok":
             raise _damaged(self.path, verdict)
         for table in _TABLES:
+            made = self._db.execute("SELECT sql FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+            if made is None or made[0] != _creation(table):
+                raise _damaged(self.path, f"the table {table} has other columns")
             self._rows(table)
         missing = sorted(_ABOUT - self.meta.keys())
         if missing:
@@ -145,9 +151,8 @@ class StudyFile:
         with self._transaction():
             if not self._is_empty():
                 return  # Another process has created it meanwhile.
-            for table, columns in _TABLES.items():
-                key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
-                self._db.execute(f"CREATE TABLE {table} ({columns}, checksum INTEGER{key})")
+            for table in _TABLES:
+                self._db.execute(_creation(table))
             # The process that runs the study asks before every batch what waits.
             self._db.execute("CREATE INDEX batches ON interventions (batch)")
             self._set(meta)
@@ -466,6 +471,31 @@ class StudyFile:
         """Return all gradients by point."""
         return {decode(point): tuple(json.loads(gradient)) for point, gradient, _ in self._rows("gradients")}
 
+    # -- rollouts that were driven
+
+    def add_drive(self, parameters: Mapping[str, Any], outcome: Outcome, course: Course, *, name: str) -> DrivenTrial:
+        """Record a rollout that was driven."""
+        with self._transaction():
+            number = self._number("SELECT coalesce(max(number), 0) + 1 FROM drives")
+            drive = DrivenTrial(number, datetime.now(UTC), name, parameters, outcome, course)
+            texts = [json.dumps(part) for part in (parameters, asdict(outcome), course.to_dict())]
+            self._insert("drives", [(number, drive.time.isoformat(), name, *texts)])
+        return drive
+
+    def drives(self) -> list[DrivenTrial]:
+        """Return the rollouts that were driven, in their order."""
+        return [
+            DrivenTrial(
+                row["number"],
+                datetime.fromisoformat(row["time"]),
+                row["name"],
+                json.loads(row["parameters"]),
+                _outcome_of(json.loads(row["outcome"])),
+                Course.from_dict(json.loads(row["course"])),
+            )
+            for row in self._rows("drives", "ORDER BY number")
+        ]
+
     # -- interventions
 
     def intervene(
@@ -563,6 +593,12 @@ class StudyFile:
         for point, key, value, _ in self._rows("attributes", "ORDER BY rowid"):
             by_point.setdefault(decode(point) if point else None, {})[key] = json.loads(value)
         return by_point
+
+
+def _creation(table: str) -> str:
+    """Return the statement that makes a table."""
+    key = f", PRIMARY KEY ({_KEYS[table]})" if table in _KEYS else ""
+    return f"CREATE TABLE {table} ({_TABLES[table]}, checksum INTEGER{key})"
 
 
 def _mark(number: int, row: sqlite3.Row, count: int) -> Mark:
@@ -730,3 +766,7 @@ def _explained(path: Path | None) -> Iterator[None]:
         ) from error
     except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         raise _damaged(path, error) from error
+
+
+def _outcome_of(fields: dict[str, Any]) -> Outcome:
+    return Outcome(**{**fields, "measures": tuple(fields["measures"])})

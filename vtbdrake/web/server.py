@@ -39,6 +39,7 @@ class Server:
     Args:
         session: The session.
         folder: Where tests are saved.
+        study: The file of the study in which drives are stored as trials; None: nowhere.
         port: The port; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer it.
         vr: Lets headsets that open it lead a robot; None if none may. It is closed with the server.
@@ -57,6 +58,7 @@ class Server:
         session: Session,
         *,
         folder: Path = Path(),
+        study: Path | None = None,
         port: int = 0,
         hosts: Collection[str] = (),
         vr: VirtualReality | None = None,
@@ -65,7 +67,7 @@ class Server:
         routes: list[BaseRoute] = [Route("/camera/{name}", self._camera_image)]
         if vr is not None:
             routes.append(WebSocketRoute("/vr", until_closed(vr.serve)))
-        self._session, self._folder, self._vr = session, folder, vr
+        self._session, self._folder, self._study, self._vr = session, folder, study, vr
         self._steering: Page | None = None
         self._pages: list[Page] = []
         self._host = Host(
@@ -90,7 +92,7 @@ class Server:
         return {} if self._vr is None else self._vr.description()
 
     async def _serve_page(self, browser: WebSocket) -> None:
-        page = Page(self._session, browser, self._folder)
+        page = Page(self._session, browser, self._folder, self._study)
         self._pages.append(page)
         if self._steering is None:
             self._steering = page
@@ -133,8 +135,8 @@ class Server:
 class Page:
     """The connection to one page."""
 
-    def __init__(self, session: Session, browser: WebSocket, folder: Path) -> None:
-        self._session, self._folder = session, folder
+    def __init__(self, session: Session, browser: WebSocket, folder: Path, study: Path | None) -> None:
+        self._session, self._folder, self._study = session, folder, study
         self._browser = browser
         self._watched: tuple[str, ...] = ()
         # Command -> what it does with the message; those of `_ANYBODY` do not steer.
@@ -161,6 +163,7 @@ class Page:
             "landmarks": lambda message: session.landmarks(message["near"], int(message["count"])),
             "save_test": self._save_test,
             "go_on": lambda _: session.go_on(),
+            "store_trial": self._store_trial,
         }
 
     async def serve(self, server: Server) -> None:
@@ -174,6 +177,7 @@ class Page:
             "followed": self._session.followed,
             "vr": server.vr_description(),
             "log": self._session.log_path,
+            "study": "" if self._study is None else self._study.name,
             "quality": "" if problem is None else problem.objectives[0].name,
             "handles": [handle.description() for handle in self._session.handles.values()],
             "layers": dict(self._session.layers),
@@ -220,6 +224,12 @@ class Page:
 
     def _end_drive(self, message: Mapping[str, Any]) -> dict[str, Any]:
         return self._session.end_drive(keep=bool(message["keep"])).summary()
+
+    def _store_trial(self, _: Mapping[str, Any]) -> str:
+        if self._study is None:
+            raise SessionError("no study was given: begin the page with one (--study FILE)")
+        drive = self._session.store_trial(self._study)
+        return f"stored as the driven trial {drive.number} of {self._study.name}"
 
     def _save_test(self, message: Mapping[str, Any]) -> str:
         name = str(message["name"])

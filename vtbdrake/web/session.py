@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
     from vtbdrake.optimization import Problem
+    from vtbdrake.optimization.records import DrivenTrial
     from vtbdrake.rollout.course import Course
     from vtbdrake.state import Snapshot, Variable
     from vtbdrake.testbed import Scenario
@@ -374,6 +375,18 @@ class Session:
         """
         return self._do(lambda: self._end_drive(keep))
 
+    def store_trial(self, study: str | os.PathLike[str], *, by: str | None = None) -> DrivenTrial:
+        """Store the last drive that was ended as a trial of a study of the session's problem, see `Study.add_driven`.
+
+        Args:
+            study: The file of the study, which is begun if there is none.
+            by: Who drove; by default the user of this process.
+
+        Raises:
+            ValueError: Nothing has been driven, the session has no problem, or the study is one of another problem.
+        """
+        return self._do(lambda: self._store_trial(study, by))
+
     @property
     def course(self) -> Course | None:
         """Return what was done last: the last drive that was ended, or what was set since; None if nothing was.
@@ -484,6 +497,7 @@ class Session:
         self._preview: _Preview | None = None
         self._comparison: Comparison | None = None
         self._driver: Driver | None = None
+        self._driven: Driven | None = None
         self.handles = handles(self._testbed)
         self._readers: dict[str, Callable[..., Any]] = {}
         self._history: deque[tuple[float, Snapshot]] = deque(maxlen=self.config.history_size)
@@ -836,7 +850,18 @@ class Session:
             self._end_comparison()
         self._go_on_from(snapshot)
         self._interventions.forget(driven.course)
+        self._driven = driven
         return driven
+
+    def _store_trial(self, study: str | os.PathLike[str], by: str | None) -> DrivenTrial:
+        problem, driven = self.problem, self._driven
+        if problem is None:
+            raise SessionError("this session has no problem, so that no study can have trials of it")
+        if driven is None:
+            raise SessionError("nothing has been driven: take over, and end the drive")
+        parameters = problem.values_in(driven.course.start)
+        with problem.study(study) as opened:
+            return opened.add_driven(driven.course, driven.result, parameters=parameters, by=by)
 
     def _save_test(self, path: Path, tolerance: float) -> None:
         from vtbdrake.testing.saved_course import save_course

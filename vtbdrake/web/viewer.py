@@ -106,6 +106,7 @@ def view(
     values: Mapping[str, Any] | None = None,
     config: SessionConfig | None = None,
     problem: Problem | None = None,
+    study: str | os.PathLike[str] | None = None,
     folder: str | os.PathLike[str] = ".",
     port: int = 0,
     hosts: Collection[str] = (),
@@ -121,6 +122,8 @@ def view(
         values: Variables that are set first, by address.
         config: How it runs.
         problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
+        study: The file of a study of the problem, in which the page stores drives. Without a problem, it is that of
+            the study, whose modules are imported already.
         folder: Where the page saves tests.
         port: The port of the page on the loopback interface; 0 for any that is free.
         hosts: Host names (with port) under which proxies offer the page.
@@ -136,6 +139,8 @@ def view(
     _check_extra()
     from vtbdrake.web.vr import SimulatedRobot, VirtualReality
 
+    if study is not None and problem is None:
+        problem = _problem_of(study)
     if log is not None:
         if start is not None or values or vr:
             raise ValueError("a log is replayed as it was recorded: leave out start, values and vr")
@@ -152,9 +157,25 @@ def view(
         if vr:
             reality = VirtualReality(SimulatedRobot(session))
             stack.callback(reality.close)
-        opened = _served(session, folder=Path(folder), port=port, hosts=hosts, vr=reality, tls=tls)
+        opened = _served(
+            session,
+            folder=Path(folder),
+            study=None if study is None else Path(study),
+            port=port,
+            hosts=hosts,
+            vr=reality,
+            tls=tls,
+        )
         stack.pop_all()
         return opened
+
+
+def _problem_of(study: str | os.PathLike[str]) -> Problem:
+    from vtbdrake.optimization import Study
+    from vtbdrake.optimization.statement import restated
+
+    with Study.open(study) as opened:
+        return restated(opened.record)
 
 
 def _check_extra() -> None:
