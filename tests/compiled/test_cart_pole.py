@@ -126,6 +126,21 @@ def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
         rollouts({address: 1.0})
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"horizon": 0.0}, "the horizon is a positive time in seconds, not 0.0"),
+        ({"sample_period": np.inf}, "the sample period is a positive time in seconds, not inf"),
+        ({"outputs": "plant.velocity"}, "no variable and no port 'plant.velocity'"),
+        ({"parameters": "u.goal"}, "there is no variable 'u.goal'"),
+        ({"parameters": ["sim.sense.joint_position.latency"]}, "a latency is compiled in"),
+    ],
+)
+def test_refuses_arguments_that_make_no_sense(options: dict, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        compiled(SCENARIOS["errors"], **options)
+
+
 def test_refuses_values_that_do_not_fit() -> None:
     rollouts = compiled(SCENARIOS["exact"])
     with pytest.raises(ValueError, match=r"shape \(11,\)"):

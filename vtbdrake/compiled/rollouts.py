@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import casadi
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
+from vtbdrake.argument_checks import as_addresses, as_number
 from vtbdrake.arrays import Array
 from vtbdrake.compiled.equations import UnsupportedTestbedError
 from vtbdrake.compiled.plant import OVERRUN
@@ -97,7 +99,11 @@ class CompiledRollouts:
             measures: Functions of outputs that are recorded as well: name -> (function, addresses of its arguments).
             timings: (period, offset) of all periodic events; by default those of the compiled systems.
         """
-        self.parameters, self.outputs = tuple(parameters), tuple(outputs)
+        for name, time in {"horizon": horizon, "sample period": sample_period}.items():
+            if not 0.0 < as_number(f"the {name}", time) < inf:
+                raise ValueError(f"the {name} is a positive time in seconds, not {time}")
+        self.parameters = parameters = as_addresses("what varies", parameters)
+        self.outputs = as_addresses("what to record", outputs)
         self._measures = dict(measures or {})
         self._translate = TRANSLATIONS[compile]
         self._workers = workers

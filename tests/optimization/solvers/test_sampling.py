@@ -7,6 +7,7 @@ from scipy.stats import norm, truncnorm
 from tests.optimization.solvers.driver import SPHERE, evaluation, solve
 from vtbdrake.optimization.parameter import Choice, Parameter
 from vtbdrake.optimization.solvers import Evaluation, SolverError, make_solver
+from vtbdrake.optimization.solvers.solver import Search
 
 pytestmark = pytest.mark.one_python
 
@@ -154,3 +155,12 @@ def test_integers_are_sampled_as_whole_numbers():
 def test_what_they_cannot_do_is_refused(name, options, message):
     with pytest.raises(SolverError, match=message):
         make_solver(name, options.pop("space", [X]), **options)
+
+
+@pytest.mark.parametrize(
+    "last", [Parameter("c", 1.0, 9.0), Parameter("c", 1.0, 9.0, log=True), Parameter("c", 1, 9, integer=True)]
+)
+def test_points_of_a_batch_are_those_one_by_one(last):
+    search = Search((Parameter("a", -0.3, 0.1), Parameter("b", 2.0, 7.7), last))
+    U = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 3))
+    assert search.points(U) == [search.point(u) for u in U]
