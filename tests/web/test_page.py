@@ -135,6 +135,31 @@ def test_dragged_slider_previews_and_its_release_commits(page: Page, running: Vi
     assert angle(running.session) == value
 
 
+def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None:
+    with view(LimitedPendulumScenario()) as running:
+        opened = browser.new_page(viewport={"width": 1000, "height": 650})
+        opened.set_default_timeout(PATIENCE)
+        opened.goto(running.url)
+        opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+        watch(opened, "u.angle")
+        box = opened.locator(".vtb-pad.dial").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        for cancelled in (True, False):
+            opened.mouse.move(x + 40.0, y)
+            opened.mouse.down()
+            opened.mouse.move(x + 40.0, y - 20.0, steps=4)  # counter-clockwise
+            opened.wait_for_selector("[data-kind=preview]")
+            if cancelled:
+                opened.keyboard.press("Escape")
+                opened.wait_for_selector("[data-kind=preview]", state="detached")
+            opened.mouse.up()
+            settle(opened)
+            expected = 0.0 if cancelled else np.arctan2(20.0, 40.0)
+            assert running.session.snapshot()["u.angle"] == pytest.approx(expected, abs=0.03)
+        opened.close()
+
+
 def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: View) -> None:
     watch(page, MASS)
     page.check("#vtb-compare")

@@ -4,6 +4,7 @@ import { Connection, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
 import { Loop } from "./loop.js";
+import { Pad, padded } from "./pad.js";
 import { Recorded } from "./recorded.js";
 import { Keep } from "./keep.js";
 import { VirtualReality } from "./vr.js";
@@ -26,6 +27,7 @@ class Watched {
     const size = variable.shape.reduce((product, n) => product * n, 1);
     this.size = Math.min(size, ENTRIES);
     this.entries = Array.from({ length: this.size }, (_, index) => this.#entry(index));
+    this.pad = padded(variable) ? new Pad(this) : null;
     this.root = element(
       "section",
       { className: "vtb-watched" },
@@ -38,6 +40,7 @@ class Watched {
         element("button", { className: "plain", title: "remove", onclick: () => page.unwatch(this) }, "×"),
       ),
       ...this.entries.map((entry) => entry.row),
+      ...(this.pad ? [this.pad.root] : []),
       size > ENTRIES ? element("small", {}, `and ${size - ENTRIES} more entries`) : "",
     );
     this.root.dataset.address = address;
@@ -50,7 +53,7 @@ class Watched {
       type: "text",
       readOnly: !settable,
       "aria-label": `${this.address}[${index}]`,
-      onchange: () => this.#commit(index, Number(text.value)),
+      onchange: () => this.commit({ [index]: Number(text.value) }),
       onfocus: () => (this.typing = true),
       onblur: () => (this.typing = false),
     });
@@ -60,34 +63,38 @@ class Watched {
       step: "any",
       "aria-label": `${this.address}[${index}]`,
       onpointerdown: () => (this.draft = "none"),
-      oninput: () => this.#preview(index, Number(slider.value)),
-      onchange: () => this.#commit(index, Number(slider.value)),
+      oninput: () => this.preview({ [index]: Number(slider.value) }),
+      onchange: () => this.commit({ [index]: Number(slider.value) }),
     });
     const row = element("div", { className: "vtb-entry" }, slider, text);
     return { text, slider, row, lower, upper, ranged: false };
   }
 
-  #with(index, value) {
-    const values = this.values.map((old, i) => (i === index ? value : old));
+  // Returns the value of the variable with other entries, by index.
+  #with(changes) {
+    const values = this.values.map((old, index) => changes[index] ?? old);
     return this.variable.shape.length ? this.page.shaped(values, this.variable.shape) : values[0];
   }
 
   // A drag is a draft: a fork of now runs ahead with it.
-  #preview(index, value) {
+  preview(changes) {
     if (this.draft === "cancelled") return;
     this.draft = "open";
-    this.entries[index].row.classList.add("draft");
-    this.entries[index].text.value = number(value);
-    this.page.preview(this, { [this.address]: this.#with(index, value) });
+    for (const [index, value] of Object.entries(changes)) {
+      this.entries[index].row.classList.add("draft");
+      this.entries[index].text.value = number(value);
+      this.entries[index].slider.value = value;
+    }
+    this.page.preview(this, { [this.address]: this.#with(changes) });
   }
 
   // The release commits, unless the draft was cancelled.
-  #commit(index, value) {
+  commit(changes) {
     const cancelled = this.draft === "cancelled";
     this.close("none");
     if (cancelled) return;
-    if (!Number.isFinite(value)) return this.page.say(`${this.address} takes a number`, "bad");
-    this.page.commit({ [this.address]: this.#with(index, value) });
+    if (!Object.values(changes).every(Number.isFinite)) return this.page.say(`${this.address} takes a number`, "bad");
+    this.page.commit({ [this.address]: this.#with(changes) });
   }
 
   close(draft) {
@@ -110,6 +117,7 @@ class Watched {
       }
       entry.slider.value = now;
     });
+    this.pad?.show();
     this.#extend(time);
   }
 
