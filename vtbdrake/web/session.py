@@ -76,7 +76,7 @@ class SessionConfig:
         gt=0.0,
         le=1.0,
     )
-    frame_rate: float = setting(30.0, "Frames per second of wall time.", unit="Hz", gt=0.0, le=120.0)
+    frame_rate: float = setting(30.0, "Frames per second of wall time, at most.", unit="Hz", gt=0.0, le=120.0)
     history_period: float = setting(0.2, "Wall time between two states that are kept, to go back to.", unit="s", gt=0.0)
     history_size: int = setting(600, "Number of states that are kept.", ge=2, le=100_000)
     preview_horizon: float = setting(2.0, "How far a preview looks ahead.", unit="s", gt=0.0, le=60.0)
