@@ -39,11 +39,11 @@ GAINS: dict[str, tuple[object, str, tuple[float, float]]] = {
     "lead_rate": (10.0, "1/s", (0.0, 50.0)),
     "lead_speed": (0.3, "m/s", (0.0, 1.0)),
     "lead_turn_rate": (1.2, "rad/s", (0.0, 3.0)),
-    "lead_acceleration": (3.0, "m/s^2", (0.0, 10.0)),
-    "lead_turn_acceleration": (12.0, "rad/s^2", (0.0, 40.0)),
+    "lead_acceleration": (3.0, "m/s^2", (0.5, 10.0)),
+    "lead_turn_acceleration": (12.0, "rad/s^2", (2.0, 40.0)),
     "lead_posture_rate": (0.5, "1/s", (0.0, 5.0)),
 }
-"""Value, unit and bounds of the parameters."""
+"""Value, unit and bounds of the parameters; with less acceleration, a tip that is let go would go on for long."""
 
 STATE: dict[str, tuple[object, str]] = {
     "lead_twist": ((0.0,) * 6, "rad/s, m/s"),
