@@ -106,9 +106,11 @@ def view_cost(repeats: int = 25, horizon: float = 8.0) -> list[Benchmark]:
 
 def _watched(session: CrowdedSession, horizon: float) -> tuple[float, float]:
     """Return wall time and processor time of a simulated second in a session, in s."""
+    session.pause()
+    number, when = session.latest.number if session.latest is not None else 0, 0.0  # Older frames do not count.
     session.reset()
     session.advance()
-    start, number, when = session.snapshot().time, 0, 0.0
+    start = session.snapshot().time
     begin, worked = time.perf_counter(), session.processor_time()
     session.play()
     while when < horizon:
