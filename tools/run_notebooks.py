@@ -1,6 +1,7 @@
 """Run the notebooks and store them with their text and plots: ``python tools/run_notebooks.py [NAME...]``.
 
-What a reader cannot use without a kernel is left out: recordings in 3D (they are large), and widgets.
+What a reader cannot use without a kernel is left out: widgets; recordings in 3D, which are large, and pages, whose
+pictures stay.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def run(notebook: NotebookNode) -> NotebookNode:
 
 
 def strip(notebook: NotebookNode) -> None:
-    """Remove what a stored page cannot use: 3D recordings, progress bars, log messages, times of execution."""
+    """Remove what a stored page cannot use: 3D recordings, pages, progress bars, log messages, times of execution."""
     notebook.metadata.pop("widgets", None)
     notebook.metadata.language_info = {"name": "python"}
     for cell in notebook.cells:
@@ -40,8 +41,8 @@ def strip(notebook: NotebookNode) -> None:
             data = output.get("data", {})
             if WIDGET in data or output.get("name") == "stderr":
                 continue
-            if "<iframe" in data.get("text/html", ""):
-                del data["text/html"]
+            if "image/png" in data or "<iframe" in data.get("text/html", ""):
+                data.pop("text/html", None)
             if outputs and output.get("name") == outputs[-1].get("name") == "stdout":
                 outputs[-1].text += output.text
             else:

@@ -49,5 +49,7 @@ def check_runs(name: str, *, shorter: Mapping[str, str] | None = None) -> None:
         lines = "".join(output.text for output in cell.outputs if output.get("name") == "stderr").splitlines()
         warnings = [line for line in lines if line and not line.startswith("INFO:")]  # such as Meshcat's address
         assert not warnings, f"{cell.id} warns: {warnings}"
-        expected = "plot()" in cell.source or "plt.show()" in cell.source
+        if "Scene in 3D" in str(cell.outputs):  # It has a picture where the machine can render.
+            continue
+        expected = any(word in cell.source for word in ("plot()", "plt.show()", ".view()"))
         assert pictures(cell) == pictures(before[cell.id]) == expected, cell.id

@@ -26,7 +26,7 @@ from vtbdrake.components.rendering import RenderingError
 from vtbdrake.failures import one_line
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.visualization.camera import fitting_camera
+from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.still import Still
 
@@ -177,7 +177,9 @@ def make_meshcat() -> Meshcat:
     return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
 
 
-def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0) -> Scene:
+def show_motion(
+    meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0, camera: Camera | None = None
+) -> Scene:
     """Record a motion in ``meshcat``; one second of the recording is one simulated second.
 
     The present recording, and all objects under ``prefix``, are replaced. `show_motions` shows several motions.
@@ -187,6 +189,7 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
         motion: The states over time.
         prefix: The Meshcat path under which it is drawn.
         rate: Keyframes per second at most.
+        camera: From where it is looked at first; by default from where all that moves is in view.
 
     Returns:
         The scene, which shows itself in a notebook.
@@ -196,7 +199,7 @@ def show_motion(meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", ra
     """
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
-    still = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate)
+    still = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate, camera)
     return Scene(meshcat, curves=_curves({"": motion}, {"": _PALETTE[0]}), still=still)
 
 
@@ -209,6 +212,7 @@ def show_motions(
     opacity: float | Mapping[str, float] = 1.0,
     spacing: ArrayLike = (0.0, 0.0, 0.0),
     rate: float = 20.0,
+    camera: Camera | None = None,
 ) -> Scene:
     """Record several motions overlaid (Figure 7), for example of the unloaded and the loaded robot.
 
@@ -224,6 +228,7 @@ def show_motions(
         opacity: Opacity of the moving bodies, in (0, 1], for all or by label.
         spacing: Displacement from each motion to the next, in metres; shape (3,).
         rate: Keyframes per second at most.
+        camera: From where it is looked at first; by default from where all that moves is in view.
 
     Returns:
         The scene, whose legend names the tints; it shows itself in a notebook.
@@ -251,7 +256,7 @@ def show_motions(
             )
         )
     meshcat.Delete(prefix)
-    still = _record(meshcat, actors, rate)
+    still = _record(meshcat, actors, rate, camera)
     return Scene(meshcat, legend=tints, curves=_curves(motions, tints), still=still)
 
 
@@ -264,6 +269,7 @@ def show_poses(
     colors: Mapping[str, ColorType] | None = None,
     opacity: float | Mapping[str, float] = 1.0,
     title: str = "",
+    camera: Camera | None = None,
 ) -> Scene:
     """Draw motions as poses at several instants, like a photograph that is exposed several times (Figure 8).
 
@@ -277,6 +283,7 @@ def show_poses(
         colors: Label -> tint, as in `show_motions`.
         opacity: Opacity of the moving bodies, in (0, 1], for all or by label.
         title: A caption of the scene.
+        camera: From where it is looked at first; by default from where all that moves is in view.
 
     Returns:
         The scene, whose legend names the tints; it shows itself in a notebook.
@@ -312,7 +319,7 @@ def show_poses(
             )
             drawing.add_to(still, stage.context)
             corners.append(drawing.corners(stage.context))
-    _fit_camera(meshcat, still, corners)
+    _set_camera(meshcat, still, camera, corners)
     return Scene(meshcat, title=title, legend=tints, still=still)
 
 
@@ -397,15 +404,17 @@ def _curves(motions: Mapping[str, Motion], colors: Mapping[str, str]) -> dict[st
     }
 
 
-def _fit_camera(meshcat: Meshcat, still: Still, corners: list[np.ndarray]) -> None:
-    """Let the page and the picture begin with a view of all that moves, wherever it moves to."""
+def _set_camera(meshcat: Meshcat, still: Still, camera: Camera | None, corners: list[np.ndarray]) -> None:
+    """Let the page and the picture begin with a camera, by default with a view of all that moves, wherever it goes."""
     points = np.hstack([np.empty((3, 0)), *corners])
-    if np.isfinite(points).all() and points.size:
-        still.camera = fitting_camera(points)
-        meshcat.SetCameraPose(still.camera.position, still.camera.target)
+    if camera is None and points.size and np.isfinite(points).all():
+        camera = fitting_camera(points)
+    if camera is not None:
+        still.camera = camera
+        meshcat.SetCameraPose(camera.position, camera.target)
 
 
-def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> Still:
+def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Camera | None) -> Still:
     """Record the motions, and return a picture of them."""
     end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), _Stages(), Still()
     corners: list[np.ndarray] = []
@@ -417,7 +426,7 @@ def _record(meshcat: Meshcat, actors: list[_Actor], rate: float) -> Still:
     finally:
         meshcat.StopRecording()
     meshcat.PublishRecording()
-    _fit_camera(meshcat, still, corners)
+    _set_camera(meshcat, still, camera, corners)
     return still
 
 

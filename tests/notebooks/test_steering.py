@@ -1,0 +1,14 @@
+"""The notebook `steering` runs, and is stored as it runs. One file each, so that notebooks run side by side."""
+
+import pytest
+
+from tests.notebooks.checks import check_runs, check_stored
+
+
+def test_is_stored_with_text_and_plots() -> None:
+    check_stored("steering")
+
+
+@pytest.mark.slow
+def test_runs_as_it_is_stored() -> None:
+    check_runs("steering")
