@@ -181,3 +181,14 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cut.lcm").write_bytes(path.read_bytes()[:600])
     with pytest.raises(LogError):
         LogSession(tmp_path / "cut.lcm")
+
+
+def test_simulation_that_left_a_log_is_saved_as_a_test(session: LogSession, tmp_path: Path) -> None:
+    session.seek(0.2)
+    session.write({GAIN: 3.0})
+    session.advance(10)
+    session.save_test(tmp_path / "test_gain.py")
+    namespace: dict[str, Any] = {"__file__": str(tmp_path / "test_gain.py")}
+    exec((tmp_path / "test_gain.py").read_text(), namespace)
+    namespace["test_gain"]()
+    assert namespace["EXPECTED"] == {WORLD: read(session, WORLD).tolist()}
