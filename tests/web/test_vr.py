@@ -92,6 +92,7 @@ class Headset:
         self.until(lambda status: status["armed"])
         while not self.status["leading"]:  # Until the robot follows.
             self.hold(z, grip=False)
+            self.until(lambda status: not status["refusal"])  # Each answer is waited for: nothing piles up.
             self.hold(z, grip=True)
             self.until(lambda status: status["leading"] or status["refusal"])
 
