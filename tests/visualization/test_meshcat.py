@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from pydrake.geometry import Meshcat
+from pydrake.common import MemoryFile
+from pydrake.geometry import InMemoryMesh, Mesh, Meshcat, Rgba
+from pydrake.math import RigidTransform
 
 from tests.testbeds import AcrobotScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Motion
 from vtbdrake.visualization import make_meshcat, show_motion, show_motions
 from vtbdrake.visualization.camera import Camera, fitting_camera
+from vtbdrake.visualization.meshcat import picture_bundle
+from vtbdrake.visualization.still import Still
 
 UPPER = "Acrobot/upper_link"
 
@@ -191,6 +195,18 @@ def test_picture_has_the_begin_of_the_motion_as_a_shadow_of_its_end() -> None:
     colors = [np.linalg.norm(image - image[0, 0], axis=2) for image in (swung, resting)]
     faint = [np.mean((color > 5) & (color < 60)) for color in colors]
     assert faint[0] > 3 * faint[1]
+
+
+def test_scene_that_drake_cannot_render_tells_why_it_has_no_picture() -> None:
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"  # without normals
+    still = Still(Camera((2.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
+    still.add(
+        Mesh(InMemoryMesh(mesh_file=MemoryFile(triangle, ".obj", "triangle"))),
+        RigidTransform(),
+        Rgba(1.0, 0.0, 0.0, 1.0),
+    )
+    bundle = picture_bundle("<Scene>", still)
+    assert bundle.keys() == {"text/plain"} and "(no picture: Drake cannot render a shape" in bundle["text/plain"]
 
 
 def test_camera_has_all_points_in_view_and_one_at_the_edge() -> None:

@@ -150,7 +150,7 @@ class Scene:
 def picture_bundle(text: str, still: Still | None) -> dict[str, Any]:
     """Return how something that is drawn appears in a notebook without a kernel: its picture, or a text.
 
-    There is no picture where nothing moves, or on a machine that cannot render.
+    There is no picture where nothing moves, or where Drake cannot render: the text tells why.
     """
     if still is None or still.camera is None:
         return {"text/plain": text}

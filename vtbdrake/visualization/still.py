@@ -10,7 +10,8 @@ from PIL import Image
 from pydrake.geometry import HalfSpace, Rgba, Shape
 from pydrake.math import RigidTransform
 
-from vtbdrake.components.rendering import check_rendering
+from vtbdrake.components.rendering import RenderingError, check_rendering
+from vtbdrake.failures import one_line
 from vtbdrake.visualization.camera import FIELD_OF_VIEW, Camera
 
 # Each pixel of a picture is the mean of so many squared, which smooths edges.
@@ -41,7 +42,7 @@ class Still:
         """Return the picture, shape (height, width, 3).
 
         Raises:
-            RenderingError: This machine cannot render.
+            RenderingError: This machine cannot render, or not one of the shapes.
             ValueError: There is no camera.
         """
         from pydrake.geometry import (
@@ -75,7 +76,10 @@ class Still:
             properties = PerceptionProperties()
             properties.AddProperty("phong", "diffuse", color)
             geometry.set_perception_properties(properties)
-            scene_graph.RegisterAnchoredGeometry(source, geometry)
+            try:
+                scene_graph.RegisterAnchoredGeometry(source, geometry)
+            except RuntimeError as error:  # such as a mesh without normals, which Meshcat shows
+                raise RenderingError(f"Drake cannot render a shape of the scene: {one_line(error)}") from error
         size = (_POINTS * width, _POINTS * height)
         distance = float(np.linalg.norm(np.subtract(self.camera.position, self.camera.target)))
         clipping = ClippingRange(1e-3 * distance, max(_FARTHEST, 10.0 * distance))
