@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from html import escape
+from math import isnan
 from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
@@ -56,7 +57,8 @@ def comparison_html(comparison: Comparison) -> str:
     head = "".join(f"<th>{escape(title)}</th>" for title in ("signal", "verdict", *_COLUMNS, "samples"))
     rows = []
     for name, result in comparison.signals.items():
-        numbers = (f"{getattr(result, field) * factor:.4g}" for field, factor in _COLUMNS.values())
+        values = (getattr(result, field) * factor for field, factor in _COLUMNS.values())
+        numbers = ("" if isnan(value) else f"{value:.4g}" for value in values)
         reasons = "".join(f"<br>{escape(reason)}" for reason in result.beyond)
         cells = "".join(f"<td>{number}</td>" for number in (*numbers, result.samples))
         rows.append(f"<tr><td>{escape(name)}</td><td>{result.verdict}{reasons}</td>{cells}</tr>")
