@@ -74,6 +74,16 @@ def test_best_so_far_is_monotonic():
     np.testing.assert_array_equal(drawn(falling.axes[0], "best so far"), [[0, 1], [1, 1], [2, 1], [6, 1]])
 
 
+def test_point_that_has_been_forbidden_is_not_the_best_so_far():
+    study = one_of_each()
+    study.intervene("forbid", region={PERIOD.address: [1.5, 2.5]})
+    np.testing.assert_array_equal(drawn(plot_history(study).axes[0], "best so far"), [[0, 1], [2, 2], [6, 2]])
+    assert study.best.value == 2.0
+    study.intervene("forbid", region={PERIOD.address: [0.5, 3.2]})
+    history = plot_history(study)
+    assert not drawn(history.axes[0], "best so far").size and "best so far" not in legend(history)
+
+
 def test_history_counts_methods_and_what_went_wrong():
     assert legend(plot_history(one_of_each())) == [
         "TPE (5)",

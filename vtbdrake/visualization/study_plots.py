@@ -81,10 +81,12 @@ class Points:
     def best(self, study: Study, quality: int) -> Trial | None:
         """Return the best point in one quality; None if no point keeps the constraints and is allowed."""
         sign = study.signs[quality]
+        return max(self.candidates(study), key=lambda trial: sign * trial.values[quality], default=None)
+
+    def candidates(self, study: Study) -> tuple[Trial, ...]:
+        """Return the points that keep the constraints, and lie in no region that is forbidden now."""
         allows = study.search.allows
-        return max(
-            (t for t in self.feasible if allows(t.point)), key=lambda trial: sign * trial.values[quality], default=None
-        )
+        return tuple(trial for trial in self.feasible if allows(trial.point))
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
@@ -385,11 +387,14 @@ _ORDER_LABEL = "point, in the order of the study"
 def plot_history(study: Study) -> Figure:
     """Plot every quality in the order of the points, coloured by solver, with the best value so far.
 
+    Points that have been forbidden since are not among the best, as in `Study.best`.
+
     Raises:
         ValueError: There are no points.
     """
     points = Points.of(study)
     trials = study.trials
+    candidates = points.candidates(study)
     methods = Counter(trial.method for trial in trials)
     colors = {method: _METHODS(k % 10) for k, method in enumerate(methods)}
     count = len(study.names)
@@ -403,9 +408,9 @@ def plot_history(study: Study) -> Figure:
             quality=quality,
             c=[colors[trial.method] for trial in points.feasible],
         )
-        if points.feasible:
-            numbers = np.array([trial.number for trial in points.feasible])
-            best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(points.feasible, quality))
+        if candidates:
+            numbers = np.array([trial.number for trial in candidates])
+            best = study.signs[quality] * np.maximum.accumulate(study.signs[quality] * values(candidates, quality))
             # The last best value holds up to the last point.
             numbers, best = np.append(numbers, trials[-1].number), np.append(best, best[-1])
             axes.plot(numbers, best, color=BEST, drawstyle="steps-post", lw=1.4, gid="best so far", zorder=2.5)
@@ -417,7 +422,7 @@ def plot_history(study: Study) -> Figure:
         Line2D([], [], marker="o", ls="none", ms=5, color=colors[method], label=f"{method} ({number})")
         for method, number in methods.items()
     ]
-    if points.feasible:
+    if candidates:
         handles.append(Line2D([], [], color=BEST, lw=1.4, label="best so far"))
     _legend(figure, [*handles, *point_keys(study, points)])
     return figure
