@@ -237,6 +237,27 @@ def test_poses_for_a_browser_that_hangs_take_no_memory() -> None:
 
 
 @pytest.mark.one_python
+def test_browser_whose_loss_is_noticed_in_the_next_turn_gets_nothing_more() -> None:
+    messages, sent = [msgpack.packb({"type": "delete", "path": f"/{number}"}) for number in range(20)], 0
+
+    async def receive() -> bytes:
+        if not messages:
+            await asyncio.Event().wait()
+        return messages.pop()  # type: ignore[no-any-return]
+
+    async def send(_: bytes) -> None:
+        nonlocal sent
+        if is_lost:
+            raise OSError("the browser is gone")
+        sent += 1
+        asyncio.get_running_loop().call_soon(is_lost.append, True)
+
+    is_lost: list[bool] = []
+    asyncio.run(asyncio.wait_for(relay(receive, send), PATIENCE))
+    assert sent == 1
+
+
+@pytest.mark.one_python
 @pytest.mark.parametrize("seed", range(20))
 def test_slow_browser_ends_with_the_same_scene(seed: int) -> None:
     rng, queue, sent, received = random.Random(seed), Newest(), [], []

@@ -82,6 +82,8 @@ async def relay(receive: Callable[[], Awaitable[bytes | str]], send: Callable[[b
     async def write() -> None:
         while True:
             await send(await messages.get())
+            # Neither of the two need wait, and only in a turn of the event loop is it noticed that the browser is gone.
+            await asyncio.sleep(0.0)
 
     tasks = [asyncio.create_task(read()), asyncio.create_task(write())]
     try:
