@@ -22,6 +22,7 @@ from tests.web.test_server import PATIENCE, ask, base, cookie, page
 from vtbdrake.optimization import Choice, Parameter, Study, StudyError
 from vtbdrake.rollout import Quality
 from vtbdrake.web import StudyView, view_study
+from vtbdrake.web.study_worker import PointError, PointSimulator
 
 
 @pytest.fixture(scope="module")
@@ -301,3 +302,12 @@ def test_file_that_is_no_study_is_refused(tmp_path: Path, finished: Path) -> Non
     ):
         with pytest.raises(StudyError, match=message):
             view_study(path)
+
+
+def test_point_is_refused_after_the_end() -> None:
+    simulator = PointSimulator(cart_pole_problem())
+    simulator.close()
+    with pytest.raises(PointError, match="the page has ended"):
+        simulator.attempt((1.0, 0.0))
+    with pytest.raises(PointError, match="the page has ended"):
+        simulator.rollout((1.0, 0.0), condition=0)

@@ -191,12 +191,15 @@ class Toy(Robot):
         super().__init__(PatientArm())
         self.sent: list[dict[str, Any]] = []
         self.reason, self.is_deaf = "", False
+        self.defect: Exception | None = None
         self.closed = False
 
     def read(self, addresses: tuple[str, ...]) -> dict[str, Any]:
         return {self.command.pose: np.eye(3, 4), **self.command.ready}
 
     def send(self, commands: Any) -> None:
+        if self.defect is not None:
+            raise self.defect
         if self.is_deaf:
             raise HandError("nobody listens")
         self.sent.append(dict(commands))
@@ -208,30 +211,60 @@ class Toy(Robot):
         self.closed = True
 
 
+def take(reality: VirtualReality, robot: Toy) -> None:
+    reality.arm()
+    for grip in (False, True):
+        reality.receive("A", HandMessage(time.monotonic(), None, {"left": TOOL}, {"left": grip}, {"left": ()}))
+    becomes(lambda: reality.status.leading and robot.sent[-1]["hand"][0] == 1.0)
+
+
+def test_defect_of_a_robot_is_told_and_disarms(caplog: pytest.LogCaptureFixture) -> None:
+    robot = Toy()
+    reality = VirtualReality(robot)
+    take(reality, robot)
+    robot.defect = ZeroDivisionError("a gear of zero teeth")
+    becomes(lambda: not reality.status.armed)
+    assert reality.status.notice == "a gear of zero teeth"
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    with pytest.raises(ZeroDivisionError, match="zero teeth"):
+        reality.arm()
+    assert not reality.status.armed
+    robot.defect = None
+    becomes(lambda: bool(robot.sent[-1]["hand"][0] == 0.0))  # It is released as soon as it can be.
+    take(reality, robot)
+    with pytest.raises(ZeroDivisionError):
+        robot.defect = ZeroDivisionError()
+        reality.arm()
+    becomes(lambda: not reality.status.armed)
+    reality.close()
+    assert robot.closed
+
+
+def test_request_after_the_end_is_refused() -> None:
+    reality = VirtualReality(Toy())
+    reality.close()
+    for request in (reality.arm, reality.disarm):
+        with pytest.raises(HandError, match="the server has ended"):
+            request()
+
+
 def test_robot_in_trouble_is_released_and_not_armed() -> None:
     robot = Toy()
     reality = VirtualReality(robot)
-
-    def take() -> None:
-        reality.arm()
-        for grip in (False, True):
-            reality.receive("A", HandMessage(time.monotonic(), None, {"left": TOOL}, {"left": grip}, {"left": ()}))
-        becomes(lambda: reality.status.leading and robot.sent[-1]["hand"][0] == 1.0)
-
-    take()
+    take(reality, robot)
     robot.reason = "the fallbacks command: position is stale"
     becomes(lambda: not reality.status.armed and robot.sent[-1]["hand"][0] == 0.0)
     assert reality.status.notice == robot.reason
     with pytest.raises(HandError, match="stale"):
         reality.arm()
     robot.reason = ""
-    take()
+    take(reality, robot)
     robot.is_deaf = True  # It is told that it is released as soon as it listens again.
     becomes(lambda: not reality.status.armed)
     assert reality.status.notice == "nobody listens"
     robot.is_deaf = False
     becomes(lambda: bool(robot.sent[-1]["hand"][0] == 0.0))
-    take()
+    take(reality, robot)
     reality.close()
     assert robot.closed and robot.sent[-1]["hand"][0] == 0.0
 

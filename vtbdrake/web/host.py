@@ -24,7 +24,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vtbdrake.failures import one_line
+from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.web.access import Access
 from vtbdrake.web.relay import relay
 from vtbdrake.web.tls import Tls
@@ -166,7 +166,7 @@ async def answer_commands(
             message = json.loads(text)
             number = message.get("id")
             result = await carry_out(message)
-        except (ValueError, LookupError, TypeError, AttributeError) as failure:
+        except FAILURES as failure:  # It is told on the page, which waits for an answer.
             error = one_line(failure)
         await send(browser, {"type": "answer", "id": number, "error": error, "result": result})
 

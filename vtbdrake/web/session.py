@@ -11,7 +11,6 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, field
 from math import floor, inf, isfinite
 from pathlib import Path
@@ -31,6 +30,7 @@ from vtbdrake.web.drive import Driven, Driver, Handle, handles
 from vtbdrake.web.fork import CommandLimits, Differences, Fork
 from vtbdrake.web.interventions import Interventions
 from vtbdrake.web.layers import Layers
+from vtbdrake.web.requests import result_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -464,11 +464,7 @@ class Session:
             raise SessionError("the session has ended")
         future: Future[_Result] = Future()
         self._commands.put((action, future))
-        while True:
-            with suppress(TimeoutError):
-                return future.result(0.5)
-            if not self._thread.is_alive():
-                raise SessionError("the session has ended")
+        return result_of(future, self._thread, SessionError("the session has ended"))
 
     # -- in the thread of the session
 

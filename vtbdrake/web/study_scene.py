@@ -7,9 +7,8 @@ import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,13 +18,12 @@ from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.camera import fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.web.requests import result_of
 from vtbdrake.web.study_worker import PointError, PointRollout
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
     from pydrake.systems.framework import Context
-
-_Result = TypeVar("_Result")
 
 # Role -> tint, and the opacity of a ghost. The best has its own colours.
 TINTS = {"best": None, "pointed": "#cc3399", "tried": "#009e73"}
@@ -91,14 +89,10 @@ class StudyScene:
         """Show all rollouts at a time in seconds since their begin."""
         self._do(lambda: self._set_time(time))
 
-    def _do(self, action: Callable[[], _Result]) -> _Result:
+    def _do(self, action: Callable[[], object]) -> None:
         future: Future[object] = Future()
         self._commands.put((action, future))
-        while True:
-            with suppress(TimeoutError):
-                return future.result(0.5)  # type: ignore[return-value]
-            if not self._thread.is_alive():
-                raise PointError("the page has ended")
+        result_of(future, self._thread, PointError("the page has ended"))
 
     # -- in the thread of the scene
 

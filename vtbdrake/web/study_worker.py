@@ -105,7 +105,7 @@ class PointSimulator:
 
         Raises:
             PointError: The pointer has moved on, so that another point is simulated instead; or there is no such
-                condition, or the worker is lost.
+                condition, or the worker is lost or has ended.
         """
         with self._changed:
             if (rollout := self._rollouts.use((point, condition))) is not None:
@@ -116,7 +116,7 @@ class PointSimulator:
         """Evaluate a point under all conditions.
 
         Raises:
-            PointError: Another point is tried instead, or the worker is lost.
+            PointError: Another point is tried instead, or the worker is lost or has ended.
         """
         return self._result(_TRIED, lambda: self._evaluate(point), Tried)
 
@@ -124,6 +124,8 @@ class PointSimulator:
         """Return the result of an action in the thread of the worker, which replaces one of that name that waits."""
         future: Future[object] = Future()
         with self._changed:
+            if self._closed:
+                raise PointError("the page has ended")
             if name in self._waiting:
                 self._waiting[name][1].cancel()
             self._waiting[name] = action, future
@@ -131,7 +133,7 @@ class PointSimulator:
         try:
             result = future.result()
         except CancelledError:
-            raise PointError("another point is simulated instead") from None
+            raise PointError("the page has ended" if self._closed else "another point is simulated instead") from None
         assert isinstance(result, kind)
         return result
 

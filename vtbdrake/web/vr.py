@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -21,22 +22,26 @@ from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket
 
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.failures import one_line
+from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError
+from vtbdrake.monitoring.live.client import LiveClient, LiveTimeoutError
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.hand import HandCommand
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.web.hand import HandError, HandMessage, Lead
 from vtbdrake.web.host import CLOSED, first_of, send
-from vtbdrake.web.session import Session, SessionError
+from vtbdrake.web.requests import result_of
+from vtbdrake.web.session import Session
 
 _TICK = 0.01  # s, between two commands while a hand leads
 _STATUS_PERIOD = 0.05  # s
 _ANSWER_TIME = 0.5  # s, for the loop to tell where its tool is
 _BURST = 100
-_FAILURES = (HandError, SessionError, BridgeError, LiveError, LiveTimeoutError, OSError)
+# Why a robot is not led: any ValueError, also of a session or a loop, and a bus that is gone.
+_FORESEEN = (ValueError, BridgeError, OSError)
+
+_log = logging.getLogger(__name__)
 
 
 def hand_command_of(scenario: Scenario) -> HandCommand:
@@ -251,7 +256,7 @@ class VirtualReality:
         """Let a headset lead.
 
         Raises:
-            ValueError: The robot cannot be led.
+            ValueError: The robot cannot be led, or the server has ended.
         """
         self._call(self._arm)
 
@@ -274,13 +279,16 @@ class VirtualReality:
         def carry_out() -> None:
             try:
                 action()
-            except (*_FAILURES, ValueError) as error:
+            except _FORESEEN as error:
                 future.set_exception(error)
+            except FAILURES as error:
+                future.set_exception(error)
+                raise  # It disarms.
             else:
                 future.set_result(None)
 
         self._inbox.put(carry_out)
-        future.result()
+        result_of(future, self._thread, HandError("the server has ended: no hand leads"))
 
     # -- in the thread
 
@@ -293,12 +301,20 @@ class VirtualReality:
             self._work()
             self._robot.close()
 
+    def _fail(self, error: BaseException) -> None:
+        if self._lead.armed and not isinstance(error, _FORESEEN):
+            _log.error("the robot is released, as leading it has failed", exc_info=error)
+        self._lead.disarm(one_line(error))
+
     def _take(self) -> bool:
         """Carry out what has arrived, after a tick at most; return whether to go on."""
         try:
             action = self._inbox.get(timeout=_TICK)
             while action is not None:
-                action()
+                try:
+                    action()
+                except FAILURES as error:
+                    self._fail(error)
                 action = self._inbox.get_nowait()
         except Empty:
             return True
@@ -316,8 +332,8 @@ class VirtualReality:
                 self._robot.send(self._commands(command))
                 self._released = not lead.leading
                 self._sent += 1
-        except _FAILURES as error:
-            lead.disarm(one_line(error))
+        except FAILURES as error:
+            self._fail(error)
         self.status = VrStatus(lead.armed, lead.leading, lead.notice, lead.headset, dict(self._refusals), self._sent)
 
     def _commands(self, command: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -343,7 +359,7 @@ class VirtualReality:
     def _receive(self, headset: object, message: HandMessage, now: float) -> None:
         try:
             self._refusals[headset] = self._lead.receive(headset, message, now)
-        except _FAILURES as error:
+        except _FORESEEN as error:
             self._refusals[headset] = self._lead.notice = one_line(error)
 
     def _forget(self, headset: object) -> None:
@@ -384,7 +400,7 @@ class VirtualReality:
                     self.receive(headset, HandMessage.of(message))
                 else:
                     await run_in_threadpool(actions[name])
-            except (*_FAILURES, ValueError, LookupError, TypeError, AttributeError) as error:
+            except FAILURES as error:
                 await send(browser, {"type": "error", "error": one_line(error)})
 
     async def _tell(self, browser: WebSocket, headset: object) -> None:
