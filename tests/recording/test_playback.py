@@ -17,6 +17,7 @@ from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.clock import Clock, ScaledClock, SimulatedClock
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
+from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.recording.export import export
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
@@ -24,6 +25,7 @@ from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.playback import DrivenScenario, LogBridge
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.table_reader import read_table
+from vtbdrake.rollout import Quality
 from vtbdrake.testbed import DpsAlone, Scenario, ScenarioError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
@@ -144,6 +146,29 @@ def test_driven_scenario_is_sent_to_other_processes_and_refuses_what_does_not_fi
     copied = pickle.loads(pickle.dumps(DrivenScenario(scenario=scenario, log=log, period=0.5)))
     assert [signal.name for signal in copied.build().interface.commands] == ["plan"]
     assert len(copied.log.act["force"]) == 2
+    logs = [Log("a.csv", {}, {"force": Series(np.arange(2.0), value * np.ones((2, 1)))}) for value in (1.0, 2.0)]
+    same, other = (DrivenScenario(scenario=scenario, log=log, period=0.5) for log in logs)
+    assert copied == same != other
+    assert copied.record() == same.record() != other.record()
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes", "compiled"])
+def test_sweep_of_a_driven_world(executor: str) -> None:
+    times = 0.02 * np.arange(10)
+    log = Log("a.csv", {}, {"force": Series(times, 20.0 * np.sin(times[:, np.newaxis]))})
+    problem = Problem(
+        scenario=DrivenScenario(scenario=CartPoleScenario(), log=log),
+        parameters=[Parameter("sim.sys.cart_pole.pole.mass", 0.5, 1.0)],
+        quality=Quality(lambda state: state[0] ** 2, of="plant.state", reading="end"),
+        horizon=0.2,
+    )
+    values = [rollout.value for rollout in problem.sweep(2, executor=executor, progress=False).rollouts]
+    heavy = DrivenScenario(scenario=CartPoleScenario(), log=log).build()
+    context = heavy.default_context()
+    heavy.write(context, {"sim.sys.cart_pole.pole.mass": 1.0})
+    heavy.simulator(context).AdvanceTo(0.2)
+    assert values[1] == pytest.approx(heavy.read(context, "plant.state")[0] ** 2, rel=1e-11)
+    assert values[0] > values[1] > 0.0
 
 
 @pytest.mark.parametrize(

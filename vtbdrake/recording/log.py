@@ -93,6 +93,8 @@ class Series:
 class Log:
     """Recorded signals, each with its own times, in seconds on a clock that they share.
 
+    Logs with the same names, times and samples are equal.
+
     Args:
         source: The file, for messages.
         sense: Samples of sensors, by signal.
@@ -112,6 +114,12 @@ class Log:
         self.sense = dict(sense)
         self.act = dict(act)
         self.remarks = tuple(remarks)
+
+    def __eq__(self, other: object) -> bool:
+        return self.digest == other.digest if isinstance(other, Log) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
     def __str__(self) -> str:
         lines = [self.source]

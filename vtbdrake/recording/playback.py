@@ -172,6 +172,10 @@ class DrivenScenario(Scenario):
             raise ScenarioError(f"DrivenScenario.log is a Log, see read_table and ControlLog.signals, not {self.log!r}")
         return self.log
 
+    def record(self) -> dict[str, Any]:
+        """Return the identity of the scenario as plain data, with the digest of the log."""
+        return super().record() | {"log": None if self.log is None else self._recorded.digest}
+
     def interface(self) -> Interface:
         return self._driving.interface()
 
