@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -13,11 +14,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio
+from vtbdrake.recording import DrivenScenario, Log, Series
 from vtbdrake.rollout import RolloutTask, SerialExecutor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.arm import Arm
+from vtbdrake_diagrams.manipulator.excited import ExcitedArmScenario
 
 STATE = "plant.state"
 # Rounding grows in the motion that is compared.
@@ -72,6 +76,52 @@ def _compared(
         note=f"ms per rollout of {horizon:g} s: {1e3 * np.median(compiled) / count:.3g}, in Drake "
         f"{1e3 * np.median(by_drake) / count:.3g}; states {apart:.1g} apart; n = {repeats}",
     )
+
+
+def log_replay(repeats: int = 5) -> list[Benchmark]:
+    """How much faster the compiled world of the arm follows the torques of a log than Drake's, on one core each."""
+    # Without its controller, the arm falls onto a stop some time later.
+    seconds, sample_period, torque = 2.0, 0.01, "joint_torque"
+    machine = ExcitedArmScenario()
+    turns = 0.3 * np.random.default_rng(0).standard_normal((machine.knots, 7))
+    knots = np.clip(np.add(Arm().home, turns), Arm().lower, Arm().upper)
+    task = RolloutTask(machine, seconds, record=[f"dps.{torque}"], sample_period=machine.period)
+    with SerialExecutor() as executor:
+        (recorded,) = run_rollouts(executor, task, [{"u.plan": np.append(0.0, knots)}], progress=False)
+    assert recorded is not None
+    # A sample is taken before the updates of its instant: it has acted since the sample before.
+    commands = Series(recorded.times[:-1], recorded.record[f"dps.{torque}"][1:])
+    world = DrivenScenario(scenario=machine, log=Log("the arm", {}, {torque: commands}))
+
+    testbed = world.build()
+    rollouts = testbed.compiled(horizon=seconds, sample_period=sample_period, outputs=[STATE], compile=True)
+    begun = time.perf_counter()
+    batch = rollouts()
+    first = time.perf_counter() - begun
+    replay = RolloutTask(world, seconds, record=[STATE], sample_period=sample_period)
+    with SerialExecutor(testbed) as executor:
+        in_drake = partial(run_rollouts, executor, replay, [{}], progress=False)
+        (result,) = in_drake()
+        assert result is not None
+        positions, expected = (state[..., :7] for state in (batch.outputs[STATE][0], result.record[STATE]))
+        apart = float(np.max(np.abs(positions - expected)))
+        if not (batch.valid.all() and apart <= TOLERANCE):
+            raise ArithmeticError(f"the compiled arm is {apart:.2g} rad from Drake's on the same log")
+        by_drake, compiled = interleaved(in_drake, rollouts, repeats=repeats)
+    moved = float(np.max(np.ptp(expected, axis=0)))
+    return [
+        Benchmark(
+            name="log_replay",
+            value=ratio(by_drake, compiled),
+            unit="1",
+            goal=20.0,
+            better=HIGHER,
+            against="the same log in Drake, the full world on one core",
+            note=f"ms for {seconds:g} s of log at 1 kHz: {1e3 * np.median(compiled):.3g}, the first time "
+            f"{1e3 * first:.3g}, in Drake {1e3 * np.median(by_drake):.3g}; over {moved:.2g} rad, positions {apart:.1g} "
+            f"rad apart; n = {repeats}",
+        )
+    ]
 
 
 def compile_time(repeats: int = 5) -> list[Benchmark]:

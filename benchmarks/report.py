@@ -45,6 +45,7 @@ BENCHMARKS: Registry = {
     "recording_cost": "benchmarks.recording:recording_cost",
     "replay_rtf": "benchmarks.recording:replay_rtf",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
+    "log_replay": "benchmarks.compiled_testbed:log_replay",
     "calibration_time": "benchmarks.calibration:calibration_time",
     "domain_query": "benchmarks.domain_query:domain_query",
     "dps_alone_start": "benchmarks.dps_alone:dps_alone_start",

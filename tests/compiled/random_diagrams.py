@@ -26,8 +26,10 @@ from pydrake.systems.primitives import (
     Saturation,
     Sine,
     SymbolicVectorSystem,
+    TrajectorySource,
     ZeroOrderHold,
 )
+from pydrake.trajectories import PiecewisePolynomial
 
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.casadi_system import CasadiSystem
@@ -78,6 +80,7 @@ class RandomDiagram:
             self.symbolic,
             self.casadi,
             self.spline,
+            self.trajectory,
         )
         for _ in range(systems):
             self.add(makers[self.random.integers(len(makers))]())
@@ -118,6 +121,10 @@ class RandomDiagram:
             self.builder.Connect(source, adapted.get_input_port())
             source = adapted.get_output_port()
         self.builder.Connect(source, port)
+
+    def trajectory(self) -> System:
+        values = self.random.standard_normal((self.size(), 9))
+        return TrajectorySource(PiecewisePolynomial.ZeroOrderHold(0.1 * np.arange(9), values))
 
     def linear(self) -> System:
         n, m = self.size(), self.size()

@@ -6,8 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pydrake.symbolic import Expression, Variable, uninterpreted_function
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus, LeafSystem, System
-from pydrake.systems.primitives import Adder, ConstantVectorSource, Gain, Integrator, ZeroOrderHold
+from pydrake.systems.primitives import (
+    Adder,
+    ConstantVectorSource,
+    Gain,
+    Integrator,
+    SymbolicVectorSystem,
+    TrajectorySource,
+    ZeroOrderHold,
+)
+from pydrake.trajectories import PiecewisePolynomial
 
 from vtbdrake.compiled import (
     EQUATIONS,
@@ -89,6 +99,20 @@ def test_names_contact() -> None:
 def test_unconnected_inputs_are_named() -> None:
     with pytest.raises(UnsupportedTestbedError, match="part0: nothing is connected to the input port u"):
         compiled(alone(ZeroOrderHold(0.1, 1)))
+
+
+def test_what_drake_cannot_write_down_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(EQUATIONS, TrajectorySource)
+    trajectory = TrajectorySource(PiecewisePolynomial.ZeroOrderHold([0.0, 1.0], [[1.0, 2.0]]))
+    x = Variable("x")
+    unknown = SymbolicVectorSystem(input=[x], output=[uninterpreted_function("f", [Expression(x)])])
+    for source, reason in {
+        trajectory: "TrajectorySource has no equations that Drake can write down .*symbolic time",
+        unknown: r"SymbolicVectorSystem has no equations that Drake can write down \(there is no expression of CasADi",
+    }.items():
+        systems = [ConstantVectorSource([1.0])] if source is unknown else []
+        with pytest.raises(UnsupportedTestbedError, match=reason):
+            compiled(alone(*systems, source, ZeroOrderHold(0.1, 1)))
 
 
 class Loop(LeafSystem):

@@ -1,8 +1,9 @@
-"""The equations of Drake's own systems: those that it converts to symbolic expressions, and its switches."""
+"""The equations of Drake's own systems: those that it converts to symbolic expressions, switches, trajectories."""
 
 from __future__ import annotations
 
 import operator
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from typing import Any
@@ -13,7 +14,16 @@ from pydrake.symbolic import Expression as DrakeExpression
 from pydrake.symbolic import ExpressionKind, Formula, FormulaKind, Variable
 from pydrake.systems.framework import Context, PortDataType, System
 
-from vtbdrake.compiled.equations import REMEDY, At, Equations, Expression, refusal
+from vtbdrake.arrays import Array
+from vtbdrake.compiled.equations import (
+    REMEDY,
+    At,
+    Draw,
+    Equations,
+    Expression,
+    UnsupportedTestbedError,
+    refusal,
+)
 
 
 class SymbolicEquations(Equations):
@@ -28,7 +38,7 @@ class SymbolicEquations(Equations):
         super().__init__(system, context, varied)
         symbolic = system.ToSymbolicMaybe()
         if symbolic is None:
-            raise refusal(system, f"has no equations that Drake can write down: {REMEDY}")
+            raise self._unwritten()
         # A converted context: some systems have values beside the numeric groups.
         self._symbolic, self._context = symbolic, symbolic.CreateDefaultContext()
         self._variables: dict[str, list[Variable]] = {}
@@ -46,11 +56,22 @@ class SymbolicEquations(Equations):
             parameter.SetFromVector(_expressions(self._new(f"parameter {i}", parameter.size())))
 
     def output(self, port: str, at: At) -> Expression:
-        return self._translated(self._symbolic.GetOutputPort(port).Eval(self._context), at)
+        try:
+            value = self._symbolic.GetOutputPort(port).Eval(self._context)
+        except RuntimeError as error:
+            raise self._unwritten(error) from None
+        return self._translated(value, at)
 
     def update(self, at: At) -> dict[int | str, Expression]:
-        following = self._symbolic.EvalUniquePeriodicDiscreteUpdate(self._context)
+        try:
+            following = self._symbolic.EvalUniquePeriodicDiscreteUpdate(self._context)
+        except RuntimeError as error:
+            raise self._unwritten(error) from None
         return {i: self._translated(following.value(i), at) for i in range(following.num_groups())}
+
+    def _unwritten(self, error: RuntimeError | None = None) -> UnsupportedTestbedError:
+        why = "" if error is None else f" ({error})"
+        return refusal(self.system, f"has no equations that Drake can write down{why}: {REMEDY}")
 
     def _new(self, name: str, size: int) -> list[Variable]:
         return self._variables.setdefault(name, [Variable(f"{name} {k}") for k in range(size)])
@@ -64,7 +85,10 @@ class SymbolicEquations(Equations):
                 source, _, number = name.partition(" ")
                 value = at.time if source == "time" else getattr(at, source)(int(number))
                 symbols |= {variable.get_id(): value[k] for k, variable in enumerate(variables)}
-        return casadi.vertcat(casadi.SX(0, 1), *(from_drake(e, symbols) for e in expressions))
+        try:
+            return casadi.vertcat(casadi.SX(0, 1), *(from_drake(e, symbols) for e in expressions))
+        except NotImplementedError as error:
+            raise self._unwritten(error) from None
 
 
 def _expressions(variables: Sequence[Variable]) -> np.ndarray:
@@ -153,3 +177,21 @@ class PortSwitchEquations(Equations):
 
     def output(self, port: str, at: At) -> Expression:
         return at.input(int(at.input(0)))
+
+
+class TrajectoryEquations(Equations):
+    """Drake's TrajectorySource, whose values are data: they are looked up before a rollout, at its instants."""
+
+    def __init__(self, system: System, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        port, clock, lock = system.get_output_port(), system.CreateDefaultContext(), threading.Lock()
+
+        def values(_: int, time: float) -> Array:
+            with lock:
+                clock.SetTime(time)
+                return np.array(port.Eval(clock))
+
+        self.draws["value"] = Draw(port.size(), None, values)
+
+    def output(self, port: str, at: At) -> Expression:
+        return at.draw("value")

@@ -37,16 +37,19 @@ class Timing:
 
 @dataclass(frozen=True)
 class Draw:
-    """Random numbers of the updates of a system, drawn before the rollout.
+    """Numbers that are looked up before the rollout, for each update of a system: random ones, or samples of a log.
+
+    A system that is never updated has them at each instant, also in its outputs.
 
     Attributes:
         size: How many numbers an update takes.
-        seed: Where the seed lies in the system's parameters: (number of the group, entry).
-        numbers: Function (seed, time of the update in s) that returns them, shape (size,).
+        seed: Where the seed lies in the system's parameters: (number of the group, entry); None: the numbers depend on
+            the time alone.
+        numbers: Function (seed, time of the update in s) that returns them, shape (size,); without a seed, it is 0.
     """
 
     size: int
-    seed: tuple[int, int]
+    seed: tuple[int, int] | None
     numbers: Callable[[int, float], Any]
 
 
@@ -100,7 +103,7 @@ class At(ABC):
 
     @abstractmethod
     def draw(self, name: str) -> Expression:
-        """Return random numbers, shape (n, 1); in an update only; see `Equations.draws`."""
+        """Return numbers of `Equations.draws`, shape (n, 1); in an update only, if the system has updates."""
 
 
 class Equations(ABC):
@@ -112,7 +115,7 @@ class Equations(ABC):
         memory: Numbers that the equations keep beside the system's own state, with their values at the begin.
         extras: Variables that lie in no numeric group, such as masses, by the name under which `At.extra` returns them,
             with their sizes; they are among those that vary.
-        draws: The random numbers of an update, by the name under which `At.draw` returns them.
+        draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
     """
 
     memory: dict[str, float]

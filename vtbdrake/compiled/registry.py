@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, System
-from pydrake.systems.primitives import PortSwitch
+from pydrake.systems.primitives import PortSwitch, TrajectorySource
 
 from vtbdrake.compiled.components import (
     BoardEquations,
@@ -15,7 +15,7 @@ from vtbdrake.compiled.components import (
     JointTorqueEquations,
     SplineEquations,
 )
-from vtbdrake.compiled.drake_systems import PortSwitchEquations, SymbolicEquations
+from vtbdrake.compiled.drake_systems import PortSwitchEquations, SymbolicEquations, TrajectoryEquations
 from vtbdrake.compiled.equations import REMEDY, Equations, refusal
 from vtbdrake.compiled.plant import PlantEquations
 from vtbdrake.components.actuators import JointDrives
@@ -36,6 +36,7 @@ EQUATIONS: dict[type, type[Equations]] = {
     PortSwitch: PortSwitchEquations,
     SplineCommand: SplineEquations,
     SwitchBoard: BoardEquations,
+    TrajectorySource: TrajectoryEquations,
 }
 """The equations of each class of systems, to which others can be added: ``EQUATIONS[TheirSystem] = MyEquations``.
 

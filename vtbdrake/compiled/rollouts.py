@@ -114,7 +114,7 @@ class CompiledRollouts:
             self._w = casadi.SX.sym("w", max(1, self.walker.noise))
             self._recorded = self._recorded_values()
             self._shapes = self._output_shapes(variables)
-            self._record = casadi.Function("record", [self._z, self._time], [self._recorded], {"cse": True})
+            self._record = casadi.Function("record", [self._z, self._time, self._w], [self._recorded], {"cse": True})
         for address in parameters:
             self.walker.place(address)
         self.times = sample_times(horizon, sample_period)
@@ -283,7 +283,8 @@ class CompiledRollouts:
                 )
 
     def _recorded_values(self) -> casadi.SX:
-        values = {address: self.walker.output(address, self._z, self._time) for address in self._addresses()}
+        z, time, w = self._z, self._time, self._w
+        values = {address: self.walker.output(address, z, time, w) for address in self._addresses()}
         recorded = [values[address] for address in self.outputs]
         for function, of in self._measures.values():
             recorded.append(casadi.densify(function(*(values[address] for address in of))))
@@ -298,7 +299,7 @@ class CompiledRollouts:
             if address in variables:
                 shapes[address] = variables[address].shape
             else:
-                shapes[address] = (self.walker.output(address, self._z, self._time).numel(),)
+                shapes[address] = (self.walker.output(address, self._z, self._time, self._w).numel(),)
         return shapes | dict.fromkeys(self._measures, ())
 
     def schedule_at(self, t0: float) -> list[Instant]:
@@ -326,7 +327,7 @@ class CompiledRollouts:
                     return program
             count = needed + len(self.walker.timings)
             updates = {due: self._update(due) for due in dues}
-            program = _Program(updates, self._record, self._w.numel(), count, self._translate)
+            program = _Program(updates, self._record, count, self._translate)
             self._programs[count, dues] = program
             return program
 
@@ -354,13 +355,12 @@ class _Program:
         self,
         updates: Mapping[tuple[int, ...], casadi.Function],
         record: casadi.Function,
-        noise: int,
         count: int,
         translate: Callable[[casadi.Function], casadi.Function],
     ) -> None:
         self.count = count
         self._numbers = {due: float(k) for k, due in enumerate(updates)}
-        self.function = _rollout(list(updates.values()), record, noise, count)
+        self.function = _rollout(list(updates.values()), record, count)
         arguments = self.function.mx_in()
         results: Any = self.function(*arguments)
         packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
@@ -395,21 +395,20 @@ class _Program:
         return rows[:, :nz].copy(), recorded[:, sampled]
 
 
-def _rollout(updates: Sequence[casadi.Function], record: casadi.Function, noise: int, count: int) -> casadi.Function:
+def _rollout(updates: Sequence[casadi.Function], record: casadi.Function, count: int) -> casadi.Function:
     """Return the function (z, instants, w) -> (z, recorded) of ``count`` instants.
 
     A column of ``instants`` is [time, number of the update, whether to record]; there is no update of number -1.
     """
-    z, time = record.sx_in()
-    w = casadi.SX.sym("w", noise)
+    z, time, w = record.sx_in()
     keep = casadi.Function("keep", [z, time, w], [z])
-    nothing = casadi.Function("nothing", [z, time], [casadi.SX.zeros(record.numel_out(0), 1)])
+    nothing = casadi.Function("nothing", [z, time, w], [casadi.SX.zeros(record.numel_out(0), 1)])
     update = casadi.Function.conditional("update", list(updates) or [keep], keep)
     sample = casadi.Function.if_else("sample", record, nothing)
     state, instant, random = (
-        casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 3), ("w", noise))
+        casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 3), ("w", w.numel()))
     )
-    results: Any = [update(instant[1], state, instant[0], random), sample(instant[2], state, instant[0])]
+    results: Any = [update(instant[1], state, instant[0], random), sample(instant[2], state, instant[0], random)]
     return _repeated(casadi.Function("step", [state, instant, random], results), count)
 
 

@@ -57,7 +57,7 @@ class Walker:
         size: The number of entries of z.
         equations: The equations of the systems that have some, by path.
         uncovered: Why other systems have none, by path.
-        draws: The random numbers of the updates, with their entries in w: (path, name, draw, entries).
+        draws: The random numbers of the updates, and other data, with their entries in w: (path, name, draw, entries).
         noise: The number of entries of w.
         fixed: Entries of z whose values are compiled in, with the address and the reason: (entries, path, reason).
     """
@@ -201,7 +201,7 @@ class Walker:
 
     # -- expressions
 
-    def update(self, z: Expression, time: Expression, due: Sequence[int], w: Expression | None) -> Expression:
+    def update(self, z: Expression, time: Expression, due: Sequence[int], w: Expression) -> Expression:
         """Return z after the updates of an instant: the unrestricted ones, then the discrete ones."""
         for unrestricted in (True, False):
             at = Evaluation(self, z, time, w)
@@ -216,7 +216,7 @@ class Walker:
             z = following
         return z
 
-    def output(self, address: str, z: Expression, time: Expression) -> Expression:
+    def output(self, address: str, z: Expression, time: Expression, w: Expression) -> Expression:
         """Return the value of a variable or of a vector output port, as an expression, shape (n, 1)."""
         if address == "time":
             return time
@@ -226,7 +226,7 @@ class Walker:
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
         leaf, number = _writer(system, port.get_index())
-        evaluation = Evaluation(self, z, time, None)
+        evaluation = Evaluation(self, z, time, w)
         return casadi.densify(evaluation.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
 
     def reader(self, address: str) -> Callable[[Context], Any]:
@@ -352,13 +352,15 @@ class Walker:
 
     def seeds(self, z: Array) -> Array:
         """Return the seeds of all draws in vectors z, shape (n, size), as an array of shape (n, draws)."""
-        starts = [
-            self.blocks[path, PARAMETER, draw.seed[0]].entries.start + draw.seed[1] for path, _, draw, _ in self.draws
-        ]
-        return z[:, starts]
+        seeds = np.zeros((len(z), len(self.draws)))
+        for k, (path, _, draw, _) in enumerate(self.draws):
+            if draw.seed is not None:
+                group, entry = draw.seed
+                seeds[:, k] = z[:, self.blocks[path, PARAMETER, group].entries.start + entry]
+        return seeds
 
     def draw_numbers(self, seeds: Array, time: float, due: Sequence[int], w: Array) -> None:
-        """Write the random numbers of the updates of an instant into w, shape (noise,).
+        """Write the random numbers and other data of an instant into w, shape (noise,).
 
         Args:
             seeds: The seeds of the draws, shape (draws,).
@@ -368,7 +370,7 @@ class Walker:
         """
         for seed, (path, _, draw, entries) in zip(seeds.tolist(), self.draws, strict=True):
             timing = self.equations[path].timing
-            if timing is not None and self.timings.index(timing) in due:
+            if timing is None or self.timings.index(timing) in due:
                 w[entries] = draw.numbers(int(seed), time)
 
 
@@ -379,10 +381,10 @@ class Evaluation:
         walker: The Diagram.
         z: Its state and parameters.
         time: The time.
-        w: The random numbers of this instant; None where nothing is updated.
+        w: The random numbers and other data of this instant.
     """
 
-    def __init__(self, walker: Walker, z: Expression, time: Expression, w: Expression | None) -> None:
+    def __init__(self, walker: Walker, z: Expression, time: Expression, w: Expression) -> None:
         self.walker, self.z, self.time, self.w = walker, z, time, w
         self._values: dict[tuple[str, str], Expression] = {}
         self._under_way: list[tuple[str, str]] = []
@@ -452,7 +454,6 @@ class _Reading(At):
         return shared[key]
 
     def draw(self, name: str) -> Expression:
-        assert self._evaluation.w is not None
         draws = self._evaluation.walker.draws
         return self._evaluation.w[next(e for path, n, _, e in draws if (path, n) == (self._path, name))]
 
