@@ -15,6 +15,7 @@ from vtbdrake.calibration import CalibrationError, RolloutCalibration, Window, c
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.optimization import Parameter
 from vtbdrake.testbed import ScenarioError
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cube_toss import CubeTossScenario
 
 POSITION, VELOCITY = "sim.sys.cube.position", "sim.sys.cube.velocity"
@@ -185,6 +186,44 @@ def test_what_does_not_fit_is_refused(change: dict[str, object], error: type[Exc
         calibrate_by_rollouts(
             CubeTossScenario(), windows, parameters, distance, holdout=arguments["holdout"], executor="serial"
         )
+
+
+ANGLE, RATE, DAMPING = (f"sim.sys.cart_pole.pole_pin.{name}" for name in ("position", "velocity", "damping"))
+
+
+def swings(damping: float) -> list[Window]:
+    """Return swings of the cart-pole's pole, as Drake simulates them, measured to 1 mrad."""
+    testbed, rng, times = CartPoleScenario().build(), np.random.default_rng(3), 0.02 * np.arange(33)
+    windows = []
+    for k, angle in enumerate(np.linspace(0.3, 1.0, 8)):
+        context = testbed.default_context()
+        testbed.write(context, {DAMPING: damping, ANGLE: angle})
+        simulator, angles = testbed.simulator(context), []
+        for time in times:
+            simulator.AdvanceTo(time)
+            angles.append(testbed.read(context, ANGLE))
+        measured = np.array(angles) + 1e-3 * rng.normal(size=len(times))
+        windows.append(Window(times, [{ANGLE: angle, RATE: 0.0}], {ANGLE: measured}, f"swing {k}"))
+    return windows
+
+
+def test_compiled_rollouts_give_the_same_estimates() -> None:
+    by_drake, compiled = (
+        calibrate_by_rollouts(
+            CartPoleScenario(),
+            swings(0.2),
+            [Parameter(DAMPING, 0.05, 0.6)],
+            lambda times, measured, simulated: float(np.mean((measured[ANGLE] - simulated[ANGLE]) ** 2)),
+            points=8,
+            executor=executor,
+        )
+        for executor in ("serial", "compiled")
+    )
+    for name in ("value", "lower", "upper", "deviation"):
+        expected = getattr(by_drake.parameters[DAMPING], name)
+        assert getattr(compiled.parameters[DAMPING], name) == pytest.approx(expected, rel=1e-6), name
+    assert compiled.parameters[DAMPING].value == pytest.approx(0.2, rel=0.05)
+    assert compiled.rollouts == by_drake.rollouts and str(compiled) == str(by_drake)
 
 
 @pytest.mark.parametrize(

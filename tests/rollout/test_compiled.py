@@ -198,6 +198,12 @@ def test_auto_takes_drake_where_nothing_can_be_compiled(caplog: pytest.LogCaptur
     assert "the mental testbed is simulated in Drake: compiled rollouts cannot do what pruning= asks for" in caplog.text
 
 
+def test_compiled_is_refused_when_the_reasoner_is_made() -> None:
+    search = SearchConfig(method="random", pruning=Pruning(), executor="compiled")
+    with pytest.raises(ValueError, match="compiled rollouts cannot do what pruning= asks for"):
+        make_reasoner(SCENARIO, rollouts=4, search=search)
+
+
 def test_a_decision_within_wall_time() -> None:
     testbed = SCENARIO.build()
     context = testbed.default_context()

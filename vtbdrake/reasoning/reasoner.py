@@ -54,7 +54,8 @@ class SearchConfig:
             from all points, such as CEM and MPPI, propose other candidates with pruning than without.
         executor: Where the rollouts run, see `Problem.sweep`. ``auto`` compiles the mental testbed if that is possible
             and equal to Drake's as far as is checked; else it takes processes if a system in Python has work to do,
-            and threads otherwise. The log tells, and ``RolloutResult.computed``.
+            and threads otherwise. The log tells, and ``RolloutResult.computed``. ``compiled`` insists: what cannot be
+            compiled is an error when the reasoner is made.
         workers: Number of threads or processes; by default the number of cores.
         time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
             By default the horizon, but at least 10 s.
@@ -167,7 +168,8 @@ class Reasoner:
         self.solver(0.0, budget=affordable).close()
         self._workers = checked_workers(search.workers)
         self._owned = not isinstance(search.executor, Executor)
-        compiled = self._compiled_executor() if search.executor == "auto" and search.time_limit is None else None
+        compiles = search.executor in ("auto", "compiled") and search.time_limit is None
+        compiled = self._compiled_executor() if compiles else None
         self.executor = compiled or _make_executor(search, self.problem, budget)
         if search.pruning is not None or budget.seconds is not None:
             self._check_executor()
@@ -178,7 +180,10 @@ class Reasoner:
         self._closed = False
 
     def _compiled_executor(self) -> Executor | None:
-        """Return the executor of the compiled testbed, if it is equal to the mental testbed as far as was checked."""
+        """Return the executor of the compiled testbed, if it is equal to the mental testbed as far as was checked.
+
+        Otherwise, ``auto`` does without it, and ``compiled`` raises the error.
+        """
         # Imported here: without it, a reasoner needs no CasADi.
         from vtbdrake.rollout.compiled import CompiledExecutor
 
@@ -186,8 +191,10 @@ class Reasoner:
         try:
             executor.prepare(self.task, [dict.fromkeys(self.space.addresses)])
         except (ValueError, ArithmeticError) as error:
-            _log.info("the mental testbed is simulated in Drake: %s", error)
             executor.close()
+            if self._search.executor != "auto":
+                raise
+            _log.info("the mental testbed is simulated in Drake: %s", error)
             return None
         _log.info("decisions are computed in the compiled testbed, which was compared with Drake's")
         return executor

@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vtbdrake.compiled import UnsupportedTestbedError
+from vtbdrake.rollout import RolloutTask, SerialExecutor
+from vtbdrake.rollout.compiled import CompiledExecutor
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.satellite.plant import plant_config
 from vtbdrake_diagrams.satellite.studies.arm_motion import BASE, DEVIATION, PLAN, ArmMotionScenario, deviation, limits
@@ -53,6 +56,24 @@ def test_mental_testbed_has_no_forces_and_the_same_addresses():
     assert deviation(testbed.read(context, BASE)) == pytest.approx(expected, abs=1e-5)
     joints = [testbed.read(context, f"sim.sys.servicer.joint_{k}.position") for k in range(1, 8)]
     np.testing.assert_allclose(joints, scenario.goal, atol=1e-12)
+
+
+def test_mental_testbed_is_compiled_to_the_same_outcomes():
+    scenario = ArmMotionScenario(thinking_time=0.2).mental()
+    task = RolloutTask(scenario, scenario.horizon, DEVIATION, measures=tuple(limits(scenario, PLAN)))
+    straight, bends = scenario.move().straight, bent(scenario) - scenario.move().straight
+    points = [{PLAN: scenario.plan(straight + share * bends)} for share in (0.0, 0.5, 1.0)]
+    with SerialExecutor() as serial, CompiledExecutor(compile=False) as compiled:
+        expected, results = ([result for _, result in executor.run(task, points)] for executor in (serial, compiled))
+    assert {result.computed for result in results} == {"compiled"}
+    np.testing.assert_allclose([r.h for r in results], [r.h for r in expected], rtol=1e-9)
+    np.testing.assert_allclose([r.measures for r in results], [r.measures for r in expected], rtol=1e-9, atol=1e-12)
+    assert np.ptp([result.h for result in results]) > 1e-4
+
+
+def test_fingers_that_can_touch_are_not_compiled():
+    with pytest.raises(UnsupportedTestbedError, match="finger_left and finger_right can collide"):
+        ArmMotionScenario(thinking_time=0.2).build().compiled(horizon=1.0, compile=False)
 
 
 @pytest.mark.one_python
