@@ -52,6 +52,15 @@ def test_clutch_adds_the_scaled_motion_of_the_hand_to_the_pose_of_the_tool() -> 
     assert pose(clutch.command(7.1)).IsNearlyEqualTo(expected, 1e-9)
 
 
+def test_new_clutch_and_new_lead_do_not_move_a_robot() -> None:
+    np.testing.assert_array_equal(Clutch(LIMITS).command(0.0), [0, 1, 0, 0, 0, 0, 0, 0])
+    rig = Rig()
+    rig.lead = Lead(LIMITS, lambda: TOOL)
+    assert not rig.lead.armed and not rig.lead.leading and not rig.closed
+    rig.take()
+    assert not rig.lead.leading and not rig.closed and rig.lead.notice == "not armed"
+
+
 def test_turns_are_scaled_about_their_own_axis() -> None:
     clutch = closed(replace(LIMITS, turn_scale=0.5, turn_rate=100.0))
     axis = np.array([2.0, -1.0, 2.0]) / 3
@@ -88,6 +97,14 @@ def test_tool_outside_the_box_is_led_inwards_only() -> None:
     assert pose(clutch.command(0.2)).translation()[0] == pytest.approx(1.3)
     clutch.follow(moved([-0.8, 0.0, 0.0]))
     assert pose(clutch.command(0.3)).translation()[0] == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("offset", [-1e6, 1e6])
+def test_delay_does_not_depend_on_which_clock_is_ahead(offset: float) -> None:
+    delay = Delay()
+    for k in range(200):
+        late = 0.25 if k % 3 else 0.0
+        assert delay.of(0.5 * k, offset + 0.5 * k + 0.03 + late) == pytest.approx(late, abs=1e-9)
 
 
 def test_delay_is_measured_against_the_quickest_message_and_forgets_a_drift() -> None:
@@ -136,6 +153,15 @@ def test_grip_that_is_taken_leads_until_it_is_let_go() -> None:
     assert not rig.closed
     rig.take(side="right")
     assert rig.closed and rig.lead.notice == "the right hand leads"
+
+
+def test_grip_leads_for_as_long_as_it_is_held() -> None:
+    rig = Rig()
+    rig.take()
+    for k in range(200):  # 4 s
+        assert rig.send(grip=True, at=(1e-4 * k, 0, 0)) == "" and rig.closed
+    assert rig.lead.headset == "A" and rig.lead.head is HAND
+    assert rig.lead.command(rig.now)[5] == pytest.approx(0.5 + 0.5 * 199e-4, abs=2e-4)
 
 
 def test_grip_that_is_held_when_the_robot_is_armed_does_not_lead() -> None:
@@ -232,6 +258,10 @@ def test_message_is_read() -> None:
     np.testing.assert_allclose(message.hands["left"].rotation().matrix(), np.diag([-1, -1, 1]), atol=1e-15)
     assert message.head is not None and message.head.translation()[2] == 1.6
     assert HandMessage.of({"time": 0, "left": None}).hands == {}
+    for norm in (0.91, 1.09):  # Rounded on the way
+        head = HandMessage.of({"time": 0, "head": [0.6 * norm, 0.8 * norm, 0, 0, 0, 0, 0]}).head
+        assert head is not None
+        np.testing.assert_allclose(head.rotation().ToQuaternion().wxyz(), [0.6, 0.8, 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +270,8 @@ def test_message_is_read() -> None:
         {"time": None},
         {"time": float("nan")},
         {"head": [1, 0, 0, 0, 0, 0]},
-        {"head": [2, 0, 0, 0, 0, 0, 0]},
+        {"head": [1.1, 0, 0, 0, 0, 0, 0]},
+        {"head": [0.9, 0, 0, 0, 0, 0, 0]},
         {"left": {"pose": [1, 0, 0, 0, 0, 0, float("inf")], "grip": True}},
         {"left": {"pose": [True, 0, 0, 0, 0, 0, 0], "grip": True}},
         {"left": {"pose": [1, 0, 0, 0, 0, 0, 0]}},

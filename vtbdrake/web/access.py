@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Collection
-from http.cookies import CookieError, SimpleCookie
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from starlette.requests import cookie_parser
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -71,7 +70,7 @@ class Access:
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return f"pages of {origin} may not use this server"
-        tokens = [*query.get("token", []), self._cookies(headers).get(self._cookie, "")]
+        tokens = [*query.get("token", []), cookie_parser(headers.get("cookie", "")).get(self._cookie, "")]
         if not self._is_token(tokens):
             return "the token is missing or wrong: open the address that the server has printed, with its token"
         return ""
@@ -79,11 +78,3 @@ class Access:
     def _is_token(self, texts: Collection[str]) -> bool:
         """Return whether one of some texts is the token."""
         return any(secrets.compare_digest(text.encode(), self.token.encode()) for text in texts)
-
-    @staticmethod
-    def _cookies(headers: dict[str, str]) -> dict[str, Any]:
-        try:
-            cookies = SimpleCookie(headers.get("cookie", ""))
-        except CookieError:
-            return {}
-        return {name: morsel.value for name, morsel in cookies.items()}
