@@ -128,7 +128,16 @@ def test_address_that_begins_with_the_token_needs_no_cookie() -> None:
     for path in (f"/{token}/", f"/{token}/page/view.js"):
         assert not server.ask(path, host="hub.example", origin="https://hub.example")
         assert server.passed[0]["root_path"] == f"/{token}" and server.passed[0]["path"] == path
-    for path in (f"/{token}", f"/page/{token}/", f"//{token}/", f"/{token[:-1]}/", f"/{token}x/", "/é/", token):
+    for path in (
+        f"/{token}",
+        f"/page/{token}",
+        f"/page/{token}/",
+        f"//{token}/",
+        f"/{token[:-1]}/",
+        f"/{token}x/",
+        "/é/",
+        token,
+    ):
         check_refusal(server.ask(path), "the token is missing or wrong")
 
 

@@ -294,8 +294,68 @@ def test_command_of_a_hand_releases_a_robot_by_itself() -> None:
     with pytest.raises(SignalError, match="finite max_age"):
         LIMITS.check_interface(interface(max_age=float("inf")))
     with pytest.raises(SignalError, match="finite max_age"):
-        LIMITS.check_interface(interface(default=1.0))
+        LIMITS.check_interface(interface(default=[1.0, *[0.0] * 7]))
+    LIMITS.check_interface(interface(default=[0.0, *[1.0] * 7]))
     with pytest.raises(SignalError, match="no command hand"):
         LIMITS.check_interface(Interface(sense=[], act=[]))
-    with pytest.raises(SignalError, match="a workspace box"):
-        replace(LIMITS, upper=(0.0, 1.0, 1.0))
+
+
+def test_commands_of_head_and_buttons_are_checked_too() -> None:
+    def check(**signals: int) -> None:
+        commands = [Signal("hand", size=8, max_age=0.1), *(Signal(name, size=size) for name, size in signals.items())]
+        limits.check_interface(Interface(sense=[], act=[], commands=commands))
+
+    limits = replace(LIMITS, head="gaze", buttons="trigger", begin={"mode": 1.0})
+    check(gaze=7, trigger=1, mode=1)
+    check(gaze=7, trigger=5, mode=1)
+    with pytest.raises(SignalError, match="7 entries; gaze has 8"):
+        check(gaze=8, trigger=1, mode=1)
+    for name in ("gaze", "trigger", "mode"):
+        with pytest.raises(SignalError, match=f"no command {name}: a hand gives one of hand, "):
+            check(**{other: 7 if other == "gaze" else 1 for other in ("gaze", "trigger", "mode") if other != name})
+
+
+def test_hand_leads_a_robot_slowly_and_one_to_one_by_default() -> None:
+    command = HandCommand(command="hand", pose="", lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0))
+    assert command.speed == 0.25  # m/s, the reduced speed of ISO 10218-1
+    assert command.scale == command.turn_scale == command.turn_rate == 1.0
+    assert command.release_time == 0.1 and command.stand == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "greatest", "is_positive"),
+    [
+        ("scale", 10.0, True),
+        ("turn_scale", 3.0, False),
+        ("release_time", 10.0, True),
+        ("speed", 1e3, True),
+        ("turn_rate", 1e3, True),
+    ],
+)
+def test_limits_of_a_hand_are_positive_and_bounded(name: str, greatest: float, is_positive: bool) -> None:
+    assert getattr(replace(LIMITS, **{name: greatest}), name) == greatest  # type: ignore[arg-type]
+    wrong = [
+        float("nan"),
+        float("inf"),
+        -1e-3,
+        *([0.0] if is_positive else []),
+        *([1.01 * greatest] * (greatest < 1e3)),
+    ]
+    for value in wrong:
+        with pytest.raises(SignalError, match=name):
+            replace(LIMITS, **{name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("upper", "error"),
+    [
+        ((1.0, -1.0, 1.0), "is not below"),
+        ((0.0, 1.0, 1.0), "is not below"),
+        ((1.0, 1.0), "a list of 3 entries"),
+        ((1.0, 1.0, float("nan")), "a finite number"),
+        ((1.0, 1.0, float("inf")), "a finite number"),
+    ],
+)
+def test_box_without_an_inside_is_refused(upper: tuple[float, ...], error: str) -> None:
+    with pytest.raises(SignalError, match=error):
+        replace(LIMITS, upper=upper)  # type: ignore[arg-type]

@@ -54,11 +54,9 @@ class HandCommand:
 
     def __post_init__(self) -> None:
         check_settings(self, error=SignalError)
-        box = np.array([self.lower, self.upper], dtype=float)
-        if box.shape != (2, 3) or not np.all(box[0] < box[1]):
+        if not np.all(np.less(self.lower, self.upper)):
             raise SignalError(
-                f"a workspace box has a lower and an upper corner of three numbers each, in m, not {self.lower} and "
-                f"{self.upper}"
+                f"the lower corner of a workspace box, {self.lower}, is not below its upper, {self.upper}"
             )
 
     def check_interface(self, interface: Interface) -> None:
