@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.signal
+import scipy.stats
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, TRUTH, VISCOUS, calibrated
@@ -14,6 +15,7 @@ from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.calibration.filtering import Segments
 from vtbdrake.calibration.fisher import information_of
 from vtbdrake.optimization import Parameter
+from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 
 pytestmark = pytest.mark.one_python
 
@@ -96,6 +98,47 @@ def test_slopes_of_the_likelihood_are_those_of_finite_differences() -> None:
             (unlikelihood(logs + step)[0] - unlikelihood(logs - step)[0]) / 2e-4 for step in 1e-4 * np.eye(3)
         ]
         np.testing.assert_allclose(unlikelihood(logs)[1], differences, rtol=1e-5, atol=1e-3)
+
+
+def test_likelihood_of_two_joints_is_that_of_the_normal_distribution_of_all_positions() -> None:
+    generator, h = np.random.default_rng(3), 0.01
+    times = h * np.arange(101)
+    q = np.outer(np.sin(3.0 * times), [0.3, -0.4]) + 1e-3 * generator.normal(size=(101, 2))
+    model = JointModel(DoublePendulumScenario().build())
+    segments = Segments(model, [JointRecording("made", times, q, generator.normal(size=(101, 2)))], duration=0.5)
+    assert segments.count == 2
+    linearized, N = segments.linearized(np.empty(0)), segments.steps
+
+    def normal(logs: np.ndarray) -> float:
+        """-2 log of the density of all positions of the segments at once, but for 2 pi: there is no filter."""
+        measurement, torque, correlation = np.exp(logs[:2]), np.exp(logs[2:4]), np.exp(logs[4])
+        decay, total = np.exp(-h / correlation), 0.0
+        start = np.concatenate([measurement, measurement / h, torque])
+        driving = np.concatenate([np.zeros(4), np.sqrt(1.0 - decay**2) * torque])
+        for w in range(segments.count):
+            # The state (q, v, disturbance) beside the trajectory, as a mean and by all independent normal numbers.
+            mean, by_noise = np.zeros(6), np.zeros((6, 6 * (N + 1)))
+            by_noise[:, :6] = np.diag(start)
+            means, rows = [], []
+            for k in range(N):
+                F = np.block([[linearized.A[k, w], linearized.B[k, w]], [np.zeros((2, 4)), decay * np.eye(2)]])
+                mean, by_noise = F @ mean, F @ by_noise
+                mean[:4] += linearized.defects[k, w]
+                by_noise[:, 6 * (k + 1) : 6 * (k + 2)] += np.diag(driving)
+                means.append(segments.trajectory[k + 1, w, :2] + mean[:2])
+                rows.append(by_noise[:2])
+            S = np.concatenate(rows)
+            covariance = S @ S.T + np.diag(np.tile(measurement**2, N))
+            measured = q[w * N + 1 : (w + 1) * N + 1].ravel()
+            density = scipy.stats.multivariate_normal(np.concatenate(means), covariance)
+            total -= 2.0 * density.logpdf(measured)
+        return total - segments.count * 2 * N * np.log(2.0 * np.pi)
+
+    logs = np.log([1e-3, 2e-3, 0.5, 0.2, 0.05])
+    value, slope = segments.unlikelihood(Noise(np.exp(logs[:2]), np.exp(logs[2:4]), 0.05), linearized)
+    assert value == pytest.approx(normal(logs), rel=1e-9)
+    differences = [(normal(logs + step) - normal(logs - step)) / 2e-4 for step in 1e-4 * np.eye(5)]
+    np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-3)
 
 
 def test_what_a_recording_will_tell_is_known_beforehand() -> None:
