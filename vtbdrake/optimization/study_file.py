@@ -482,8 +482,8 @@ class StudyFile:
             self._insert("drives", [(number, drive.time.isoformat(), name, *texts)])
         return drive
 
-    def drives(self) -> list[DrivenTrial]:
-        """Return the rollouts that were driven, in their order."""
+    def drives(self, *, after: int = 0) -> list[DrivenTrial]:
+        """Return the rollouts that were driven, in their order, behind one of a number."""
         return [
             DrivenTrial(
                 row["number"],
@@ -493,7 +493,7 @@ class StudyFile:
                 _outcome_of(json.loads(row["outcome"])),
                 Course.from_dict(json.loads(row["course"])),
             )
-            for row in self._rows("drives", "ORDER BY number")
+            for row in self._rows("drives", "WHERE number > ? ORDER BY number", (after,))
         ]
 
     # -- interventions

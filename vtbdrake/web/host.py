@@ -93,6 +93,7 @@ class Host:
         config = uvicorn.Config(
             access, log_level="warning", lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=1
         )
+        config.ws_per_message_deflate = tls is not None  # On the loopback interface it only takes time.
         with ExitStack() as stack:
             if tls:
                 try:
