@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from vtbdrake.optimization import Parameter, Problem
+from vtbdrake.optimization.records import DrivenTrial
 from vtbdrake.rollout import Constraint, Quality
 from vtbdrake.rollout.named_function import magnitude
+from vtbdrake.web.session import Session
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 ROOT = Path(__file__).resolve().parents[2]
 ANGLE = "sim.sys.cart_pole.pole_pin.position"
 RATE = "sim.sys.cart_pole.pole_pin.velocity"
 PLACE = "sim.sys.cart_pole.cart_slider.position"
+FORCE = "T_act.force.idle"
 HORIZON = 1.0
 
 
@@ -29,6 +32,18 @@ def cart_pole_problem(**more: Any) -> Problem:
         "horizon": HORIZON,
     }
     return Problem(**{**settings, **more})
+
+
+def drive_cart(path: Path) -> DrivenTrial:
+    """Push the cart by hand for a quarter of a second, and store that in the study."""
+    problem = cart_pole_problem()
+    with Session(problem.scenario, problem=problem) as session:
+        session.write({ANGLE: 1.5, RATE: 0.5})
+        session.drive([FORCE])
+        session.deflect({FORCE: 1.0})
+        session.advance(32)
+        session.end_drive()
+        return session.store_trial(path, by="Ada")
 
 
 def run_elsewhere(path: Path, *, rollouts: int) -> subprocess.Popen[bytes]:

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.chromium import PATIENCE, needs_chromium, screenshot
-from tests.web.studies import ANGLE, PLACE, RATE, cart_pole_problem, run_elsewhere
+from tests.web.studies import ANGLE, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from tests.web.test_page import GREEN, drawn, share
 from vtbdrake.optimization import Parameter, Study
 from vtbdrake.rollout import Quality
@@ -51,11 +51,21 @@ def place_of(page: Page, chart: str, trial: int) -> tuple[float, float]:
     return box["x"] + x, box["y"] + y
 
 
+def place_of_drive(page: Page, chart: str, number: int) -> tuple[float, float]:
+    """Where the mark of a driven trial lies on the screen."""
+    mark = f"vtb.{chart}.data.marks.find(({{ index }}) => index === {-1 - number}).at"
+    x, y = page.evaluate(f"[vtb.{chart}.x({mark}[0]), vtb.{chart}.y({mark}[1])]")
+    box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
+    assert box is not None
+    return box["x"] + x, box["y"] + y
+
+
 def test_landscape_can_be_entered(browser: Browser, tmp_path: Path) -> None:
     problem = cart_pole_problem()
     with problem.study(tmp_path / "a.db", solver="sobol", seed=2) as study:
         study.run(rollouts=16, executor="serial", progress=False)
         best, trials = study.best, study.trials
+    drive = drive_cart(tmp_path / "a.db")
     far = max(range(16), key=lambda k: abs(trials[k].point[0] - best.point[0]))
     with view_study(tmp_path / "a.db") as view, page_of(browser, view) as page:
         assert page.title() == "a.db: study"
@@ -78,6 +88,14 @@ def test_landscape_can_be_entered(browser: Browser, tmp_path: Path) -> None:
         assert np.mean(np.abs(later - pointed).max(axis=2) > 30) > 0.005
         page.mouse.move(5, 5)
         page.wait_for_selector("#vtb-key-pointed", state="hidden")
+        # What was driven by hand has marks of its own, which show it.
+        for chart in ("landscape", "history"):
+            page.mouse.move(*place_of_drive(page, chart, drive.number))
+            drawn(page, f"document.body.dataset.pointed === '{-1 - drive.number}'")
+            assert f"driven by Ada: magnitude = {drive.outcome.value:.5g}" in page.inner_text("#vtb-pointed")
+            assert share(scene(page), PURPLE) > 0.005
+            page.mouse.move(5, 5)
+            page.wait_for_selector("#vtb-key-pointed", state="hidden")
         # A click tries a point.
         page.click("#vtb-tab-try")
         page.check("#vtb-try-click")

@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from websockets.sync.client import ClientConnection
 
 from tests.folders import open_folder, that_cannot_be_written
 from tests.optimization.studies import pendulum_problem
-from tests.web.studies import ANGLE, HORIZON, RATE, cart_pole_problem, run_elsewhere
+from tests.web.studies import ANGLE, HORIZON, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from tests.web.test_server import PATIENCE, ask, base, cookie, page
 from vtbdrake.optimization import Choice, Parameter, Study, StudyError
 from vtbdrake.rollout import Quality
@@ -302,6 +303,35 @@ def test_file_that_is_no_study_is_refused(tmp_path: Path, finished: Path) -> Non
     ):
         with pytest.raises(StudyError, match=message):
             view_study(path)
+
+
+def test_driven_trial_is_shown_by_its_course(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    with cart_pole_problem().study(path, solver="sobol", seed=2) as study:
+        study.run(rollouts=4, executor="serial", progress=False)
+    with view_study(path) as view, page(view) as socket:
+        reader = Reader(socket).until("ended", 4)
+        assert reader.status["driven"]["numbers"] == []
+        drive = drive_cart(path)  # While the page is open.
+        while not reader.status["driven"]["numbers"]:
+            reader.read()
+        driven = {key: column[0] for key, column in reader.status["driven"].items()}
+        violation = drive.outcome.measures[0]
+        assert driven == {
+            "numbers": 1, "names": "Ada", "points": [1.5, 0.5], "values": [drive.outcome.value], "after": 4,
+            "kinds": "feasible" if violation <= 0.0 else "broken", "messages": "ended by hand",
+        }  # fmt: skip
+        assert len(reader.trials) == 4
+        shown = reader.ask("show", role="pointed", driven=1)
+        assert (shown["t_star"], shown["duration"], shown["message"]) == (drive.outcome.t_star, 0.25, "ended by hand")
+        with pytest.raises(StudyError, match="no driven trial 7"):
+            reader.ask("show", role="pointed", driven=7)
+        with Study.open(path) as study:
+            result = replace(drive.course.rollout(cart_pole_problem().task), value=0.25)
+            study.add_driven(drive.course, result, parameters=drive.parameters)
+        while len(reader.status["driven"]["numbers"]) < 2:
+            reader.read()
+        assert "the code has changed since" in reader.ask("show", role="pointed", driven=2)["message"]
 
 
 def test_point_is_refused_after_the_end() -> None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
-from math import isnan
+from math import isnan, nan
 from typing import Any
 
 from vtbdrake.failures import safe_text
@@ -135,3 +135,14 @@ class DrivenTrial:
     parameters: Mapping[str, Any]
     outcome: Outcome
     course: Course
+
+    def values(self, qualities: int) -> tuple[float, ...]:
+        """Return the values of the study's qualities, of which there are so many, in the user's terms."""
+        values = (self.outcome.value, *self.outcome.measures)[:qualities]
+        return values if len(values) == qualities else (nan,) * qualities
+
+    def kind(self, qualities: int) -> str:
+        """Return how it came out, as `Trial.kind` does: `FEASIBLE`, `BROKEN` or `FAILED`."""
+        if any(isnan(value) for value in self.values(qualities)):
+            return FAILED
+        return FEASIBLE if all(v <= 0.0 for v in self.outcome.measures[qualities - 1 :]) else BROKEN

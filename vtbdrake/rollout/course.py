@@ -123,6 +123,7 @@ class DrivenRollout:
             sample_period=task.sample_period,
             start=start,
             measures=task.measures,
+            record=task.record,
             catch=True,
         )
         self._runner = RolloutRunner(task, testbed)

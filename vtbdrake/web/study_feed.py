@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -15,7 +16,8 @@ from typing import Any
 
 from vtbdrake.failures import one_line
 from vtbdrake.optimization import Choice, Study, StudyError, Trial
-from vtbdrake.optimization.records import Intervention
+from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.records import DrivenTrial, Intervention
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.steering import StudySearch
 from vtbdrake.optimization.study_file import Mark, StudyFile
@@ -27,6 +29,7 @@ _SIGN_OF_LIFE = 1.0  # s between two looks at whether a process runs the study
 _RATE_OVER = 60  # rollouts over which their rate is measured
 _FAILURES = 40  # different reasons that are listed
 _TEXT = 300  # letters of a reason
+_DRIVEN = 200  # driven rollouts that are shown, the last ones
 _REVISIONS = 1000  # that are remembered, for pages that lag behind
 
 
@@ -65,6 +68,7 @@ class StudyFeed:
 
     Attributes:
         trials: The trials in the order in which they were recorded.
+        driven: The rollouts that somebody has driven, in their order.
         status: Where the study stands.
         revision: Counts the changes.
     """
@@ -75,13 +79,16 @@ class StudyFeed:
         # The options of choices stay, other ranges may be widened.
         self._parameters = self._study.parameters
         self.trials: list[Trial] = []
+        self.driven: list[DrivenTrial] = []
+        problem = self._study.record["problem"]
+        self._conditions, self._qualities = len(problem["conditions"]), len(problem["qualities"])
         self.revision = 0
         self._trial_mark, self._outcome_mark = Mark(), Mark()
         self._failure_of: dict[Point, str] = {}
         self._first_trial: dict[str, int] = {}
         self._failures: Counter[str] = Counter()
         self._ends: Counter[str] = Counter()
-        self._finished: deque[datetime] = deque(maxlen=_RATE_OVER)
+        self._finished: list[datetime] = []
         # Since each revision, so many trials have stayed as they were.
         self._stayed: dict[int, int] = {}
         self._oldest = 0  # revision; what was before it is forgotten
@@ -122,11 +129,31 @@ class StudyFeed:
             now = self.revision
         return {"type": "trials", "first": stay, "revision": now, **self._as_columns(new)}
 
+    def driven_columns(self) -> dict[str, list[Any]]:
+        """Return the driven rollouts as columns, of the last ones that are shown.
+
+        Attributes of the answer: ``numbers`` and ``names``; ``points``, one list per rollout, with None for a value
+        that is no option of a choice; ``values``, one list per rollout; ``kinds``, as those of trials; ``messages``;
+        and ``after``, how many points the study had at that time.
+        """
+        with self._changed:
+            driven, finished = self.driven[-_DRIVEN:], self._finished
+            after = [bisect_right(finished, drive.time) // self._conditions for drive in driven]
+        return {
+            "numbers": [drive.number for drive in driven],
+            "names": [drive.name for drive in driven],
+            "points": [[_place(p, drive.parameters[p.address]) for p in self._parameters] for drive in driven],
+            "values": [[_finite(value) for value in drive.values(self._qualities)] for drive in driven],
+            "kinds": [drive.kind(self._qualities) for drive in driven],
+            "messages": [drive.outcome.message[:_TEXT] for drive in driven],
+            "after": after,
+        }
+
     def _as_columns(self, trials: Sequence[Trial]) -> dict[str, Any]:
         columns: list[list[Any]] = [[trial.parameters[p.address] for trial in trials] for p in self._parameters]
         for k, parameter in enumerate(self._parameters):
             if isinstance(parameter, Choice):
-                columns[k] = [parameter.options.index(parameter.as_value(value)) for value in columns[k]]
+                columns[k] = [_place(parameter, value) for value in columns[k]]
         count = len(trials[0].values) if trials else 0
         failures = {k: self._failure_of.get(t.point, "")[:_TEXT] for k, t in enumerate(trials) if t.kind == FAILED}
         return {
@@ -175,8 +202,11 @@ class StudyFeed:
         self._search, self._interventions = self._study.search, self._study.interventions
         earlier, outcomes, outcome_mark = self._file.outcomes_since(self._outcome_mark)
         stay, trials, trial_mark = self._file.trials_since(self._trial_mark)
+        driven = self._file.drives(after=self.driven[-1].number if self.driven else 0)
         with self._changed:
+            self.driven += driven
             if earlier == 0:
+                self._finished.clear()
                 self._ends.clear()
                 self._failures.clear()
                 self._failure_of.clear()
@@ -229,10 +259,9 @@ class StudyFeed:
         )
 
     def _rate(self) -> float | None:
-        if len(self._finished) < 2:
-            return None
-        since = (self._finished[-1] - self._finished[0]).total_seconds()
-        return (len(self._finished) - 1) / since if since > 0.0 else None
+        last = self._finished[-_RATE_OVER:]
+        since = (last[-1] - last[0]).total_seconds() if last else 0.0
+        return (len(last) - 1) / since if since > 0.0 else None
 
 
 def _equal(before: Sequence[Trial], after: Sequence[Trial]) -> int:
@@ -249,6 +278,14 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return stat.st_dev, stat.st_ino
+
+
+def _place(parameter: Dimension, value: Any) -> Any:
+    """Return the value of a parameter, of a choice the number of the option; None if there is no such option."""
+    if not isinstance(parameter, Choice):
+        return value
+    option = parameter.as_value(value)
+    return parameter.options.index(option) if option in parameter.options else None
 
 
 def _finite(value: float) -> float | None:

@@ -16,12 +16,15 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.failures import one_line
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization import Choice, Problem, Study, StudyError
 from vtbdrake.optimization.identity import code_changes, describe
 from vtbdrake.optimization.parameter import Dimension
+from vtbdrake.optimization.records import DrivenTrial, Outcome
 from vtbdrake.optimization.solvers import known_solvers
 from vtbdrake.optimization.statement import StatementError, check_statement, restated
 from vtbdrake.optimization.study_file import StudyFile
@@ -261,14 +264,19 @@ class _StudyPage:
             "solver": search.solver,
             "aspiration": search.aspiration,
             "paused": search.paused,
+            "driven": view.feed.driven_columns(),
             "interventions": [{**i.to_dict(), "text": i.text} for i in status.interventions[-_LISTED:]],
         }
 
     # -- commands
 
-    def _show(self, *, role: str, trial: int | None = None, point: Any = None, condition: int = 0) -> dict[str, Any]:
-        """Show the rollout of a trial, or of a point, in a role."""
+    def _show(
+        self, *, role: str, trial: int | None = None, driven: int | None = None, point: Any = None, condition: int = 0
+    ) -> dict[str, Any]:
+        """Show the rollout of a trial, of a driven one, or of a point, in a role."""
         simulator = self._simulator()
+        if driven is not None:
+            return self._shown_again(str(role), self._driven(driven))
         place = self._trial(trial).point if trial is not None else simulator.problem.point(self._point(point))
         rollout = simulator.rollout(place, condition=as_whole("the number of a condition", condition))
         return self._shown(str(role), rollout)
@@ -287,6 +295,15 @@ class _StudyPage:
             "message": result.message or message,
             "seconds": _finite(result.wall_time),
         }
+
+    def _shown_again(self, role: str, trial: DrivenTrial) -> dict[str, Any]:
+        rollout = self._simulator().drive(trial)
+        shown, now = self._shown(role, rollout), Outcome.of(rollout.result)
+        if not np.array_equal(_numbers(now), _numbers(trial.outcome), equal_nan=True):
+            shown["message"] = (
+                f"computed again, the course has another value, {now.value:.5g}: the code has changed since"
+            )
+        return shown
 
     def _try(self, *, point: Any, condition: int = 0) -> dict[str, Any]:
         simulator = self._simulator()
@@ -331,6 +348,12 @@ class _StudyPage:
             raise StudyError(f"the study has {len(trials)} trials, counted from 0, and no trial {number}")
         return trials[number]
 
+    def _driven(self, number: int) -> DrivenTrial:
+        matches = [trial for trial in self._view.feed.driven if trial.number == number]
+        if not matches:
+            raise StudyError(f"the study has no driven trial {number}")
+        return matches[0]
+
     def _point(self, point: Any) -> list[Any]:
         """Return a point of a page, which has the numbers of options instead of options."""
         pairs = zip(self._study.parameters, point, strict=True)
@@ -343,6 +366,10 @@ class _StudyPage:
 
 def _finite(value: float) -> float | None:
     return value if isfinite(value) else None
+
+
+def _numbers(outcome: Outcome) -> list[float]:
+    return [outcome.h, outcome.value, outcome.t_star, *outcome.measures]
 
 
 def _described(parameters: Sequence[Dimension], units: Sequence[str]) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from vtbdrake.optimization import Problem
 from vtbdrake.optimization.evaluator import Evaluator
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.problem import recording_motion
-from vtbdrake.optimization.records import RolloutKey
+from vtbdrake.optimization.records import DrivenTrial, RolloutKey
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout import RolloutResult, RolloutTask
 from vtbdrake.rollout.worker_processes import ProcessExecutor
@@ -33,10 +33,10 @@ class PointError(ValueError):
 
 @dataclass(frozen=True)
 class PointRollout:
-    """A rollout of a point under one condition, with the states of its plant.
+    """A rollout of a point under one condition, or a driven one, with the states of its plant.
 
     Attributes:
-        point, condition: The point and the number of the condition.
+        point, condition: The point and the number of the condition; of a driven rollout, where it began, and 0.
         scenario: The scenario, with the fields that the point sets.
         result: The rollout; ``record`` has ``plant.state``, if the testbed has a plant.
     """
@@ -74,6 +74,7 @@ class PointSimulator:
         self._executor = ProcessExecutor(1)
         self._executor.start_workers(1)
         self._rollouts: LruDict[RolloutKey, PointRollout] = LruDict(_KEPT)
+        self._drives: LruDict[int, PointRollout] = LruDict(_KEPT)
         # The newest of each kind that waits; what is tried comes first.
         self._waiting: dict[str, tuple[Callable[[], object], Future[object]]] = {}
         self._changed = threading.Condition()
@@ -111,6 +112,17 @@ class PointSimulator:
             if (rollout := self._rollouts.use((point, condition))) is not None:
                 return rollout
         return self._result(_POINTED, lambda: self._simulate(point, condition), PointRollout)
+
+    def drive(self, trial: DrivenTrial) -> PointRollout:
+        """Return the rollout of a driven trial, whose course is computed again if it is not kept.
+
+        Raises:
+            PointError: The pointer has moved on, or the course cannot be computed: its scenario has changed.
+        """
+        with self._changed:
+            if (rollout := self._drives.use(trial.number)) is not None:
+                return rollout
+        return self._result(_POINTED, lambda: self._repeat(trial), PointRollout)
 
     def attempt(self, point: Point) -> Tried:
         """Evaluate a point under all conditions.
@@ -162,6 +174,13 @@ class PointSimulator:
         rollout = PointRollout(point, condition, scenario, result)
         with self._changed:
             self._rollouts.add((point, condition), rollout)
+        return rollout
+
+    def _repeat(self, trial: DrivenTrial) -> PointRollout:
+        result = trial.course.rollout(self._task, testbed=self.problem.testbed)
+        rollout = PointRollout(tuple(trial.parameters.values()), 0, self.problem.scenario, result)
+        with self._changed:
+            self._drives.add(trial.number, rollout)
         return rollout
 
     def _evaluate(self, point: Point) -> Tried:

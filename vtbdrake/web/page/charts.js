@@ -84,7 +84,7 @@ class Chart {
       return;
     }
     const index = this.near(...this.#place(event));
-    this.canvas.style.cursor = index >= 0 ? "pointer" : "crosshair";
+    this.canvas.style.cursor = index !== -1 ? "pointer" : "crosshair";
     this.onpoint?.(index);
   }
 
@@ -141,7 +141,8 @@ class Chart {
   }
 }
 
-// Points over two axes. `data` is {x, y: arrays of values, color: index -> colour, kind: array, best, line: [[x, y], ...]}.
+// Points over two axes. `data` is {x, y: arrays of values, color: index -> colour, kind: array, best, line: [[x, y], ...]},
+// with marks [{at: [x, y], tint, shape, index}]: those with an index, which is below -1, can be pointed at as points are.
 export class Scatter extends Chart {
   show(data, xScale, yScale) {
     Object.assign(this, { data, xScale, yScale, stale: true });
@@ -169,6 +170,10 @@ export class Scatter extends Chart {
     for (let k = 0; k < this.data.x.length; k++) {
       const distance = Math.hypot(this.x(this.data.x[k]) - px, this.y(this.#height(k)) - py);
       if (distance < least) [nearest, least] = [k, distance];
+    }
+    for (const { at, index } of this.data.marks ?? []) {
+      const distance = Math.hypot(this.x(at[0]) - px, this.y(at[1]) - py);
+      if (index && distance < least) [nearest, least] = [index, distance];
     }
     return nearest;
   }
@@ -204,7 +209,9 @@ export class Scatter extends Chart {
   }
 
   overlay(pen) {
-    const { x } = this.data, k = this.pointed;
+    const { x, marks = [] } = this.data, k = this.pointed;
+    const at = marks.find(({ index }) => index && index === k)?.at;
+    if (at) ring(pen, this.x(at[0]), this.y(at[1]), 10, "#cc3399");
     if (k >= 0 && k < x.length) ring(pen, this.x(x[k]), this.y(this.#height(k)), 7, "#cc3399");
     const shape = this.pressed && this.dragged && this.drags();
     if (shape === "box") this.#box(pen, ...this.pressed, ...this.dragged);
@@ -399,6 +406,12 @@ function mark(pen, x, y, tint, shape) {
     pen.lineTo(x + 9, y);
     pen.moveTo(x, y - 9);
     pen.lineTo(x, y + 9);
+  } else if (shape === "diamond") {
+    pen.moveTo(x, y - 7);
+    for (const [dx, dy] of [[6, 0], [0, 7], [-6, 0]]) pen.lineTo(x + dx, y + dy);
+    pen.closePath();
+    pen.fillStyle = "rgba(255,255,255,0.8)";
+    pen.fill();
   } else if (shape === "target") {
     pen.arc(x, y, 8, 0, 2 * Math.PI);
     pen.moveTo(x + 3, y);

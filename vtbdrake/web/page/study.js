@@ -9,6 +9,7 @@ const POINT_PERIOD = 60; // ms between two points that the pointer asks for
 const TIME_PERIOD = 50; // ms between two instants of the animation
 const MODEL_GROWTH = 1.2; // by how much the trials grow before the model is asked for again
 const SHARE = 0.003; // of a core, what a page takes by itself while the study runs, for the model and for new bests
+const DRIVEN = "#e69f00"; // marks of rollouts that were driven by hand
 const TABS = ["best", "try", "search", "changes", "failures"];
 
 const duration = (s) => (s < 90 ? `${Math.round(s)} s` : s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`);
@@ -66,7 +67,8 @@ class Page {
     this.time = 0;
     this.duration = 0;
     this.pointed = this.best = -1;
-    Object.assign(this, { front: [], bestLine: [], modelThrift: new Thrift(), bestThrift: new Thrift() });
+    this.driven = []; // [{number, name, point, values, kind, message, after}]
+    Object.assign(this, { front: [], ranking: [], bestLine: [], shadeOf: {}, modelThrift: new Thrift(), bestThrift: new Thrift() });
     this.connection = new Connection({
       hello: (message) => this.#hello(message),
       trials: (message) => this.#take(message),
@@ -273,18 +275,27 @@ class Page {
     this.#showBest(this.best);
   }
 
+  // What may be the best: the feasible trials that are not forbidden now.
+  #candidates() {
+    const feasible = [];
+    this.trials.kinds.forEach((kind, k) => kind === "feasible" && feasible.push(k));
+    return this.status?.forbidden.length ? feasible.filter((k) => !this.steering.excludes(this.trials.point(k))) : feasible;
+  }
+
   #findBest() {
-    const { kinds, values } = this.trials;
+    const { kinds, values } = this.trials, candidates = this.#candidates();
     this.best = -1;
     this.bestLine = [];
+    this.shadeOf = {};
     if (this.qualities.length > 1) {
-      this.front = paretoFront(kinds, values, this.sign);
+      this.ranking = this.front = paretoFront(candidates, values, this.sign);
       this.best = this.front.length ? this.front[0] : -1;
       return;
     }
-    kinds.forEach((kind, k) => {
+    this.ranking = candidates.toSorted((a, b) => this.sign[0] * (values[0][b] - values[0][a])).slice(0, LISTED);
+    candidates.forEach((k) => {
       const value = values[0][k];
-      if (kind !== "feasible" || this.steering?.excludes(this.trials.point(k)) || (this.best >= 0 && this.sign[0] * value <= this.sign[0] * values[0][this.best])) return;
+      if (this.best >= 0 && this.sign[0] * value <= this.sign[0] * values[0][this.best]) return;
       if (this.best >= 0) this.bestLine.push([k, values[0][this.best]]);
       this.bestLine.push([k, value]);
       this.best = k;
@@ -295,6 +306,7 @@ class Page {
   #showStatus(status) {
     const ended = this.#running && status.state !== "running";
     this.status = status;
+    this.#takeDriven(status.driven);
     const { state, reason, message, rollouts, budget, left, rate, solver, paused, interventions } = status;
     const method = this.trials.methods.at(-1);
     const waiting = interventions.filter(({ kind, batch }) => kind === "try" && batch === null).length;
@@ -324,6 +336,20 @@ class Page {
     document.body.dataset.rollouts = rollouts;
   }
 
+  #takeDriven({ numbers, names, points, values, kinds, messages, after }) {
+    const isSame = this.driven.length === numbers.length && this.driven.at(-1)?.number === numbers.at(-1);
+    this.driven = numbers.map((number, k) => ({ number, name: names[k], point: points[k], values: values[k], kind: kinds[k], message: messages[k], after: after[k] }));
+    if (isSame) return;
+    document.body.dataset.driven = numbers.length;
+    this.#draw();
+  }
+
+  // Marks of the rollouts that were driven by hand, each where `place` says; its index is -1 - number.
+  #drivenMarks(place) {
+    const marks = this.driven.map((drive) => ({ at: place(drive), tint: drive.kind === "feasible" ? DRIVEN : "#b2182b", shape: "diamond", index: -1 - drive.number }));
+    return marks.filter(({ at }) => at.every((value) => value !== null));
+  }
+
   #showDeath(state) {
     if (state !== "died") return this.takeBack("died");
     if (this.messages.querySelector('[data-kind="died"]')) return;
@@ -351,10 +377,9 @@ class Page {
   }
 
   #showTable() {
-    const { kinds, values } = this.trials;
-    const order = this.qualities.length > 1 ? this.front : ranked(kinds, values[0] ?? [], this.sign[0]).slice(0, LISTED);
+    const { values } = this.trials;
     const head = element("tr", {}, element("th", {}, "trial"), ...this.qualities.map(({ name }) => element("th", {}, name)), ...this.parameters.map(({ address }) => element("th", { title: address }, short(address))));
-    const rows = order.slice(0, LISTED).map((k) =>
+    const rows = this.ranking.slice(0, LISTED).map((k) =>
       element(
         "tr",
         { onclick: () => this.#pin(k), onmouseenter: () => this.point(k), className: k === this.shownBest ? "chosen" : "" },
@@ -379,7 +404,7 @@ class Page {
   }
 
   valueScale(quality, label) {
-    const finite = this.trials.values[quality]?.filter((value) => value !== null) ?? [];
+    const finite = [...(this.trials.values[quality] ?? []), ...this.driven.map(({ values }) => values[quality])].filter((value) => value !== null);
     const [least, most] = extent(finite);
     const margin = 0.06 * (most - least);
     return new Scale({ label: label ?? this.qualities[quality].name, lower: least - margin, upper: most + margin });
@@ -410,7 +435,7 @@ class Page {
     if (!this.hello) return;
     const quality = this.qualities.length > 1 ? Number(this.quality.value) : 0;
     const { kinds: kind, values, points } = this.trials;
-    const shade = this.shades(quality);
+    const shade = (this.shadeOf[quality] ??= this.shades(quality));
     const common = { kind, best: this.best, color: (k) => color(shade(values[quality][k])) };
     if (this.view === "landscape") this.#drawLandscape(quality, shade, common);
     if (this.view === "parallel") {
@@ -426,7 +451,13 @@ class Page {
     }
     const many = this.trials.count;
     this.history.show(
-      { ...common, x: kind.map((_, k) => k), y: values[quality] ?? [], line: quality === 0 ? this.bestLine : [] },
+      {
+        ...common,
+        x: kind.map((_, k) => k),
+        y: values[quality] ?? [],
+        line: quality === 0 ? this.bestLine : [],
+        marks: this.#drivenMarks((drive) => [Math.min(drive.after, Math.max(many - 1, 0)), drive.values[quality]]),
+      },
       new Scale({ label: "trial", lower: -0.02 * many - 0.5, upper: Math.max(1, 1.02 * many - 0.5) }),
       this.valueScale(quality),
     );
@@ -436,6 +467,7 @@ class Page {
   paretoMarks() {
     const aim = this.status?.aspiration;
     return [
+      ...this.#drivenMarks(({ values }) => values.slice(0, 2)),
       ...(this.tried ? [{ at: this.tried.values, tint: "#009e73", shape: "box" }] : []),
       ...(aim ? [{ at: aim, tint: "#0b6e99", shape: "target" }] : []),
     ];
@@ -448,7 +480,10 @@ class Page {
     const [x, y] = [Number(this.xAxis.value), single ? -1 : Number(this.yAxis.value)];
     const grid = this.grid && this.model.checked && this.grid.key === `${x} ${y} ${quality}` ? this.grid : null;
     const height = (point, value) => (single ? value : point[y]);
-    const marks = this.tried ? [{ at: [this.tried.point[x], height(this.tried.point, this.tried.values[0])], tint: "#009e73", shape: "box" }] : [];
+    // A drive may begin outside the ranges: its mark is then at the edge.
+    const inside = (value, k) => (value === null || this.parameters[k].options ? value : Math.min(Math.max(value, this.parameters[k].lower), this.parameters[k].upper));
+    const marks = this.#drivenMarks(({ point, values }) => [inside(point[x], x), single ? values[quality] : inside(point[y], y)]);
+    if (this.tried) marks.push({ at: [this.tried.point[x], height(this.tried.point, this.tried.values[0])], tint: "#009e73", shape: "box" });
     if (!single && this.sections.try && !this.sections.try.hidden) marks.push({ at: [this.draft[x], this.draft[y]], tint: "#1c2329", shape: "cross" });
     this.landscape.show(
       { ...common, x: points[x] ?? [], y: (single ? values[quality] : points[y]) ?? [], grid, shade: (value) => color(shade(value), 0.55), marks, regions: single ? [] : this.steering.regions(x, y) },
@@ -498,19 +533,26 @@ class Page {
   #showPointed() {
     const k = this.wanted;
     if (!this.hello.simulates) return;
-    if (k < 0) {
+    if (k === -1) {
       this.#legend("pointed", false);
       return this.ask("hide", { role: "pointed" }).catch(() => {});
     }
-    this.ask("show", { role: "pointed", trial: k, condition: this.#condition })
+    const source = k >= 0 ? { trial: k, condition: this.#condition } : { driven: -1 - k };
+    this.ask("show", { role: "pointed", ...source })
       .then((shown) => {
         if (this.pointed !== k) return;
         this.#legend("pointed", true);
         this.#extend(shown.duration);
         document.body.dataset.pointed = k;
-        if (shown.message && this.trials.kinds[k] !== "failed") this.pointedText.append(` ${shown.message}`);
+        const isTold = k >= 0 ? this.trials.kinds[k] === "failed" : shown.message === this.#drive(k)?.message;
+        if (shown.message && !isTold) this.pointedText.append(` ${shown.message}`);
       })
       .catch((error) => k === this.pointed && this.pointedText.append(` ${error.message}`));
+  }
+
+  // The driven rollout of an index, which is -1 - its number.
+  #drive(index) {
+    return this.driven.find(({ number: its }) => its === -1 - index);
   }
 
   get #condition() {
@@ -518,9 +560,12 @@ class Page {
   }
 
   #describe(k) {
-    if (k < 0) return (this.pointedText.textContent = "");
-    const values = this.qualities.map(({ name }, q) => `${name} = ${number(this.trials.values[q][k])}`);
-    const point = this.trials.point(k).map((value, p) => `${short(this.parameters[p].address)} ${this.valueText(p, value)}`);
+    if (k === -1) return (this.pointedText.textContent = "");
+    const drive = this.#drive(k);
+    if (k < -1 && !drive) return;
+    const values = this.qualities.map(({ name }, q) => `${name} = ${number(drive ? drive.values[q] : this.trials.values[q][k])}`);
+    const point = (drive?.point ?? this.trials.point(k)).map((value, p) => `${short(this.parameters[p].address)} ${this.valueText(p, value)}`);
+    if (drive) return (this.pointedText.textContent = `driven by ${drive.name}: ${values.join(", ")}${drive.kind === "broken" ? " (breaks a constraint)" : ""}${drive.message && `, ${drive.message}`}; from ${point.join(", ")}`);
     const remark = { failed: ` failed: ${this.trials.reasons[k] ?? ""}`, broken: " (breaks a constraint)", dropped: " (dropped by racing)", feasible: "" }[this.trials.kinds[k]];
     this.pointedText.textContent = `trial ${k}${this.trials.byHand.has(k) ? ", by hand" : ""}: ${values.join(", ")}${remark}; ${point.join(", ")}`;
   }
@@ -666,20 +711,12 @@ function extent(values) {
   return least <= most ? [least, most] : [0, 1];
 }
 
-function ranked(kinds, values, sign) {
-  const feasible = [];
-  kinds.forEach((kind, k) => kind === "feasible" && feasible.push(k));
-  return feasible.sort((a, b) => sign * (values[b] - values[a]));
-}
-
-// The trials that no other one beats in one quality without losing in another, along the first quality.
-function paretoFront(kinds, values, sign) {
-  const feasible = [];
-  kinds.forEach((kind, k) => kind === "feasible" && feasible.push(k));
+// The trials of those that no other one beats in one quality without losing in another, along the first quality.
+function paretoFront(candidates, values, sign) {
   const better = (a, b) => values.every((column, q) => sign[q] * column[a] >= sign[q] * column[b]) && values.some((column, q) => column[a] !== column[b]);
-  feasible.sort((a, b) => sign[0] * (values[0][b] - values[0][a]) || sign[1] * (values[1][b] - values[1][a]));
+  const sorted = candidates.toSorted((a, b) => sign[0] * (values[0][b] - values[0][a]) || sign[1] * (values[1][b] - values[1][a]));
   const front = [];
-  for (const k of feasible) if (!front.some((other) => better(other, k))) front.push(k);
+  for (const k of sorted) if (!front.some((other) => better(other, k))) front.push(k);
   return front.sort((a, b) => values[0][a] - values[0][b]);
 }
 
