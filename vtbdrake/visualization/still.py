@@ -7,7 +7,7 @@ import io
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydrake.geometry import HalfSpace, Rgba, Shape
+from pydrake.geometry import HalfSpace, Mesh, Rgba, Shape
 from pydrake.math import RigidTransform
 
 from vtbdrake.components.rendering import RenderingError, check_rendering
@@ -74,7 +74,8 @@ class Still:
         for number, (shape, X_WG, color) in enumerate(self._shapes):
             geometry = GeometryInstance(X_WG, shape, f"{number}")
             properties = PerceptionProperties()
-            properties.AddProperty("phong", "diffuse", color)
+            if not _has_materials(shape):  # Drake would ignore the colour, and warn.
+                properties.AddProperty("phong", "diffuse", color)
             geometry.set_perception_properties(properties)
             try:
                 scene_graph.RegisterAnchoredGeometry(source, geometry)
@@ -93,3 +94,12 @@ class Still:
         file = io.BytesIO()
         Image.fromarray(self.render(width=width, height=height)).save(file, "png", optimize=True)
         return file.getvalue()
+
+
+def _has_materials(shape: Shape) -> bool:
+    """Return whether a shape is a mesh of a file (.obj) that names its materials."""
+    if not isinstance(shape, Mesh) or shape.extension() != ".obj":
+        return False
+    source = shape.source()
+    content = source.path().read_bytes() if source.is_path() else source.in_memory().mesh_file.contents()
+    return b"mtllib" in content
