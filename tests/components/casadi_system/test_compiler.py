@@ -58,6 +58,20 @@ def test_compiled_computes_what_interpreted_computes(cache, kind):
     assert gradients[0].shape == (5, 6)
 
 
+def test_a_jacobian_that_is_too_long_to_be_compiled_is_interpreted(cache):
+    """Few operations, with a dense Jacobian of 330 x 330 entries; a C compiler would need minutes for it."""
+    x, u, row = casadi.SX.sym("x", 330), casadi.SX.sym("u", 1), np.linspace(0.1, 1.0, 330)
+    y = casadi.sin(row * casadi.sin(casadi.dot(x, x)))
+    system = CasadiSystem(casadi.Function("wide", [x, u], [y], ["x", "u"], ["y"]), compile=True)
+    assert _runs(cache) == 1
+    z = np.linspace(-0.1, 0.1, 330)
+    gradient = ExtractGradient(_eval(system.ToAutoDiffXd(), InitializeAutoDiff(z).ravel(), [0.0]))
+    inner = z @ z
+    expected = np.outer(np.cos(row * np.sin(inner)) * row * np.cos(inner), 2.0 * z)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-12, atol=1e-15)
+    assert _runs(cache) == 1
+
+
 def test_a_function_is_compiled_once(cache):
     for _ in range(3):
         CasadiSystem(_function(), compile=True)

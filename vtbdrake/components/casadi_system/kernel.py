@@ -24,6 +24,11 @@ TRANSLATIONS: dict[bool | None, Callable[[casadi.Function], casadi.Function]] = 
     None: compiled_if_possible,
     False: lambda function: function,
 }
+LONGEST_JACOBIAN = 100_000
+"""The most operations of a Jacobian that is compiled: the time of a compiler grows faster than their number.
+
+The Jacobian of an arm's law with 185,000 operations takes gcc minutes and 2.7 GB; interpreted, it takes 0.7 ms.
+"""
 _GENERATING = threading.Lock()
 # The expressions and functions of kernels that are gone, until the next kernel is made. CasADi's expressions share
 # nodes, and count the references to them without atomics; its Python package gives up the interpreter lock even where
@@ -49,7 +54,7 @@ class Kernel:
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):
         """Wrap ``y`` (m, 1), an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other.
 
-        ``compile`` is that of a `CasadiSystem`.
+        ``compile`` is that of a `CasadiSystem`; a Jacobian above `LONGEST_JACOBIAN` is interpreted.
         """
         _SET_ASIDE.clear()
         self._name = casadi.Function.fix_name(name)
@@ -88,7 +93,8 @@ class Kernel:
         function = casadi.Function(name, self._arguments, [expression])
         # A function of scalar operations cannot fail; others (a root finder, a solver) report it.
         may_fail = not function.is_a("SXFunction")
-        translated = self._translate(function)
+        is_long = expression is not self._y and function.n_instructions() > LONGEST_JACOBIAN
+        translated = function if is_long else self._translate(function)
         self._set_aside_at_end(function, translated)
         return Buffers(translated, may_fail)
 
