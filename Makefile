@@ -29,7 +29,7 @@ help:
 	@echo "make check                         ruff, mypy, and the public interface against that of the newest release"
 	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
-	@echo "make bench [ONLY=name] [PAGE=1]    every benchmark; writes benchmarks/results.json, and docs/benchmarks.md"
+	@echo "make bench [ONLY=name] [PAGE=1]    every claim of speed; writes benchmarks/results.json, and docs/benchmarks.md"
 	@echo "make dist                          source distribution and wheel, in dist/, tried in an empty environment"
 	@echo "make setup                         only the environment that the others need"
 	@echo "make clean                         remove environments, caches and results"

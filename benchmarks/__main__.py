@@ -20,7 +20,7 @@ FILE = Path(__file__).with_name("results.json")
 @click.argument("only", nargs=-1)
 @click.option("--page", type=click.Path(dir_okay=False, path_type=Path), help="The page to write, docs/benchmarks.md.")
 def main(only: tuple[str, ...], page: Path | None) -> None:
-    """Run the benchmarks ONLY, or all."""
+    """Run the benchmarks ONLY, or all but the longest, which run by name."""
     try:
         results = benchmark_all(only, registry=BENCHMARKS, echo=lambda line: click.echo(line, err=True))
     except ValueError as error:

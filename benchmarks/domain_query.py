@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.spatial
 
-from benchmarks.measure import LOWER, Benchmark, seconds
+from benchmarks.measure import LOWER, Benchmark, ratio, seconds
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.validity_domain import DomainWatch, ValidityDomain
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
@@ -15,7 +15,7 @@ WINDOWS, QUERIES = 500, 2000
 
 
 def domain_query() -> Benchmark:
-    """Seconds to read the state of the arm (21 features), and to know where it lies beside 500 windows."""
+    """Time to read the state of the arm (21 features) and to know where it lies beside 500 windows, over a tree's."""
     target = DpsAlone(ManipulatorScenario(law="joint_impedance"))
     context = target.default_context()
     readers = [target.reader(address) for address in FEATURES]
@@ -23,6 +23,7 @@ def domain_query() -> Benchmark:
     random = np.random.default_rng(0)
     features = random.normal(size=(WINDOWS, sum(sizes.values())))
     watch = DomainWatch(ValidityDomain(sizes, features, np.arange(WINDOWS) % 10, window=0.1))
+    point = random.normal(size=features.shape[1])
     tree = scipy.spatial.cKDTree(features)
 
     def state() -> np.ndarray:
@@ -33,14 +34,15 @@ def domain_query() -> Benchmark:
 
     took, by_tree, read = (
         np.array([seconds(function) for _ in range(QUERIES)])
-        for function in (query, lambda: tree.query(random.normal(size=features.shape[1]), k=5), state)
+        for function in (query, lambda: tree.query(point, k=5), state)
     )
     return Benchmark(
         name="domain_query",
-        value=float(np.median(took)),
-        unit="s",
-        goal=20e-6,
+        value=ratio(took, by_tree),
+        unit="1",
+        goal=2.0,
         better=LOWER,
-        against=f"the k-d tree of SciPy, {1e6 * np.median(by_tree):.0f} us without reading",
-        note=f"99 % within {1e6 * np.percentile(took, 99.0):.0f} us; reading takes {1e6 * np.median(read):.0f} us",
+        against="the k-d tree of SciPy, without reading",
+        note=f"the goal was 20 us; {1e6 * np.median(took):.0f} us, the tree {1e6 * np.median(by_tree):.0f} us; "
+        f"99 % within {1e6 * np.percentile(took, 99.0):.0f} us; reading takes {1e6 * np.median(read):.0f} us",
     )

@@ -63,6 +63,7 @@ def _update(name: str, scenario: ForestScenario, count: int, *, goal: float | No
         unit="ms",
         goal=goal,
         better=LOWER,
+        absolute="" if goal is None else "a quarter of the period of a scanner at 10 Hz",
         against=AGAINST,
         note=f"{spread(1e3 * np.array(seconds), unit='ms')}; {size or f'scans of {np.median(points):.0f} points'}, "
         f"{tracked} of {count} while it tracks; {made['matched'].item():.0f} trunks matched in the last",

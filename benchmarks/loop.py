@@ -36,7 +36,7 @@ while True:
 
 
 def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
-    """Time from a state's departure from the machine to the arrival of a command at it, with the DPS alone.
+    """Time from a state's departure from the machine to the arrival of a command, with the DPS alone, over an echo's.
 
     Each state begins a cycle of the loop. In turns with a plain echo at the same rate through the same hub: a message
     of the state's size to another process, which only sends it back. The machine runs throughout.
@@ -70,14 +70,15 @@ def loop_state_to_command_p50(cycles: int = 5000, rounds: int = 10) -> list[Benc
     return [
         Benchmark(
             name=f"loop_state_to_command_p{percent}",
-            value=states.percentile(percent),
-            unit="s",
-            goal=min(most, ratio * echo[percent]),
+            value=states.percentile(percent) / echo[percent],
+            unit="1",
+            goal=goal,
             better=LOWER,
-            against=f"a plain LCM echo through the same hub: {1e3 * echo[percent]:.3g} ms, times {ratio:g} at most",
-            note=note if percent == 50 else "",
+            against=f"a plain LCM echo through the same hub: {1e3 * echo[percent]:.3g} ms",
+            note=f"the goal was, besides, {1e3 * most:g} ms: {1e3 * states.percentile(percent):.3g} ms"
+            + (f"; {note}" if percent == 50 else ""),
         )
-        for percent, most, ratio in ((50, 0.4e-3, 2.0), (99, 1e-3, 2.5))
+        for percent, most, goal in ((50, 0.4e-3, 2.0), (99, 1e-3, 2.5))
     ]
 
 
@@ -144,6 +145,7 @@ def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
             unit="s",
             goal=60e-6,
             better=LOWER,
+            absolute="a loop at 1 kHz, whose period belongs to the control law",
             against=f"the DPS's own step: {1e6 * p50['alone']:.0f} us",
             note=f"beyond the step: {percentiles(histogram(overheads))}; processor time beyond it, waiting included: "
             f"{1e6 * besides:.0f} us; {granted}",

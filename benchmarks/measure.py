@@ -29,9 +29,10 @@ class Benchmark:
         against: The comparison, measured in the same run.
         holds: Whether the goal is reached; by default, ``value`` is compared with ``goal`` (equal is good enough).
         note: Spread, conditions, and so on.
+        absolute: The reason for which a goal is not a ratio: the limit of people or machines that it stands for.
 
     Raises:
-        ValueError: ``better`` is neither.
+        ValueError: ``better`` is neither, or a goal has a unit and no such reason.
     """
 
     name: str
@@ -42,10 +43,16 @@ class Benchmark:
     against: str
     holds: bool | None = None
     note: str = ""
+    absolute: str = ""
 
     def __post_init__(self) -> None:
         if self.better not in _MEETS:
             raise ValueError(f"{self.name}: better is one of {', '.join(_MEETS)}, not {self.better!r}")
+        if self.goal is not None and self.unit != "1" and not self.absolute:
+            raise ValueError(
+                f"{self.name}: a goal in {self.unit} depends on the machine: compare with something in the same run, "
+                "or say in absolute= which limit it stands for"
+            )
         if self.holds is None and self.goal is not None:
             object.__setattr__(self, "holds", bool(_MEETS[self.better](self.value, self.goal)))
 

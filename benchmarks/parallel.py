@@ -123,17 +123,17 @@ def _executor(executor: Executor) -> Run:
 
 def _apart(stack: ExitStack, task: RolloutTask) -> Run:
     """Processes that know nothing of executors."""
-    pools = [stack.enter_context(_process_pool(1, initializer=_Alone.prepare, initargs=(task,))) for _ in range(CORES)]
+    pools = [stack.enter_context(process_pool(1, initializer=Alone.prepare, initargs=(task,))) for _ in range(CORES)]
 
     def run(task: RolloutTask, points: Points) -> None:
-        for future in [pool.submit(_Alone.run, points[share::CORES]) for share, pool in enumerate(pools)]:
+        for future in [pool.submit(Alone.run, points[share::CORES]) for share, pool in enumerate(pools)]:
             future.result()
 
     return run
 
 
-class _Alone:
-    """In such a process."""
+class Alone:
+    """A process that simulates what it is sent, and knows nothing of executors."""
 
     runner: RolloutRunner
 
@@ -142,12 +142,12 @@ class _Alone:
         cls.runner = RolloutRunner(task)
 
     @classmethod
-    def run(cls, points: Points) -> None:
+    def run(cls, points: Points, start: object = None) -> None:
         for point in points:
-            cls.runner.run(point)
+            cls.runner.run(point, start=start)
 
 
-def _process_pool(workers: int, **options: Any) -> ProcessPoolExecutor:
+def process_pool(workers: int, **options: Any) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), **options)
 
 
@@ -155,6 +155,6 @@ EXECUTORS: Mapping[str, Callable[[ExitStack], Executor]] = {
     "threads": lambda stack: stack.enter_context(ThreadExecutor(CORES)),
     "processes": lambda stack: stack.enter_context(ProcessExecutor(CORES)),
     "pool of threads": lambda stack: FuturesExecutor(stack.enter_context(ThreadPoolExecutor(CORES))),
-    "pool of processes": lambda stack: FuturesExecutor(stack.enter_context(_process_pool(CORES))),
+    "pool of processes": lambda stack: FuturesExecutor(stack.enter_context(process_pool(CORES))),
     "dask": lambda stack: stack.enter_context(DaskExecutor(stack.enter_context(dask_cluster(workers=CORES)).client)),
 }

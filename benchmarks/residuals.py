@@ -67,6 +67,7 @@ def payload_alarm(nominal: float = 10.0) -> list[Benchmark]:
             unit="s",
             goal=1.0,
             better=LOWER,
+            absolute="simulated time, the same on every machine",
             against=f"a twin whose tool weighs {Arm().tool_mass} kg, {ERROR:.0%} less than the machine's",
             note=str(wrong.alarms[0]),
         ),

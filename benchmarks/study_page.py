@@ -78,12 +78,13 @@ def study_page_open(repeats: int = 3) -> Benchmark:
         unit="s",
         goal=OPEN_GOAL,
         better=LOWER,
+        absolute="what a person waits for",
         against="the same page of ten trials",
         note=f"{TRIALS} trials in {spread(many)}, {FEW} in {spread(few)}, Chromium with a software renderer",
     )
 
 
-def study_page_cost(rollouts: int = 200, repeats: int = 3) -> Benchmark:
+def study_page_cost(rollouts: int = 200, repeats: int = 2) -> Benchmark:
     """CPU time of a study and of the process of its page, over that of the study, which runs on all cores.
 
     The page's process is ``vtbdrake study open``, with a client that reads as a browser does. Both are measured while

@@ -168,6 +168,7 @@ def vr_pose_to_command() -> list[Benchmark]:
             unit="s",
             goal=0.05,
             better=LOWER,
+            absolute="a hand that feels the robot lag",
             against=f"a pose every {1e3 / RATE:.0f} ms, at p95; the median is {1e3 * np.median(delays):.1f} ms",
         ),
         Benchmark(
@@ -176,6 +177,7 @@ def vr_pose_to_command() -> list[Benchmark]:
             unit="s",
             goal=0.15,
             better=LOWER,
+            absolute="safety: 100 ms of silence, and how soon the robot must know of it",
             against="the silence of 100 ms that releases, at p95 of the slowest kind",
             note=note,
         ),

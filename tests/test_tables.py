@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.import_time import import_time
 from benchmarks.measure import Benchmark, interleaved, interleaved_values, ratio
-from benchmarks.report import BENCHMARKS, benchmark_all, results_page, results_table, write_results
+from benchmarks.report import BENCHMARKS, ONLY_BY_NAME, benchmark_all, results_page, results_table, write_results
 from vtbdrake_diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
 from vtbdrake_diagrams.tables import Crash, write_json
 
@@ -118,7 +118,9 @@ BENCHES = {
         benchmark("fast", 3.0, 2.5, "higher"),
         benchmark("fast_serial", 1.4, None, "higher"),
     ],
-    "slow": lambda: benchmark("slow", inf, 1.0, "lower", unit="s", against="nothing", note="never arrived"),
+    "slow": lambda: benchmark(
+        "slow", inf, 1.0, "lower", unit="s", absolute="patience", against="nothing", note="never arrived"
+    ),
     "gone": broken,
 }
 
@@ -131,14 +133,14 @@ def test_benchmarks() -> None:
     assert lines[3].split() == ["fast_serial", "1.4", "rebuilding"]
     assert lines[4].split() == ["slow", "inf", "s", "<=", "1", "NO", "nothing"]
     assert lines[5].split()[:3] == ["gone", "-", "NO"]
-    assert lines[6:] == ["slow: never arrived"]
+    assert lines[6:] == ["slow: never arrived; absolute: patience"]
 
 
 def test_page_of_benchmarks() -> None:
     lines = results_page(benchmark_all(registry=BENCHES, echo=quiet), only=["fast", "slow"]).splitlines()
     assert "| fast | 3 |  | >= 2.5 | yes | rebuilding |" in lines
     assert "| slow | inf | s | <= 1 | NO | nothing |" in lines
-    assert "* slow: never arrived" in lines
+    assert "* slow: never arrived; absolute: patience" in lines
     assert any("ONLY='fast slow'" in line for line in lines)
     assert any(re.match(r"Measured on \d{4}-\d\d-\d\d: \d+ cores of .*drake \d", line) for line in lines)
 
@@ -174,6 +176,19 @@ def test_benchmark_may_be_stricter_than_its_goal() -> None:
 def test_benchmark_of_an_unknown_direction() -> None:
     with pytest.raises(ValueError, match="one of higher, lower, not 'more'"):
         benchmark("b", 1.0, 1.0, "more")
+
+
+def test_a_goal_in_a_unit_says_which_limit_it_stands_for() -> None:
+    with pytest.raises(ValueError, match="a goal in s depends on the machine"):
+        benchmark("b", 1.0, 1.0, "lower", unit="s")
+    assert benchmark("b", 1.0, None, "lower", unit="s").holds is None
+
+
+def test_the_longest_benchmarks_run_only_by_name() -> None:
+    registry = {name: lambda: benchmark("b", 1.0, None, "lower") for name in (ONLY_BY_NAME[0], "fast")}
+    assert set(ONLY_BY_NAME) <= set(BENCHMARKS)
+    assert len(benchmark_all(registry=registry, echo=quiet)) == 1
+    assert len(benchmark_all(ONLY_BY_NAME[:1], registry=registry, echo=quiet)) == 1
 
 
 def test_interleaved_runs_alternate() -> None:
