@@ -74,7 +74,7 @@ BENCHMARKS: Registry = {
     "localization_update_p50": "benchmarks.localization:localization_update_p50",
 }
 
-# They take minutes each; without names, the others run, which take a quarter of an hour together.
+# They take minutes each; without names, the others run.
 ONLY_BY_NAME = ("calibration_time", "auto_regret_full", "time_to_target_full")
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")

@@ -229,10 +229,11 @@ def test_processes_have_a_time_limit_by_default():
 
 
 def test_thread_that_does_not_stop_is_left_behind(monkeypatch, caplog):
-    release = threading.Event()
+    begun, release = threading.Event(), threading.Event()
 
     def stuck(theta):
         if theta > 0.5:
+            begun.set()
             release.wait()
         return theta
 
@@ -240,6 +241,7 @@ def test_thread_that_does_not_stop_is_left_behind(monkeypatch, caplog):
     made = ThreadExecutor(2)
     rollouts = made.run(RolloutTask(PendulumScenario(), 0.1, Quality(stuck, THETA)), [{THETA: 0.1}, {THETA: 1.0}])
     assert next(rollouts)[0] == 0
+    begun.wait()  # A rollout that has not begun never does.
     with hanging_fails("what does not stop is not waited for"):
         rollouts.close()
     assert "a rollout does not stop: its thread is left behind" in caplog.text
