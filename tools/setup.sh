@@ -13,8 +13,8 @@ EXTRAS=dev,docs,testing,web,perception,notebook,optuna,cluster,dataframe,recordi
 LIBRARIES=(libglib-2.0.so.0:libglib2.0-0)
 # Cameras need EGL with Mesa's drivers; nothing else does.
 RENDERING=(libegl1 libgl1-mesa-dri)
-# The tests of pages look at them in a browser.
-BROWSER=(chromium)
+# The tests of pages look at them in a browser, and serve one with a certificate that openssl makes.
+BROWSER=(chromium openssl)
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() { say "$@"; exit 1; }
@@ -125,11 +125,12 @@ if ! can_render; then
         say "    sudo apt-get update && sudo apt-get install --yes --no-install-recommends ${RENDERING[*]}"
     fi
 fi
-if ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
+has_browser() { command -v chromium >/dev/null || command -v google-chrome >/dev/null; }
+if ! has_browser || ! command -v openssl >/dev/null; then
     if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
         need_packages "${BROWSER[@]}"
     else
-        say "no browser here: the tests of pages are skipped. For them, install Debian's packages or their equivalent:"
+        say "no browser or no openssl here, for tests of pages. For them, install Debian's packages or their equivalent:"
         say "    sudo apt-get update && sudo apt-get install --yes --no-install-recommends ${BROWSER[*]}"
     fi
 fi
