@@ -16,6 +16,7 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.monitoring import LiveClient
 from vtbdrake.state import AddressError
 from vtbdrake.web import LoopSession, SessionError
+from vtbdrake.web.viewer import view_loop
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
 
@@ -48,6 +49,13 @@ def test_poses_values_and_switches_are_those_of_the_loop(hub: Hub) -> None:
                 message = msgpack.unpackb(meshcat.recv(PATIENCE))
                 if message["type"] == "set_transform" and message["path"] == "/drake/now/cart_pole/cart":
                     place = message["matrix"][12]
+
+
+def test_loop_in_a_notebook_is_its_page_without_a_picture(hub: Hub) -> None:
+    with view_loop(CartPoleScenario(), hub.url) as running:
+        bundle = running._repr_mimebundle_()
+        assert bundle["text/plain"].startswith("<View of vtbdrake_diagrams.cart_pole.scenario:CartPoleScenario>")
+        assert "show(place" in bundle["text/html"] and "image/png" not in bundle
 
 
 def test_page_sets_and_resets_only_what_the_loop_accepts(hub: Hub) -> None:

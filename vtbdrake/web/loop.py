@@ -67,9 +67,7 @@ class LoopSession(Session):
     @property
     def trouble(self) -> str:
         """Return why commands do not reach the machine: a loop that is silent, or its fallbacks; empty if they do."""
-        status = self._status
-        latched = [] if status is None else [f"the fallbacks command: {text}" for text in status.latched]
-        return self._motion.trouble or "; ".join(latched)
+        return self._motion.trouble or "; ".join(_latched(self._status))
 
     # -- commands
 
@@ -114,8 +112,8 @@ class LoopSession(Session):
     def show(self, viewer: object, layers: Collection[str]) -> None:
         """Do nothing: a loop has no layers."""
 
-    def picture(self) -> None:
-        """Return None."""
+    def still(self) -> None:
+        """Return None: what a loop looks like now is drawn in the page alone."""
 
     def _do(self, action: Callable[[], Any]) -> Any:
         raise SessionError(
@@ -199,9 +197,7 @@ class LoopSession(Session):
         now = time.monotonic() if sample is None else sample[0]
         failure = self._motion.trouble
         values = {} if shown is None else {address: plain(np.asarray(value)) for address, value in shown[1].items()}
-        latched = (
-            () if status is None or failure else tuple(f"the fallbacks command: {text}" for text in status.latched)
-        )
+        latched = () if failure else _latched(status)
         frame = replace(
             latest,
             number=latest.number + 1,
@@ -305,6 +301,11 @@ class _Feed:
         for watch in self._watches:
             watch.close()
         self._watches.clear()
+
+
+def _latched(status: LoopStatus | None) -> tuple[str, ...]:
+    """Return why the fallbacks command until they are reset, as sentences."""
+    return () if status is None else tuple(f"the fallbacks command: {text}" for text in status.latched)
 
 
 def _plain_status(status: LoopStatus) -> dict[str, Any]:
