@@ -483,10 +483,11 @@ class _Samples:
             end=end,
             message=message,
             reachable=None if self._prospect is None else self._prospect.reachable,
+            wall_time=time.perf_counter() - started,
         )
-        state = None
-        if task.keep_state and np.isfinite(result.t_star):
-            state = self._state(parameters, result.t_star)
+        if not (task.keep_state and np.isfinite(result.t_star)):
+            return result
+        state = self._state(parameters, result.t_star)
         return replace(result, state=state, wall_time=time.perf_counter() - started)
 
     def _state(self, parameters: dict[str, Any], t_star: float) -> Any:

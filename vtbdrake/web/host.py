@@ -206,11 +206,11 @@ async def first_of(*tasks: Coroutine[Any, Any, None]) -> None:
 def until_closed(serve: Callable[[WebSocket], Awaitable[None]]) -> Callable[[WebSocket], Awaitable[None]]:
     """Return a handler that also ends in silence when the server ends while its browser is connected."""
 
-    async def serveuntil_closed(browser: WebSocket) -> None:
+    async def serve_until_closed(browser: WebSocket) -> None:
         with suppress(asyncio.CancelledError):
             await serve(browser)
 
-    return serveuntil_closed
+    return serve_until_closed
 
 
 def _listen(port: int, family: socket.AddressFamily, address: str) -> socket.socket:

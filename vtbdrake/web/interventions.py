@@ -28,17 +28,19 @@ class Interventions:
         """Begin anew, behind a course that was driven or without one."""
         self._driven, self._start, self._writes = driven, None, {}
 
-    def add(self, before: Snapshot, values: Mapping[str, Any]) -> None:
-        """Add values that were set; a course that was driven is over.
+    @property
+    def begun(self) -> bool:
+        """Return whether something was set, so that a course goes on."""
+        return self._start is not None
 
-        Args:
-            before: The state before they were set.
-            values: By address.
-        """
-        if self._start is None:
-            self.forget()
-            self._start = before
-        self._writes.setdefault(self._steps_until(before.time), {}).update(values)
+    def begin(self, start: Snapshot) -> None:
+        """Begin a course at the state before its first values; one that was driven is over."""
+        self.forget()
+        self._start = start
+
+    def add(self, time: float, values: Mapping[str, Any]) -> None:
+        """Add values by address, which were set at a time in seconds to a course that has begun."""
+        self._writes.setdefault(self._steps_until(time), {}).update(values)
 
     def course(self, now: float) -> Course | None:
         """Return the course until now; None if nothing was set or driven."""

@@ -777,9 +777,13 @@ class Session:
             self._end_preview()
             return
         before = self._before_change(compare)
-        state = before or self._testbed.snapshot(self._context)
+        # Values may come at 100 Hz, from a hand: only the first of a course needs the whole state.
+        start = None if self._interventions.begun else before or self._testbed.snapshot(self._context)
+        when = self._context.get_time()
         self._testbed.write(self._context, values)
-        self._interventions.add(state, values)
+        if start is not None:
+            self._interventions.begin(start)
+        self._interventions.add(when, values)
         self._end_preview()
         self._begin_comparison(before)
         self._next_frame = 0.0
