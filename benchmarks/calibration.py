@@ -1,4 +1,4 @@
-"""How long the calibration of an arm takes: 18 numbers from a recording of 10 s at 1 kHz, beside MuJoCo's sysid."""
+"""Time of the calibration of an arm (18 numbers, a recording of 10 s at 1 kHz) beside that of MuJoCo's sysid."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def calibration_time() -> Benchmark:
     scenario = arm()
     testbed = scenario.build()
     default = testbed.default_context()
-    start = {p.address: _number(testbed.read(default, p.address.split("[")[0]), p.address) for p in PARAMETERS}
+    start = {p.address: float(testbed.read(default, p.address)) for p in PARAMETERS}
     generator = np.random.default_rng(0)
     truth = {p.address: float(p.lower + (p.upper - p.lower) * generator.uniform(0.2, 0.8)) for p in PARAMETERS}
     truth[DELAY] = 2.0
@@ -137,9 +137,3 @@ def mujoco_sysid(
     answer = json.loads(done.stdout.splitlines()[-1])
     values = np.array(answer["values"]) / scale
     return answer["seconds"], {p.address: float(value) for p, value in zip(ours, values, strict=True)}
-
-
-def _number(value: object, address: str) -> float:
-    """Return the value of a variable, or of the entry that the address names."""
-    array = np.ravel(np.asarray(value, dtype=float))
-    return float(array[int(address[-2])] if address.endswith("]") else array[0])

@@ -24,6 +24,7 @@ from scipy.stats import chi2
 
 from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake_diagrams.forest.perception import moved
@@ -176,12 +177,6 @@ def calibrated(drive: Mowing) -> Calibrated:
     return odometry_of(least_squares(residuals, start, x_scale=sizes, diff_step=1e-4, loss="cauchy").x)
 
 
-def squared_errors(errors: Array, covariances: Array) -> Array:
-    """Return the normalized squared errors of positions, (k,): of a consistent model, their mean is 2."""
-    squares: Array = np.einsum("ki,kij,kj->k", errors, np.linalg.inv(covariances), errors)
-    return squares
-
-
 def likeliest(parts: Sequence[Windows]) -> DriftModel:
     """Return the model under which the errors in some stretches are the likeliest, without an error of turns."""
 
@@ -193,7 +188,7 @@ def likeliest(parts: Sequence[Windows]) -> DriftModel:
         total = 0.0
         for windows in parts:
             C = windows.covariances(model_of(p), start=0.0)
-            total += float(np.linalg.slogdet(C)[1].sum() + squared_errors(windows.errors, C).sum())
+            total += float(np.linalg.slogdet(C)[1].sum() + squared_distances(windows.errors, C).sum())
         return total
 
     start = np.log([DriftModel().along, DriftModel().across, DriftModel().heading])
@@ -226,7 +221,7 @@ def main(folder: Path) -> None:
         sizes = np.hypot(*windows.errors.T)
         columns = []
         for each in (DriftModel(), model):
-            squares = squared_errors(windows.errors, windows.covariances(each, start=0.0))
+            squares = squared_distances(windows.errors, windows.covariances(each, start=0.0))
             columns.append([f"{squares.mean() / 2.0:.2f}", f"{np.mean(squares < chi2.ppf(0.95, 2)):.0%}"])
         rows.append(
             [

@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 import vtbdrake as vtb
 from vtbdrake.arrays import Array
+from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
@@ -246,7 +247,7 @@ class Judgement:
         C = covariances[:, :k, :k] + noise**2 * np.diag([1.0, 1.0, 0.0][:k])
         distance = np.hypot(errors[:, 0], errors[:, 1])
         deviation = np.sqrt(np.trace(C[:, :2, :2], axis1=1, axis2=2))
-        squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(C), errors)
+        squares = squared_distances(errors, C)
         return cls(
             len(errors),
             float(np.sqrt(np.mean(distance**2))),

@@ -11,9 +11,7 @@ import numpy as np
 from pydrake.systems.framework import (
     Context,
     Diagram,
-    InputPortIndex,
     OutputPort,
-    OutputPortIndex,
     PortDataType,
     System,
 )
@@ -25,6 +23,7 @@ from vtbdrake.state import AddressError, Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, read_group, write_group
 from vtbdrake.state.variables import Place
+from vtbdrake.testbed.dependencies import connections, writer_of
 
 MEMORY, EXTRA = "memory", "extra"
 
@@ -77,7 +76,7 @@ class Walker:
         """
         self.diagram, self.variables = diagram, variables
         self.context = context
-        self._sources = dict(_connections(diagram))
+        self._sources = {reader: writer for writer, reader in connections(diagram)}
         self._paths = {system: path for path, system in leaves(diagram)}
         self._systems = {path: system for system, path in self._paths.items()}
         self.equations: dict[str, Equations] = {}
@@ -225,7 +224,7 @@ class Walker:
         system, port = self._port(address)
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
-        leaf, number = _writer(system, port.get_index())
+        leaf, number = writer_of(system, port.get_index())
         evaluation = Evaluation(self, z, time, w)
         return casadi.densify(evaluation.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
 
@@ -477,28 +476,3 @@ def _matters(system: System) -> bool:
         return True
     context = system.CreateDefaultContext()
     return bool(context.num_continuous_states() or context.num_discrete_state_groups() or context.num_abstract_states())
-
-
-def _connections(diagram: Diagram) -> Iterator[tuple[tuple[System, int], tuple[System, int]]]:
-    """Yield ((reader, number of its input port), (writer, number of its output port)) of all leaf systems."""
-    for (reader, input_port), (writer, output_port) in diagram.connection_map().items():
-        source = _writer(writer, output_port)
-        for leaf in _readers(reader, input_port):
-            yield leaf, source
-    for system in diagram.GetSystems():
-        if isinstance(system, Diagram):
-            yield from _connections(system)
-
-
-def _writer(system: System, port: OutputPortIndex) -> tuple[System, int]:
-    while isinstance(system, Diagram):
-        system, port = system.get_output_port_locator(port)
-    return system, int(port)
-
-
-def _readers(system: System, port: InputPortIndex) -> Iterator[tuple[System, int]]:
-    if not isinstance(system, Diagram):
-        yield system, int(port)
-        return
-    for inner, inner_port in system.GetInputPortLocators(port):
-        yield from _readers(inner, inner_port)

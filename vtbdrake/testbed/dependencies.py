@@ -24,7 +24,7 @@ def followers(diagram: Diagram, sources: Iterable[str]) -> dict[str, str]:
     """
     paths = {system: path for path, system in leaves(diagram)}
     readers: dict[str, list[str]] = {path: [] for path in paths.values()}
-    for source, reader in _connections(diagram):
+    for (source, _), (reader, _) in connections(diagram):
         readers[paths[source]].append(paths[reader])
     predecessors = {source: source for source in sources}
     waiting = deque(predecessors)
@@ -45,26 +45,30 @@ def chain(predecessors: dict[str, str], path: str) -> list[str]:
     return passed[::-1]
 
 
-def _connections(diagram: Diagram) -> Iterator[tuple[System, System]]:
-    """Yield (writer, reader) of all connections between leaf systems, in ``diagram`` and below."""
+def connections(diagram: Diagram) -> Iterator[tuple[tuple[System, int], tuple[System, int]]]:
+    """Yield all connections between leaf systems, in ``diagram`` and below.
+
+    Each is ((writer, number of its output port), (reader, number of its input port)).
+    """
     for (reader, input_port), (writer, output_port) in diagram.connection_map().items():
-        source = _writer(writer, output_port)
+        source = writer_of(writer, output_port)
         for leaf in _readers(reader, input_port):
             yield source, leaf
     for system in diagram.GetSystems():
         if isinstance(system, Diagram):
-            yield from _connections(system)
+            yield from connections(system)
 
 
-def _writer(system: System, port: OutputPortIndex) -> System:
+def writer_of(system: System, port: OutputPortIndex) -> tuple[System, int]:
+    """Return the leaf system that computes an output port, and the number of its own port."""
     while isinstance(system, Diagram):
         system, port = system.get_output_port_locator(port)
-    return system
+    return system, int(port)
 
 
-def _readers(system: System, port: InputPortIndex) -> Iterator[System]:
+def _readers(system: System, port: InputPortIndex) -> Iterator[tuple[System, int]]:
     if not isinstance(system, Diagram):
-        yield system
+        yield system, int(port)
         return
     for inner, inner_port in system.GetInputPortLocators(port):
         yield from _readers(inner, inner_port)

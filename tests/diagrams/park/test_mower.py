@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from tests.real import recordings
+from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.planar import compose
-from vtbdrake_diagrams.park.mower import RAW, Calibrated, Mowing, Windows, calibrated, squared_errors
+from vtbdrake_diagrams.park.mower import RAW, Calibrated, Mowing, Windows, calibrated
 
 pytestmark = pytest.mark.one_python
 
@@ -52,4 +53,4 @@ def test_calibrated_with_one_half_it_is_better_in_the_other() -> None:
     raw, windows = Windows.of(second, RAW, 10.0), Windows.of(second, odometry, 10.0)
     median = np.median(np.hypot(*windows.errors.T))
     assert median < 0.08 < 0.15 < np.median(np.hypot(*raw.errors.T))
-    assert np.mean(squared_errors(windows.errors, windows.covariances(DriftModel(), start=0.0)) < 5.99) > 0.9
+    assert np.mean(squared_distances(windows.errors, windows.covariances(DriftModel(), start=0.0)) < 5.99) > 0.9
