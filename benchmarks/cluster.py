@@ -17,7 +17,7 @@ from vtbdrake_diagrams.space_climber.payload import MASS
 
 PROCESSES = 2
 DURATION = 0.5
-"""Of a rollout, in s."""
+"""The duration of a rollout, in s."""
 TIMES = np.linspace(0.0, 15.0, 151)
 
 

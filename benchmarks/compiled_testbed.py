@@ -29,7 +29,7 @@ TOLERANCE = 1e-9
 
 
 def compiled_testbed(repeats: int = 10) -> list[Benchmark]:
-    """How many times as many rollouts per second a compiled testbed makes as Drake, on one core each."""
+    """Compare the rollouts per second of a compiled testbed with those of Drake, on one core each."""
     random = np.random.default_rng(0)
     cart_pole = CartPoleScenario().mental()
     plans = np.column_stack([np.zeros(32), random.uniform(-60.0, 60.0, (32, cart_pole.knots))])
@@ -79,7 +79,7 @@ def _compared(
 
 
 def log_replay(repeats: int = 5) -> list[Benchmark]:
-    """How much faster the compiled world of the arm follows the torques of a log than Drake's, on one core each."""
+    """Compare how fast the compiled world of the arm and Drake's follow the torques of a log, on one core each."""
     # Without its controller, the arm falls onto a stop some time later.
     seconds, sample_period, torque = 2.0, 0.01, "joint_torque"
     machine = ExcitedArmScenario()

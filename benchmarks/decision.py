@@ -70,7 +70,7 @@ def _processor_time(function: Callable[[], object]) -> float:
 
 
 def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
-    """What a decision of the walking SpaceClimber takes beyond its rollouts, over what these take.
+    """Measure what a decision of the walking SpaceClimber takes beyond its rollouts, over what these take.
 
     The running robot decides about its heading again and again, a sample of its DPS later each time, by rollouts in two
     warm processes: the plan in use beside one candidate, and the other candidate where a worker is free first. What is

@@ -181,7 +181,7 @@ def _rate(result: dict[str, Any]) -> float:
 
 
 def click_p95(clicks: int = 200) -> Benchmark:
-    """From a click in the page to its confirmation, while workers with nice 5 compute rollouts on all cores.
+    """Measure the time from a click in the page to its confirmation, while workers (nice 5) keep all cores busy.
 
     The cart-pole runs in real time in the session, and each click sets one of its variables.
     """
@@ -196,7 +196,7 @@ def click_p95(clicks: int = 200) -> Benchmark:
 
 
 def preview_latency(drags: int = 60) -> Benchmark:
-    """From a draft at a slider to the first pose of its ghost at the client, of the cart-pole in real time."""
+    """Measure the time from a draft at a slider to the first pose of its ghost at the client, of the cart-pole."""
     with _served(Session(CartPoleScenario())) as running, client(preview, running.url, ANGLE, drags, 0.1) as result:
         times = np.array(result())
     return _latency("preview_latency", times, goal=0.25, against="")

@@ -1,4 +1,4 @@
-"""How late the command of a hand in virtual reality is, and how soon a robot is released when the hand is gone."""
+"""Delay of the commands of a hand in virtual reality, and of the release of a robot when the hand is gone."""
 
 from __future__ import annotations
 

@@ -34,6 +34,28 @@ def running_browser() -> Iterator[Browser]:
         running.close()
 
 
+@contextmanager
+def opened_page(
+    browser: Browser, url: str, *, ready: str, size: tuple[int, int] = (1000, 650), script: str = ""
+) -> Iterator[Page]:
+    """A page, which must raise no error, from when it has an element that a selector finds.
+
+    A script runs before those of the page.
+    """
+    width, height = size
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(PATIENCE)
+    failures: list[str] = []
+    page.on("pageerror", lambda error: failures.append(str(error)))
+    if script:
+        page.add_init_script(script)
+    page.goto(url)
+    page.wait_for_selector(ready, state="attached")
+    yield page
+    page.close()
+    assert not failures
+
+
 def screenshot(page: Page, **options: Any) -> np.ndarray:
     """What a page shows when all that has been sent to it is drawn, shape (height, width, 3)."""
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")

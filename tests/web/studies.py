@@ -47,11 +47,14 @@ def drive_cart(path: Path) -> DrivenTrial:
 
 
 def run_elsewhere(path: Path, *, rollouts: int) -> subprocess.Popen[bytes]:
-    """Begin the study, or go on with it, in a process of its own."""
+    """Begin the study, or go on with it, in a process of its own; return when its file is there and taken."""
     code = f"""
 from pathlib import Path
 from tests.web.studies import cart_pole_problem
 with cart_pole_problem().study({str(path)!r}, solver="CMA-ES") as study:
     study.run(rollouts={rollouts}, executor="serial", progress=False)
 """
-    return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    runner = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    while not path.exists() or not path.with_name(f"{path.name}-lock").exists():
+        assert runner.poll() is None
+    return runner

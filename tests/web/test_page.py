@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.chromium import PATIENCE, needs_chromium, opened_page, screenshot
 from tests.control.scripted import ScriptedBridge
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from tests.web.test_session import ANGLE, MASS, START, angle, angle_by_hand
@@ -28,6 +28,8 @@ ANGLE_OF_DRIVE = "parseFloat(document.querySelector('#vtb-drive-status').textCon
 
 PURPLE = np.array([156, 0, 200])  # the recorded course
 
+READY = "body[data-session=open][data-frame]"
+
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 
@@ -39,15 +41,8 @@ def running() -> Iterator[View]:
 
 @pytest.fixture
 def page(browser: Browser, running: View) -> Iterator[Page]:
-    opened = browser.new_page(viewport={"width": 1000, "height": 650})
-    opened.set_default_timeout(PATIENCE)
-    failures: list[str] = []
-    opened.on("pageerror", lambda error: failures.append(str(error)))
-    opened.goto(running.url)
-    opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
-    yield opened
-    opened.close()
-    assert not failures
+    with opened_page(browser, running.url, ready=READY) as opened:
+        yield opened
 
 
 def picture(page: Page) -> np.ndarray:
@@ -136,11 +131,7 @@ def test_dragged_slider_previews_and_its_release_commits(page: Page, running: Vi
 
 
 def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None:
-    with view(LimitedPendulumScenario()) as running:
-        opened = browser.new_page(viewport={"width": 1000, "height": 650})
-        opened.set_default_timeout(PATIENCE)
-        opened.goto(running.url)
-        opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+    with view(LimitedPendulumScenario()) as running, opened_page(browser, running.url, ready=READY) as opened:
         watch(opened, "u.angle")
         box = opened.locator(".vtb-pad.dial").bounding_box()
         assert box is not None
@@ -157,7 +148,6 @@ def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None
             settle(opened)
             expected = 0.0 if cancelled else np.arctan2(20.0, 40.0)
             assert running.session.snapshot()["u.angle"] == pytest.approx(expected, abs=0.03)
-        opened.close()
 
 
 def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: View) -> None:
@@ -220,17 +210,14 @@ def test_robot_that_has_moved_away_is_in_view(browser: Browser) -> None:
     velocity = [0.0, 0.0, 0.0, 4.0, 0.0, 4.9]
     with view(CubeTossScenario(), values={"sim.sys.cube.velocity": velocity}) as opened:
         opened.session.advance(round(1.0 / opened.session.config.step))
-        page = browser.new_page(viewport={"width": 1000, "height": 650})
-        page.set_default_timeout(PATIENCE)
-        page.goto(opened.url)
-        page.wait_for_function("window.vtb && vtb.followed")
-        target, place, distance = page.evaluate("""() => {
-            const { camera, controls } = viewer;
-            return [controls.target.toArray(), vtb.place, camera.position.distanceTo(controls.target)];
-        }""")
-        assert place[0] > 3.0 and distance < 2.0
-        assert np.linalg.norm(np.subtract(target, place)) < 0.3 * distance
-        page.close()
+        with opened_page(browser, opened.url, ready=READY) as page:
+            page.wait_for_function("window.vtb && vtb.followed")
+            target, place, distance = page.evaluate("""() => {
+                const { camera, controls } = viewer;
+                return [controls.target.toArray(), vtb.place, camera.position.distanceTo(controls.target)];
+            }""")
+            assert place[0] > 3.0 and distance < 2.0
+            assert np.linalg.norm(np.subtract(target, place)) < 0.3 * distance
 
 
 def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:
@@ -318,16 +305,15 @@ def test_closed_session_is_told(page: Page, running: View) -> None:
 
 def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path) -> None:
     study = tmp_path / "tilt.db"
-    with view(LimitedPendulumScenario(), problem=problem(horizon=600.0), study=study, folder=tmp_path) as running:
-        opened = browser.new_page(viewport={"width": 1280, "height": 800})
-        opened.set_default_timeout(PATIENCE)
-        # A gamepad that the test holds: Chromium asks for it in each poll.
-        opened.add_init_script(
-            "window.axes = [0, 0, 0, 0];"
-            "navigator.getGamepads = () => [{connected: true, axes: window.axes, buttons: []}, null];"
-        )
-        opened.goto(running.url)
-        opened.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+    # A gamepad that the test holds: Chromium asks for it in each poll.
+    gamepad = (
+        "window.axes = [0, 0, 0, 0];"
+        "navigator.getGamepads = () => [{connected: true, axes: window.axes, buttons: []}, null];"
+    )
+    with (
+        view(LimitedPendulumScenario(), problem=problem(horizon=600.0), study=study, folder=tmp_path) as running,
+        opened_page(browser, running.url, ready=READY, size=(1280, 800), script=gamepad) as opened,
+    ):
         opened.click("#vtb-drive summary")
         opened.click("#vtb-drive-begin")
         opened.wait_for_selector("#vtb-drive-keep")
@@ -358,7 +344,6 @@ def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path)
         opened.click("#vtb-save-test")
         drawn(opened, "vtb.messages.textContent.includes('test_to_the_left.py')")
         assert sorted(file.suffix for file in tmp_path.glob("test_to_the_left.*")) == [".py", ".vtb"]
-        opened.close()
 
 
 def record_swing(path: Path) -> None:
@@ -372,11 +357,10 @@ def record_swing(path: Path) -> None:
 
 def test_log_is_replayed_and_left_with_its_course_as_a_ghost(browser: Browser, tmp_path: Path) -> None:
     record_swing(tmp_path / "swing.lcm")
-    with view(log=tmp_path / "swing.lcm") as running:
-        opened = browser.new_page(viewport={"width": 1000, "height": 650})
-        opened.set_default_timeout(PATIENCE)
-        opened.goto(running.url)
-        opened.wait_for_selector("body[data-log=recorded][data-frame]", state="attached")
+    with (
+        view(log=tmp_path / "swing.lcm") as running,
+        opened_page(browser, running.url, ready="body[data-log=recorded][data-frame]") as opened,
+    ):
         assert "swing.lcm: what was recorded" in opened.locator("#vtb-log").inner_text()
         opened.keyboard.press("Space")
         drawn(opened, "parseFloat(vtb.clock.textContent) > 0.5")
@@ -397,4 +381,3 @@ def test_log_is_replayed_and_left_with_its_course_as_a_ghost(browser: Browser, t
         opened.wait_for_selector("body[data-log=recorded]", state="attached")
         settle(opened)
         assert share(picture(opened), PURPLE) < 1e-4
-        opened.close()

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import PATIENCE, needs_chromium
-from tests.web.test_page import drawn, picture, settle, share
+from tests.chromium import needs_chromium, opened_page
+from tests.web.test_page import READY, drawn, picture, settle, share
 from tests.web.test_session import ANGLE
 from vtbdrake.testbed import Scenario
 from vtbdrake.web import View, view
@@ -28,16 +28,8 @@ pytestmark = [pytest.mark.slow, needs_chromium]
 @contextmanager
 def shown(browser: Browser, scenario: Scenario, **values: object) -> Iterator[tuple[Page, View]]:
     """The page of a scenario."""
-    with view(scenario, values=values) as running:
-        page = browser.new_page(viewport={"width": 1000, "height": 650})
-        page.set_default_timeout(PATIENCE)
-        failures: list[str] = []
-        page.on("pageerror", lambda error: failures.append(str(error)))
-        page.goto(running.url)
-        page.wait_for_selector("body[data-session=open][data-frame]", state="attached")
+    with view(scenario, values=values) as running, opened_page(browser, running.url, ready=READY) as page:
         yield page, running
-        page.close()
-        assert not failures
 
 
 def toggle(page: Page, layer: str) -> None:

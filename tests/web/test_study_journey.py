@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.chromium import needs_chromium, opened_page, screenshot
 from tests.web.studies import ANGLE, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from tests.web.test_page import GREEN, drawn, share
 from vtbdrake.optimization import Parameter, Study
@@ -24,17 +23,8 @@ PURPLE = np.array([204, 51, 153])  # the ghost of the point at the pointer
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 
-@contextmanager
-def page_of(browser: Browser, view: StudyView) -> Iterator[Page]:
-    opened = browser.new_page(viewport={"width": 1000, "height": 700})
-    opened.set_default_timeout(PATIENCE)
-    failures: list[str] = []
-    opened.on("pageerror", lambda error: failures.append(str(error)))
-    opened.goto(view.url)
-    opened.wait_for_selector("body[data-page=open][data-trials]", state="attached")
-    yield opened
-    opened.close()
-    assert not failures
+def page_of(browser: Browser, view: StudyView) -> AbstractContextManager[Page]:
+    return opened_page(browser, view.url, ready="body[data-page=open][data-trials]", size=(1000, 700))
 
 
 def scene(page: Page) -> np.ndarray:
@@ -45,16 +35,18 @@ def scene(page: Page) -> np.ndarray:
 def place_of(page: Page, chart: str, trial: int) -> tuple[float, float]:
     """Where a trial lies on the screen."""
     drawn(page, f"vtb.{chart}.draws > 0")
-    x, y = page.evaluate(f"(k) => [vtb.{chart}.x(vtb.{chart}.data.x[k]), vtb.{chart}.y(vtb.{chart}.data.y[k])]", trial)
-    box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
-    assert box is not None
-    return box["x"] + x, box["y"] + y
+    return _on_screen(page, chart, f"vtb.{chart}.data.x[{trial}]", f"vtb.{chart}.data.y[{trial}]")
 
 
 def place_of_drive(page: Page, chart: str, number: int) -> tuple[float, float]:
     """Where the mark of a driven trial lies on the screen."""
     mark = f"vtb.{chart}.data.marks.find(({{ index }}) => index === {-1 - number}).at"
-    x, y = page.evaluate(f"[vtb.{chart}.x({mark}[0]), vtb.{chart}.y({mark}[1])]")
+    return _on_screen(page, chart, f"{mark}[0]", f"{mark}[1]")
+
+
+def _on_screen(page: Page, chart: str, x_of_data: str, y_of_data: str) -> tuple[float, float]:
+    """Where a point of a chart lies on the screen, from expressions for its values."""
+    x, y = page.evaluate(f"[vtb.{chart}.x({x_of_data}), vtb.{chart}.y({y_of_data})]")
     box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
     assert box is not None
     return box["x"] + x, box["y"] + y
