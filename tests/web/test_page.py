@@ -150,6 +150,55 @@ def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None
             assert running.session.snapshot()["u.angle"] == pytest.approx(expected, abs=0.03)
 
 
+def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Browser) -> None:
+    pose, handle = "sim.sys.cube.pose", ".vtb-place"
+    # Where the viewer draws the body, which the server has placed.
+    where = """() => {
+        const { object } = viewer.scene_tree.find(["drake", "now", "cube", "cube"]);
+        const [x, y] = viewer.camera.position.clone().setFromMatrixPosition(object.matrixWorld).project(viewer.camera);
+        const { left, top, width, height } = viewer.renderer.domElement.getBoundingClientRect();
+        return [left + 0.5 * (1 + x) * width, top + 0.5 * (1 - y) * height];
+    }"""
+    with view(CubeTossScenario()) as running, opened_page(browser, running.url, ready=READY) as page:
+        page.select_option("#vtb-follow", "")
+        watch(page, pose)
+        start = np.array(running.session.snapshot().values[pose])
+        place = np.array(page.evaluate(where))
+        box = page.locator(handle).bounding_box()
+        assert box is not None
+        np.testing.assert_allclose([box["x"] + 9, box["y"] + 9], place, atol=1.0)
+        for cancelled in (True, False):
+            page.mouse.move(*place)
+            page.mouse.down()
+            page.mouse.move(*(place + [60.0, 25.0]), steps=4)
+            page.wait_for_selector("[data-kind=preview]")
+            settle(page)
+            assert share(picture(page), GREEN) > 0.0005
+            if cancelled:
+                page.keyboard.press("Escape")
+                page.wait_for_selector("[data-kind=preview]", state="detached")
+            page.mouse.up()
+            settle(page)
+            if cancelled:
+                np.testing.assert_array_equal(running.session.snapshot().values[pose], start)
+        moved = np.array(running.session.snapshot().values[pose])
+        assert np.abs(moved[:2] - start[:2]).min() > 0.005
+        np.testing.assert_allclose(moved[2:], start[2:], atol=1e-9)
+        drawn(page, f"Math.hypot(...({where})().map((v, i) => v - {(place + [60.0, 25.0]).tolist()}[i])) < 2")
+        page.keyboard.down("Shift")
+        page.mouse.move(*(place + [60.0, 25.0]))
+        page.mouse.down()
+        page.mouse.move(*(place + [60.0, -35.0]), steps=4)
+        page.mouse.up()
+        page.keyboard.up("Shift")
+        settle(page)
+        lifted = np.array(running.session.snapshot().values[pose])
+        assert lifted[2] > moved[2] + 0.005
+        np.testing.assert_allclose(np.delete(lifted, 2), np.delete(moved, 2), atol=1e-9)
+        page.click(".vtb-watched button[title=remove]")
+        assert page.locator(handle).count() == 0
+
+
 def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: View) -> None:
     watch(page, MASS)
     page.check("#vtb-compare")

@@ -4,7 +4,7 @@ import { Connection, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
 import { Loop } from "./loop.js";
-import { Pad, padded } from "./pad.js";
+import { draggables } from "./pad.js";
 import { Recorded } from "./recorded.js";
 import { Keep } from "./keep.js";
 import { VirtualReality } from "./vr.js";
@@ -27,7 +27,7 @@ class Watched {
     const size = variable.shape.reduce((product, n) => product * n, 1);
     this.size = Math.min(size, ENTRIES);
     this.entries = Array.from({ length: this.size }, (_, index) => this.#entry(index));
-    this.pad = padded(variable) ? new Pad(this) : null;
+    this.draggables = draggables(this);
     this.root = element(
       "section",
       { className: "vtb-watched" },
@@ -40,7 +40,7 @@ class Watched {
         element("button", { className: "plain", title: "remove", onclick: () => page.unwatch(this) }, "×"),
       ),
       ...this.entries.map((entry) => entry.row),
-      ...(this.pad ? [this.pad.root] : []),
+      ...this.draggables.filter(({ root }) => !root.isConnected).map(({ root }) => root),
       size > ENTRIES ? element("small", {}, `and ${size - ENTRIES} more entries`) : "",
     );
     this.root.dataset.address = address;
@@ -117,7 +117,7 @@ class Watched {
       }
       entry.slider.value = now;
     });
-    this.pad?.show();
+    for (const part of this.draggables) part.show();
     this.#extend(time);
   }
 
@@ -288,6 +288,7 @@ class Page {
 
   unwatch(watched) {
     watched.root.remove();
+    for (const part of watched.draggables) part.remove();
     this.watched.delete(watched.address);
     this.#askToWatch();
   }
@@ -303,8 +304,8 @@ class Page {
   }
 
   preview(watched, values) {
-    if (this.loop) return;
     this.draft = { watched, values };
+    if (this.loop) return;
     this.timer ??= setTimeout(() => {
       this.timer = null;
       if (this.draft) this.ask("preview", { values: this.draft.values });
@@ -319,6 +320,7 @@ class Page {
   cancel() {
     this.draft?.watched.close("cancelled");
     this.draft = null;
+    if (this.loop) return;
     this.ask("cancel_preview");
     this.ask("cancel_comparison");
   }
@@ -356,7 +358,7 @@ class Page {
       Escape: () => this.cancel(),
     };
     if (event.ctrlKey || event.metaKey || event.altKey || !actions[event.key]) return;
-    if (this.loop && event.key !== "r") return;
+    if (this.loop && !["r", "Escape"].includes(event.key)) return;
     event.preventDefault();
     actions[event.key]();
   }
