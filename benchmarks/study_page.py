@@ -65,9 +65,8 @@ def study_page_open(repeats: int = 3) -> Benchmark:
             with view_study(paths[count]) as view:
                 page = browser.new_page(viewport={"width": 1280, "height": 800})
                 page.goto(view.url)
-                drawn = (
-                    f"document.body.dataset.trials === '{count}' && vtb.landscape.draws > 0 && vtb.history.draws > 0"
-                )
+                charts = ("vtb-landscape", "vtb-history-chart")
+                drawn = " && ".join(f"document.getElementById('{id}')?.dataset.points === '{count}'" for id in charts)
                 page.wait_for_function(drawn, timeout=120_000)
                 page.close()
 

@@ -14,10 +14,12 @@ from tests.testbeds import PendulumScenario
 from tests.web.test_session import frame
 from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.rollout import Quality
+from vtbdrake.rollout.course import task_without_problem
 from vtbdrake.rollout.named_function import magnitude
 from vtbdrake.testbed import Interface
 from vtbdrake.web import Session, SessionConfig, SessionError
 from vtbdrake.web.drive import DriveError
+from vtbdrake.web.interventions import Interventions
 
 ANGLE, COMMAND, TORQUE = "sim.sys.Pendulum.theta.position", "u.angle", "T_act.torque.idle"
 STEP = SessionConfig().step
@@ -199,6 +201,29 @@ def test_interventions_are_a_course_that_is_saved_as_a_test(session: Session, tm
     assert session.course is driven.course
     session.reset()
     assert session.course is None
+
+
+def test_course_of_many_interventions_is_bounded_and_repeats_its_end() -> None:
+    scenario = LimitedPendulumScenario()
+    testbed = scenario.build()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    interventions = Interventions(STEP, longest_part=4)
+    for n in range(11):
+        for value in (0.9, 0.1 * n):  # The second of an instant counts.
+            if interventions.needs_state:
+                interventions.begin(testbed.snapshot(context))
+            testbed.write(context, {COMMAND: value})
+            interventions.add(n * STEP, {COMMAND: value})
+        simulator.AdvanceTo((n + 1) * STEP)
+    course = interventions.course(11 * STEP)
+    assert course is not None
+    assert (course.start.time, course.steps) == (6 * STEP, 5)
+    assert [(n, values[COMMAND]) for n, values in course.writes] == [
+        (n, pytest.approx(0.1 * (6 + n))) for n in range(5)
+    ]
+    again = course.driven(task_without_problem(scenario)).read([ANGLE])[ANGLE]
+    assert again == pytest.approx(float(testbed.variables().read(context, [ANGLE])[ANGLE]), rel=1e-6)
 
 
 def test_without_a_problem_the_watched_values_are_expected(tmp_path: Path) -> None:

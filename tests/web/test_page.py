@@ -164,13 +164,14 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
         watch(page, pose)
         start = np.array(running.session.snapshot().values[pose])
         place = np.array(page.evaluate(where))
+        aside, above = place + np.array([60.0, 25.0]), place + np.array([60.0, -35.0])
         box = page.locator(handle).bounding_box()
         assert box is not None
         np.testing.assert_allclose([box["x"] + 9, box["y"] + 9], place, atol=1.0)
         for cancelled in (True, False):
             page.mouse.move(*place)
             page.mouse.down()
-            page.mouse.move(*(place + [60.0, 25.0]), steps=4)
+            page.mouse.move(*aside, steps=4)
             page.wait_for_selector("[data-kind=preview]")
             settle(page)
             assert share(picture(page), GREEN) > 0.0005
@@ -184,11 +185,11 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
         moved = np.array(running.session.snapshot().values[pose])
         assert np.abs(moved[:2] - start[:2]).min() > 0.005
         np.testing.assert_allclose(moved[2:], start[2:], atol=1e-9)
-        drawn(page, f"Math.hypot(...({where})().map((v, i) => v - {(place + [60.0, 25.0]).tolist()}[i])) < 2")
+        drawn(page, f"Math.hypot(...({where})().map((v, i) => v - {aside.tolist()}[i])) < 2")
         page.keyboard.down("Shift")
-        page.mouse.move(*(place + [60.0, 25.0]))
+        page.mouse.move(*aside)
         page.mouse.down()
-        page.mouse.move(*(place + [60.0, -35.0]), steps=4)
+        page.mouse.move(*above, steps=4)
         page.mouse.up()
         page.keyboard.up("Shift")
         settle(page)

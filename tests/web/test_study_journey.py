@@ -11,12 +11,12 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from tests.chromium import needs_chromium, opened_page, screenshot
-from tests.web.studies import ANGLE, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
+from tests.web.studies import ANGLE, FORCE, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from tests.web.test_page import GREEN, drawn, share
 from vtbdrake.optimization import Parameter, Study
 from vtbdrake.rollout import Quality
 from vtbdrake.rollout.named_function import magnitude
-from vtbdrake.web import StudyView, view_study
+from vtbdrake.web import Session, StudyView, view_study
 
 PURPLE = np.array([204, 51, 153])  # the ghost of the point at the pointer
 
@@ -169,6 +169,11 @@ def test_pareto_front_and_parallel_axes(browser: Browser) -> None:
     study = problem.study(solver="random", seed=1)
     study.run(rollouts=30, executor="serial", progress=False)
     study.intervene("budget", rollouts=60)
+    with Session(problem.scenario, problem=problem) as session:
+        session.drive([FORCE])
+        session.advance(8)
+        driven = session.end_drive()
+    drive = study.add_driven(driven.course, driven.result, parameters=problem.values_in(driven.course.start), by="Ada")
     with study.view() as view, page_of(browser, view) as page:
         page.click("#vtb-view-pareto")
         assert set(page.evaluate("vtb.front")) == {trial.number for trial in study.pareto()}
@@ -187,3 +192,12 @@ def test_pareto_front_and_parallel_axes(browser: Browser) -> None:
         page.click("#vtb-view-parallel")
         picture = screenshot(page, clip={"x": 20, "y": 130, "width": 460, "height": 250})
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+        # The driven trial crosses the axis of the pole's mass at its default.
+        drawn(page, "document.querySelector('#vtb-parallel').dataset.points === '30'")
+        mass = drive.parameters["sim.sys.cart_pole.pole.mass"]
+        x, y = page.evaluate(f"[vtb.parallel.x(1), vtb.parallel.y(1, {mass})]")
+        box = page.locator("#vtb-parallel").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + x, box["y"] + y)
+        drawn(page, f"document.body.dataset.pointed === '{-1 - drive.number}'")
+        assert "driven by Ada" in page.inner_text("#vtb-pointed")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.rollout.course import Course
@@ -11,43 +13,61 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
 
 
+@dataclass(frozen=True)
+class _Part:
+    """What was set from a state on: values by address, by the number of the step since then."""
+
+    start: Snapshot
+    writes: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+
 class Interventions:
     """The last course of a session in which something was set or driven.
 
+    What is set for hours, by a hand in virtual reality, does not fill the memory: the course is kept in two parts, each
+    with the state at its beginning, and the older one gives way to a new one.
+
     Args:
         step: The time between two instants at which the session may be changed, in seconds.
+        longest_part: The number of instants with values after which another part begins.
     """
 
-    def __init__(self, step: float) -> None:
-        self._step = step
+    def __init__(self, step: float, *, longest_part: int = 10_000) -> None:
+        self._step, self._longest_part = step, longest_part
         self._driven: Course | None = None
-        self._start: Snapshot | None = None
-        self._writes: dict[int, dict[str, Any]] = {}
+        self._parts: deque[_Part] = deque(maxlen=2)
 
     def forget(self, driven: Course | None = None) -> None:
         """Begin anew, behind a course that was driven or without one."""
-        self._driven, self._start, self._writes = driven, None, {}
+        self._driven = driven
+        self._parts.clear()
 
     @property
-    def begun(self) -> bool:
-        """Return whether something was set, so that a course goes on."""
-        return self._start is not None
+    def needs_state(self) -> bool:
+        """Return whether the next values begin a course, or another part of it, at the state before them."""
+        return not self._parts or len(self._parts[-1].writes) >= self._longest_part
 
     def begin(self, start: Snapshot) -> None:
-        """Begin a course at the state before its first values; one that was driven is over."""
-        self.forget()
-        self._start = start
+        """Begin a course, or another part of it; a course that was driven is over."""
+        self._driven = None
+        self._parts.append(_Part(start))
 
     def add(self, time: float, values: Mapping[str, Any]) -> None:
         """Add values by address, which were set at a time in seconds to a course that has begun."""
-        self._writes.setdefault(self._steps_until(time), {}).update(values)
+        part = self._parts[-1]
+        part.writes.setdefault(self._steps(part.start, time), {}).update(values)
 
     def course(self, now: float) -> Course | None:
         """Return the course until now; None if nothing was set or driven."""
-        if self._start is None:
+        if not self._parts:
             return self._driven
-        return Course(self._start, self._step, tuple(self._writes.items()), max(self._steps_until(now), 1))
+        start = self._parts[0].start
+        writes: dict[int, dict[str, Any]] = {}
+        for part in self._parts:
+            before = self._steps(start, part.start.time)
+            for number, values in part.writes.items():
+                writes.setdefault(before + number, {}).update(values)
+        return Course(start, self._step, tuple(writes.items()), max(self._steps(start, now), 1))
 
-    def _steps_until(self, time: float) -> int:
-        assert self._start is not None
-        return round((time - self._start.time) / self._step)
+    def _steps(self, start: Snapshot, time: float) -> int:
+        return round((time - start.time) / self._step)

@@ -778,7 +778,8 @@ class Session:
             return
         before = self._before_change(compare)
         # Values may come at 100 Hz, from a hand: only the first of a course needs the whole state.
-        start = None if self._interventions.begun else before or self._testbed.snapshot(self._context)
+        needs_state = self._interventions.needs_state
+        start = before or self._testbed.snapshot(self._context) if needs_state else None
         when = self._context.get_time()
         self._testbed.write(self._context, values)
         if start is not None:

@@ -122,7 +122,10 @@ class Chart {
         for (const canvas of [this.canvas, this.layer]) [canvas.width, canvas.height] = size;
         this.stale = true;
       }
-      if (this.stale) this.draw(this.#pen(this.layer, ratio));
+      if (this.stale) {
+        this.draw(this.#pen(this.layer, ratio));
+        this.canvas.dataset.points = this.data.kind.length;
+      }
       this.stale = false;
       const pen = this.#pen(this.canvas, 1);
       pen.drawImage(this.layer, 0, 0);
@@ -265,18 +268,19 @@ export class Scatter extends Chart {
   }
 }
 
-// One line per trial over all parameters and qualities, side by side. `data` is {columns: arrays, color, kind, order}.
+// One line per trial over all parameters and qualities, side by side. `data` is {columns: arrays, color, kind, order},
+// with marks [{at: values, tint, index}], which are broken lines and can be pointed at as in `Scatter`.
 export class Parallel extends Chart {
   show(data, scales) {
     Object.assign(this, { data, scales, stale: true });
     this.redraw();
   }
 
-  #x(axis) {
+  x(axis) {
     return 24 + (axis / Math.max(1, this.scales.length - 1)) * (this.width - 48);
   }
 
-  #y(axis, value) {
+  y(axis, value) {
     const scale = this.scales[axis];
     return this.height - 30 - scale.unit(value ?? scale.lower) * (this.height - 52);
   }
@@ -290,24 +294,37 @@ export class Parallel extends Chart {
     const axes = this.scales.length - 1, place = ((px - 24) / (this.width - 48)) * axes;
     const left = Math.min(Math.max(Math.floor(place), 0), axes - 1), share = place - left;
     let [nearest, least] = [-1, REACH];
-    for (let k = 0; k < this.data.kind.length; k++) {
-      const [a, b] = [this.#y(left, this.data.columns[left][k]), this.#y(left + 1, this.data.columns[left + 1][k])];
+    const { columns, kind, marks = [] } = this.data;
+    const measure = (index, from, to) => {
+      const [a, b] = [this.y(left, from), this.y(left + 1, to)];
       const distance = Math.abs(a + share * (b - a) - py);
-      if (distance < least) [nearest, least] = [k, distance];
-    }
+      if (distance < least) [nearest, least] = [index, distance];
+    };
+    for (let k = 0; k < kind.length; k++) measure(k, columns[left][k], columns[left + 1][k]);
+    for (const { at, index } of marks) measure(index, at[left], at[left + 1]);
     return nearest;
   }
 
+  #values(index) {
+    const { columns, kind, marks = [] } = this.data;
+    if (index >= 0) return index < kind.length ? columns.map((column) => column[index]) : null;
+    return marks.find((mark) => mark.index === index)?.at;
+  }
+
   draw(pen) {
-    const { columns, color: tint, order, best } = this.data;
+    const { color: tint, order, best, marks = [] } = this.data;
     pen.globalAlpha = Math.min(1, Math.max(0.06, 150 / order.length));
     pen.lineWidth = 1;
-    for (const k of order) this.#line(pen, columns, k, tint(k));
+    for (const k of order) this.#line(pen, this.#values(k), tint(k));
     pen.globalAlpha = 1;
     pen.lineWidth = 2.5;
-    if (best >= 0) this.#line(pen, columns, best, BEST);
+    if (best >= 0) this.#line(pen, this.#values(best), BEST);
+    pen.lineWidth = 1.5;
+    pen.setLineDash([6, 4]);
+    for (const { at, tint } of marks) this.#line(pen, at, tint);
+    pen.setLineDash([]);
     this.scales.forEach((scale, axis) => {
-      const at = this.#x(axis);
+      const at = this.x(axis);
       pen.fillStyle = SOFT;
       pen.fillRect(at, 22, 1, this.height - 52);
       pen.textAlign = axis === 0 ? "left" : axis === this.scales.length - 1 ? "right" : "center";
@@ -321,13 +338,14 @@ export class Parallel extends Chart {
 
   overlay(pen) {
     pen.lineWidth = 2.5;
-    if (this.pointed >= 0 && this.pointed < this.data.kind.length) this.#line(pen, this.data.columns, this.pointed, "#cc3399");
+    const values = this.#values(this.pointed);
+    if (values) this.#line(pen, values, "#cc3399");
   }
 
-  #line(pen, columns, k, tint) {
+  #line(pen, values, tint) {
     pen.strokeStyle = tint;
     pen.beginPath();
-    columns.forEach((column, axis) => pen[axis ? "lineTo" : "moveTo"](this.#x(axis), this.#y(axis, column[k])));
+    values.forEach((value, axis) => pen[axis ? "lineTo" : "moveTo"](this.x(axis), this.y(axis, value)));
     pen.stroke();
   }
 }

@@ -350,6 +350,12 @@ class Page {
     return marks.filter(({ at }) => at.every((value) => value !== null));
   }
 
+  // A drive may begin outside the ranges: its mark is then at the edge.
+  #inside(value, k) {
+    const { lower, upper, options } = this.parameters[k];
+    return value === null || options ? value : Math.min(Math.max(value, lower), upper);
+  }
+
   #showDeath(state) {
     if (state !== "died") return this.takeBack("died");
     if (this.messages.querySelector('[data-kind="died"]')) return;
@@ -441,7 +447,8 @@ class Page {
     if (this.view === "parallel") {
       const order = kind.map((_, k) => k).sort((a, b) => (shade(values[quality][a]) || 0) - (shade(values[quality][b]) || 0));
       const scales = [...this.parameters.map(({ address }, k) => this.scale(k, short(address))), ...this.qualities.map((_, q) => this.valueScale(q))];
-      this.parallel.show({ ...common, columns: [...points, ...values], order }, scales);
+      const drives = this.#drivenMarks(({ point, values }) => [...point.map((value, k) => this.#inside(value, k)), ...values.map((value, q) => value ?? scales[point.length + q].lower)]);
+      this.parallel.show({ ...common, columns: [...points, ...values], order, marks: drives }, scales);
     }
     if (this.view === "pareto") {
       const inFront = new Set(this.front);
@@ -480,9 +487,7 @@ class Page {
     const [x, y] = [Number(this.xAxis.value), single ? -1 : Number(this.yAxis.value)];
     const grid = this.grid && this.model.checked && this.grid.key === `${x} ${y} ${quality}` ? this.grid : null;
     const height = (point, value) => (single ? value : point[y]);
-    // A drive may begin outside the ranges: its mark is then at the edge.
-    const inside = (value, k) => (value === null || this.parameters[k].options ? value : Math.min(Math.max(value, this.parameters[k].lower), this.parameters[k].upper));
-    const marks = this.#drivenMarks(({ point, values }) => [inside(point[x], x), single ? values[quality] : inside(point[y], y)]);
+    const marks = this.#drivenMarks(({ point, values }) => [this.#inside(point[x], x), single ? values[quality] : this.#inside(point[y], y)]);
     if (this.tried) marks.push({ at: [this.tried.point[x], height(this.tried.point, this.tried.values[0])], tint: "#009e73", shape: "box" });
     if (!single && this.sections.try && !this.sections.try.hidden) marks.push({ at: [this.draft[x], this.draft[y]], tint: "#1c2329", shape: "cross" });
     this.landscape.show(
