@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from math import isfinite
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from math import nan
 
 import casadi
 import numpy as np
 
-from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.compiled import CompiledBatch, CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
 from vtbdrake.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, checked_workers
 from vtbdrake.rollout.pruning import Cutoff
-from vtbdrake.rollout.quality import Measure, QualityError, exceeds
-from vtbdrake.rollout.runner import CancelledError, result_of_samples, values_key
+from vtbdrake.rollout.quality import Measure, QualityError, exceeds, read_quality
+from vtbdrake.rollout.runner import CancelledError, values_key
 from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
-from vtbdrake.rollout.task import HORIZON, RolloutResult, RolloutTask
-from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds, split
+from vtbdrake.rollout.task import HORIZON, THRESHOLD, RolloutResult, RolloutTask
+from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Runners, Testbeds, split
 from vtbdrake.state.variables import A
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
@@ -99,7 +99,7 @@ class CompiledExecutor(Executor):
     def _of(self, task: RolloutTask, points: Sequence[Parameters]) -> _CompiledTask:
         fields, _ = split(points[0])
         key = (id(task), values_key(fields))
-        addresses = frozenset(address for point in points for address in split(point)[1])
+        addresses = frozenset(_variables(frozenset().union(*points)))
         compiled = self._compiled.use(key)
         if compiled is None or not compiled.varies(addresses):
             if compiled is not None:
@@ -182,12 +182,12 @@ class _CompiledTask:
         results: list[RolloutResult | None] = [None] * len(points)
         by_start: dict[tuple[int, tuple[str, ...]], list[int]] = {}
         for i, (point, start) in enumerate(zip(points, starts, strict=True)):
-            by_start.setdefault((id(start), tuple(split(point)[1])), []).append(i)
+            by_start.setdefault((id(start), tuple(point)), []).append(i)
         rows: dict[float, list[tuple[list[int], np.ndarray]]] = {}
         for (_, addresses), indices in by_start.items():
             try:
                 z, t0 = self._begin(starts[indices[0]])
-                values = {address: np.array([points[i][address] for i in indices]) for address in addresses}
+                values = {a: np.array([points[i][a] for i in indices]) for a in _variables(addresses)}
                 filled = self._rollouts.filled(z, values)
             except StartError:
                 raise
@@ -199,9 +199,8 @@ class _CompiledTask:
             batch = self._rollouts.from_z(np.concatenate([part for _, part in parts]), t0)
             order = [i for indices, _ in parts for i in indices]
             share = (time.perf_counter() - begun) / len(points)
-            for row, i in enumerate(order):
-                if batch.valid[row]:
-                    results[i] = self._result(points[i], {a: v[row] for a, v in batch.outputs.items()}, share)
+            for row, result in self._results([points[i] for i in order], batch, share):
+                results[order[row]] = result
         return results
 
     def _begin(self, start: Start | None) -> tuple[np.ndarray, float]:
@@ -218,55 +217,103 @@ class _CompiledTask:
             return False
         return self.varies(frozenset(start.values))
 
-    def _result(self, point: Parameters, outputs: Mapping[str, np.ndarray], wall_time: float) -> RolloutResult | None:
-        """Return the result of a rollout from what was recorded; None if f fails, so that Drake tells how."""
-        task, times = self._task, self._rollouts.times
-        count, samples = len(times), []
-        try:
-            for k, measure in enumerate(self._measures):
-                sampled = self._samples(k, measure, outputs, count)
-                if k == 0 and task.quality is not None and task.threshold is not None and not task.run_on:
-                    exceeding = np.flatnonzero(exceeds(sampled, task.threshold, minimize=task.minimize))
-                    count = int(exceeding[0]) + 1 if exceeding.size else count
-                samples.append(sampled)
-        except QualityError:
-            return None
-        samples = [sampled[:count] for sampled in samples]
-        record = {address: outputs[address][:count] for address in task.record}
-        result = result_of_samples(
-            task,
-            dict(point),
-            times[:count],
-            samples,
-            record,
-            end=HORIZON,
-            wall_time=wall_time,
-            computed=COMPILED,
-        )
-        numbers = (*result.measures, result.value) if task.quality is not None else result.measures
-        return result if all(map(isfinite, numbers)) else None
+    def _results(
+        self, points: Sequence[Parameters], batch: CompiledBatch, wall_time: float
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        """Yield (row, result) of the rollouts of a batch, without those that only Drake can make, or tell how f fails."""
+        task, f = self._task, self._task.quality
+        valid, samples = batch.valid.copy(), []
+        counts = np.full(len(points), len(batch.times))
+        for k, measure in enumerate(self._measures):
+            samples.append(self._samples(k, measure, batch.outputs, counts, valid))
+            if k == 0 and f is not None and task.threshold is not None and not task.run_on:
+                exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
+                counts = np.where(exceeded.any(axis=1), exceeded.argmax(axis=1) + 1, counts)
+        for count in np.unique(counts[valid]).tolist():
+            rows = np.flatnonzero(valid & (counts == count))
+            yield from self._read(points, rows, batch, [each[rows, :count] for each in samples], wall_time)
 
-    def _samples(self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-        """Return the samples of a measure, shape (count,) or more; after ``count`` they do not matter."""
-        times = self._rollouts.times
+    def _read(
+        self,
+        points: Sequence[Parameters],
+        rows: np.ndarray,
+        batch: CompiledBatch,
+        samples: Sequence[np.ndarray],
+        wall_time: float,
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        """Yield (row, result) of rollouts of equal length from their samples, of shape (rows, m) for each measure."""
+        task, f = self._task, self._task.quality
+        # So that sums over time have the same order, and result, as those of a single rollout.
+        samples = [np.ascontiguousarray(each) for each in samples]
+        m = samples[0].shape[1] if samples else len(batch.times)
+        times = batch.times[:m]
+        t_star = h = value = np.full(len(rows), nan)
+        quality, exceeded = np.empty((len(rows), 0)), np.zeros((len(rows), m), dtype=bool)
+        of_measures = samples
+        if f is not None:
+            t_star, value = read_quality(f, times, samples[0], task.threshold)
+            h, quality = f.quality(value), f.quality(samples[0])
+            exceeded, of_measures = exceeds(samples[0], task.threshold, minimize=task.minimize), samples[1:]
+        measures = [measure.read(times, each) for measure, each in zip(task.measures, of_measures, strict=True)]
+        finite = np.isfinite(np.array([*measures, *([] if f is None else [value])]).reshape(-1, len(rows))).all(axis=0)
+        numbers = zip(*(each.tolist() for each in (t_star, h, value, exceeded.any(axis=1), finite)), strict=True)
+        rows_of_measures = np.array(measures).reshape(-1, len(rows)).T.tolist()
+        for k, (row, (at, best, cost, is_beyond, is_finite)) in enumerate(zip(rows.tolist(), numbers, strict=True)):
+            if is_finite:
+                yield row, RolloutResult(
+                    parameters=dict(points[row]),
+                    end=THRESHOLD if is_beyond else HORIZON,
+                    times=times,
+                    quality=quality[k],
+                    t_star=at,
+                    h=best,
+                    value=cost,
+                    measures=tuple(rows_of_measures[k]),
+                    threshold=task.f_m,
+                    exceedances=times[exceeded[k]],
+                    record={address: batch.outputs[address][row, :m] for address in task.record},
+                    wall_time=wall_time,
+                    computed=COMPILED,
+                )
+
+    def _samples(
+        self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], counts: np.ndarray, valid: np.ndarray
+    ) -> np.ndarray:
+        """Return the samples of a measure, shape (n, m).
+
+        Args:
+            k: The number of the measure.
+            measure: The measure.
+            outputs: What was recorded, each of shape (n, m, ...).
+            counts: The number of samples of each rollout, shape (n,); later ones do not matter.
+            valid: Whether a rollout is valid, shape (n,); where f fails, it is set to False.
+        """
         if f"measure {k}" in self._traced:
-            sampled = outputs[f"measure {k}"]
-            for i in np.flatnonzero(~measure.accepts(sampled))[:1].tolist():
-                raise QualityError(f"{measure.name} is {sampled[i]} at t = {times[i]:g} s")
-            return sampled
-        values = [outputs[address] for address in measure.of]
-        samples = []
-        for i, t in enumerate(times[:count].tolist()):
-            samples.append(measure([_value(value[i]) for value in values], time=t))
-            if k == 0 and measure is self._task.quality and self._exceeds(samples[-1]):
-                break
-        return np.array(samples)
+            traced: np.ndarray = outputs[f"measure {k}"]
+            valid &= measure.accepts(traced).all(axis=1)
+            return traced
+        samples = np.full((len(valid), len(self._rollouts.times)), nan)
+        recorded = [outputs[address] for address in measure.of]
+        for row in np.flatnonzero(valid).tolist():
+            try:
+                for i, t in enumerate(self._rollouts.times[: counts[row]].tolist()):
+                    samples[row, i] = measure([_value(each[row, i]) for each in recorded], time=t)
+                    if k == 0 and measure is self._task.quality and self._exceeds(samples[row, i]):
+                        break
+            except QualityError:
+                valid[row] = False
+        return samples
 
     def _exceeds(self, sample: float) -> bool:
         task = self._task
         if task.threshold is None or task.run_on:
             return False
         return bool(exceeds(np.array(sample), task.threshold, minimize=task.minimize))
+
+
+def _variables(addresses: Iterable[str]) -> list[str]:
+    """Return the addresses of variables, without those of the scenario's fields."""
+    return [address for address in addresses if not address.startswith(FIELD)]
 
 
 def _value(value: np.ndarray) -> float | np.ndarray:

@@ -180,6 +180,6 @@ class DerivativeRunner:
     def _read(self, times: np.ndarray, samples: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
         t, value = READINGS[self._quality.reading](times, samples, not self._quality.minimize)
         if self._quality.reading == "integral":
-            return value, np.trapezoid(slopes, times, axis=0)
+            return float(value), np.trapezoid(slopes, times, axis=0)
         # Envelope theorem: at the best time f is stationary in time, or the time is an end.
-        return value, slopes[int(np.flatnonzero(times == t)[0])]
+        return float(value), slopes[int(np.flatnonzero(times == t)[0])]

@@ -13,26 +13,31 @@ import numpy as np
 from vtbdrake.argument_checks import as_addresses, as_flag, as_number
 from vtbdrake.failures import FAILURES, error_text, safe_text
 
-# (times, samples, True if larger samples are better) -> (time, number)
-Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[float, float]]
+# (times, samples, True if larger samples are better) -> (time, number): of samples of shape (..., n) at times of shape
+# (n,), each of shape (...), so that many rollouts are read at once.
+Reading = Callable[[np.ndarray, np.ndarray, bool], tuple[np.ndarray, np.ndarray]]
 
 
-def _best(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, float]:
-    index = int(np.argmax(samples) if larger else np.argmin(samples))
-    return float(times[index]), float(samples[index])
+def _best(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
+    return _at(times, samples, samples.argmax(axis=-1) if larger else samples.argmin(axis=-1))
 
 
-def _worst(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, float]:
+def _worst(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
     return _best(times, samples, not larger)
 
 
-def _end(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, float]:
-    return float(times[-1]), float(samples[-1])
+def _end(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
+    return np.broadcast_to(times[-1], samples.shape[:-1]), samples[..., -1]
 
 
-def _integral(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[float, float]:
+def _integral(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(over="ignore"):
-        return float(times[-1]), float(np.trapezoid(samples, times))
+        return np.broadcast_to(times[-1], samples.shape[:-1]), np.trapezoid(samples, times)
+
+
+def _at(times: np.ndarray, samples: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and the samples at ``index``, shape (...), of samples of shape (..., n)."""
+    return times[index], np.take_along_axis(samples, np.expand_dims(index, -1), axis=-1)[..., 0]
 
 
 READINGS: dict[str, Reading] = {"best": _best, "worst": _worst, "end": _end, "integral": _integral}
@@ -128,8 +133,8 @@ class Measure:
         return f"the {self.role} function {self.name} at t = {time:g} s, {arguments},"
 
     @abstractmethod
-    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
-        """Return the reading of the samples, shape (n,), at ``times``."""
+    def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
+        """Return the reading, shape (...), of the samples, shape (..., n), at ``times``, shape (n,)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -183,7 +188,7 @@ class Quality(Measure):
         """Return f' >= 0, larger is better, for samples of f or of the cost."""
         return 1.0 / (1.0 + np.asarray(samples)) if self.minimize else np.asarray(samples)
 
-    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
+    def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
         return READINGS[self.reading](times, samples, not self.minimize)[1]
 
     def bound(self, horizon: float) -> float:
@@ -216,14 +221,14 @@ class Constraint(Measure):
         if not self.at_least <= self.at_most or (self.at_least == -inf and self.at_most == inf):
             raise QualityError(f"a constraint takes at_most, at_least or both, in this order, not {limits}")
 
-    def read(self, times: np.ndarray, samples: np.ndarray) -> float:
+    def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
         """Return the violation: at most 0 where the constraint holds."""
         violations = []
         if self.at_most < inf:
             violations.append(READINGS[self.reading](times, samples, False)[1] - self.at_most)
         if self.at_least > -inf:
             violations.append(self.at_least - READINGS[self.reading](times, samples, True)[1])
-        return max(violations)
+        return np.max(violations, axis=0)
 
 
 def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = False) -> np.ndarray:
@@ -237,10 +242,23 @@ def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = Fa
     return samples < threshold if minimize else samples > threshold
 
 
-def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize: bool = False) -> int:
-    """Return the index of the sample at t*, equations (14) to (16).
+def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize: bool = False) -> np.ndarray:
+    """Return the index of the sample at t*, shape (...), equations (14) to (16), of samples of shape (..., n).
 
     It is the first sample that exceeds ``threshold``; if none does, the first of the best.
     """
-    exceeding = np.flatnonzero(exceeds(samples, threshold, minimize=minimize))
-    return int(exceeding[0]) if exceeding.size else int(np.argmin(samples) if minimize else np.argmax(samples))
+    best = samples.argmin(axis=-1) if minimize else samples.argmax(axis=-1)
+    exceeding = exceeds(samples, threshold, minimize=minimize)
+    return np.where(exceeding.any(axis=-1), exceeding.argmax(axis=-1), best)
+
+
+def read_quality(
+    f: Quality, times: np.ndarray, samples: np.ndarray, threshold: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (t*, f or the cost there), equations (14) to (17); for other readings than ``best``, time and number.
+
+    Both have the shape (...) for samples of shape (..., n) at times of shape (n,).
+    """
+    if f.reading != "best":
+        return READINGS[f.reading](times, samples, not f.minimize)
+    return _at(times, samples, best_sample(samples, threshold=threshold, minimize=f.minimize))

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
-from vtbdrake.rollout.quality import READINGS, Measure, Quality, QualityError, best_sample, exceeds
+from vtbdrake.rollout.quality import READINGS, Measure, QualityError, exceeds, read_quality
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
@@ -510,8 +510,6 @@ def result_of_samples(
     end: str,
     message: str = "",
     reachable: float | None = None,
-    wall_time: float = np.nan,
-    computed: str = "drake",
 ) -> RolloutResult:
     """Return the outcome of a rollout, equations (14) to (17), from what was sampled.
 
@@ -524,8 +522,6 @@ def result_of_samples(
         end: Why it ended, if no sample has exceeded the threshold.
         message: The reason.
         reachable: For a pruned rollout, the best that it could still have reached.
-        wall_time: Wall time in seconds.
-        computed: How it was computed, see `RolloutResult`.
     """
     f = task.quality
     of_quality = samples[0] if f is not None else np.array([])
@@ -537,12 +533,12 @@ def result_of_samples(
         end = THRESHOLD
     if times.size and end != FAILED:
         if f is not None:
-            t_star, value = _t_star(f, times, of_quality, task.threshold)
+            t_star, value = map(float, read_quality(f, times, of_quality, task.threshold))
             if end == PRUNED and reachable is not None:
                 value = reachable
             h = float(f.quality(np.array(value)))
         pairs = zip(task.measures, samples[len(samples) - len(task.measures) :], strict=True)
-        measures = tuple(measure.read(times, measured) for measure, measured in pairs)
+        measures = tuple(float(measure.read(times, measured)) for measure, measured in pairs)
     return RolloutResult(
         parameters=parameters,
         end=end,
@@ -556,8 +552,6 @@ def result_of_samples(
         times=times,
         quality=f.quality(of_quality) if f is not None else np.array([]),
         record=record,
-        wall_time=wall_time,
-        computed=computed,
     )
 
 
@@ -574,14 +568,6 @@ def _sample(measure: Measure, values: Sequence[Any], t: float) -> float:
         if all(np.isfinite(v).all() for v in values if isinstance(v, float | np.ndarray)):
             raise
         raise SimulationError(f"a variable of a {measure.role} is not finite: {error}") from error
-
-
-def _t_star(f: Quality, times: np.ndarray, samples: np.ndarray, threshold: float | None) -> tuple[float, float]:
-    """Return (t*, f or the cost there), equations (14) to (17); for other readings than ``best``, time and number."""
-    if f.reading != "best":
-        return READINGS[f.reading](times, samples, not f.minimize)
-    index = best_sample(samples, threshold=threshold, minimize=f.minimize)
-    return float(times[index]), float(samples[index])
 
 
 def _stack(values: list[Any]) -> Any:
