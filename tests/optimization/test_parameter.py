@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vtbdrake.optimization import Choice, Parameter
-from vtbdrake.optimization.parameter import point_text
+from vtbdrake.optimization.parameter import checked_point, checked_points, point_text
 
 pytestmark = pytest.mark.one_python
 
@@ -80,3 +80,17 @@ def test_what_is_no_value_is_refused(make, message):
 )
 def test_a_value_at_an_end_of_its_range_is_pointed_out(parameter, value, text):
     assert point_text([parameter], [value], ["N"]) == text
+
+
+@pytest.mark.parametrize(
+    "points", [[(0.5, 1.0), (-2.0, 100.0)], [(0.5, 1)], [(0.5, 1.0), (7.0, 1.0)], [(np.nan, 1.0)], [(0.5,)]]
+)
+def test_many_points_are_checked_as_each_of_them_is(points):
+    def outcome(check):
+        try:
+            return check()
+        except ValueError as error:
+            return str(error)
+
+    each = outcome(lambda: [checked_point(SPACE[:2], point) for point in points])
+    assert outcome(lambda: checked_points(SPACE[:2], points)) == each

@@ -25,7 +25,7 @@ def test_a_plan_in_use_is_shifted_to_the_decision():
 
 
 def test_a_point_becomes_values_by_address_and_a_trajectory_begins_now():
-    values = SPACE.values((0.5, 1.0, 2.0, 3.0, 4.0, 1.0), HELD, 6.0)
+    values = SPACE.values([(0.5, 1.0, 2.0, 3.0, 4.0, 1.0)], HELD, 6.0)[0]
     assert values.keys() == {"u.speed", "u.plan", "dps.gait"}
     assert (values["u.speed"], values["dps.gait"]) == (0.5, 1.0)
     np.testing.assert_allclose(values["u.plan"], [6.0, 1.0, 2.0, 3.0, 4.0])
@@ -34,7 +34,7 @@ def test_a_point_becomes_values_by_address_and_a_trajectory_begins_now():
 def test_a_rate_limited_plan_goes_on_from_the_one_in_use():
     limited = Trajectory("u.plan", 4, 3.0, "linear", lower=-10.0, upper=10.0, rate=2.0)
     space = DecisionSpace([limited])
-    values = space.values((9.0, -9.0, 9.0, -9.0), {"u.plan": HELD["u.plan"]}, 5.5)
+    values = space.values([(9.0, -9.0, 9.0, -9.0)], {"u.plan": HELD["u.plan"]}, 5.5)[0]
     begin, *knots = values["u.plan"]
     assert begin == 5.5
     assert knots[0] == pytest.approx(1.0)  # Half way from 0 to 2.

@@ -15,7 +15,7 @@ from scipy.special import ellipj, ellipk
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import Constraint, Quality, QualityError, RolloutRunner, RolloutTask
-from vtbdrake.rollout.quality import best_sample, exceeds
+from vtbdrake.rollout.quality import READINGS, best_sample, exceeds, read_quality
 from vtbdrake.state import AddressedSystem, Quantity
 
 PERIOD = 0.1
@@ -370,3 +370,16 @@ def test_a_negative_cost_is_refused():
 def test_a_quality_without_a_name_is_f():
     assert Quality(lambda z: z, of="time").name == "f"
     assert Quality(abs, of="time").name == "abs"
+
+
+@pytest.mark.parametrize("reading", READINGS)
+@pytest.mark.parametrize("minimize", [False, True])
+@pytest.mark.parametrize("threshold", [None, 0.9])
+def test_many_rollouts_are_read_as_each_of_them_is(reading: str, minimize: bool, threshold: float | None) -> None:
+    times = np.linspace(0.0, 2.0, 301)
+    samples = np.random.default_rng(3).uniform(size=(50, 301))
+    quality = Quality(float, of=["q"], reading=reading, minimize=minimize)
+    constraint = Constraint(float, of=["q"], reading=reading, at_least=0.2, at_most=0.7)
+    together = [*read_quality(quality, times, samples, threshold), constraint.read(times, samples)]
+    each = [(*read_quality(quality, times, row, threshold), constraint.read(times, row)) for row in samples]
+    np.testing.assert_array_equal(np.array(together).T, each)

@@ -177,7 +177,7 @@ class CompiledRollouts:
                 raise ValueError(f"there are {len(array)} values of {address}, but {count} of others")
             count = len(array) if many else count
             places.append((self.walker.place(address), array.reshape(len(array) if many else 1, -1)))
-        batch = np.tile(z, (count, 1))
+        batch = np.repeat(z[np.newaxis], count, axis=0)
         for entries, array in places:
             batch[:, entries] = array
         return batch

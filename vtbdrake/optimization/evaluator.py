@@ -65,7 +65,7 @@ class Evaluator:
         self._budget = budget
         self._round = round_size
         self._conditions = range(len(problem.conditions))
-        self._signs = np.array([quality.sign for quality in problem.objectives])
+        self._signs = [quality.sign for quality in problem.objectives]
         self._minimize = [quality.minimize for quality in problem.objectives]
         self._bounds = [quality.bound(problem.task.horizon) for quality in problem.objectives]
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
@@ -99,9 +99,7 @@ class Evaluator:
                 count = max(1, int(min(left, count)))
             evaluations |= self._evaluate_together(waiting[:count])
             waiting = waiting[count:]
-        return [
-            replace(evaluations[point], effort=self._untold.pop(point, 0) / len(self._conditions)) for point in points
-        ]
+        return [_with_effort(evaluations[p], self._untold.pop(p, 0) / len(self._conditions)) for p in points]
 
     def _evaluate_together(self, points: Sequence[Point]) -> dict[Point, Evaluation]:
         if self._racing:
@@ -176,11 +174,12 @@ class Evaluator:
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._outcomes.get((point, c)) if c in counted else None for c in self._conditions]
         finished = [outcome for outcome in outcomes if outcome is not None]
-        exact = len(finished) == len(outcomes) and all(outcome.end != PRUNED for outcome in finished)
+        ends = [outcome.end for outcome in finished]
+        exact = len(ends) == len(outcomes) and PRUNED not in ends
         constraints = len(self._problem.constraints)
-        if any(outcome.end == FAILED for outcome in finished):
+        if FAILED in ends:
             # After one failed simulation the other conditions change nothing.
-            return Evaluation(point, (nan,) * self._signs.size, (nan,) * constraints, exact=exact)
+            return Evaluation(point, (nan,) * len(self._signs), (nan,) * constraints, exact=exact)
         values, violations = aggregate(
             outcomes,
             risk=self._problem.risk,
@@ -200,6 +199,10 @@ class Evaluator:
             return
         if self.best is None or evaluation.values[0] > self.best.values[0]:
             self.best = evaluation
+
+
+def _with_effort(evaluation: Evaluation, effort: float) -> Evaluation:
+    return evaluation if evaluation.effort == effort else replace(evaluation, effort=effort)
 
 
 class Gradients:

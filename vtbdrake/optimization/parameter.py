@@ -261,6 +261,19 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
     return tuple(parameter.as_value(value) for parameter, value in zip(parameters, entries, strict=True))
 
 
+def checked_points(parameters: Sequence[Dimension], points: Sequence[Sequence[Any]]) -> list[tuple[Any, ...]]:
+    """Check points and return their values; see `checked_point`."""
+    if {type(value) for point in points for value in point} == {float} and {*map(len, points)} == {len(parameters)}:
+        # Many floats are compared as arrays.
+        ranges = [(p.lower, p.upper) for p in parameters if isinstance(p, Parameter) and not p.integer]
+        numbers = np.array(points)
+        if len(ranges) == len(parameters):
+            lower, upper = np.array(ranges).T
+            if ((numbers >= lower) & (numbers <= upper)).all():
+                return [tuple(point) for point in points]
+    return [checked_point(parameters, point) for point in points]
+
+
 def _check_address(address: Any) -> None:
     if not isinstance(address, str):
         raise ValueError(f"a parameter is named by its address, a text, not by {address!r}")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from vtbdrake.argument_checks import all_of, as_number, as_whole
 from vtbdrake.optimization.boundary import Boundary, BoundarySearch, Refinement, checked_jitter, parameter_with_boundary
-from vtbdrake.optimization.parameter import Dimension, checked_point
+from vtbdrake.optimization.parameter import Dimension, checked_point, checked_points
 from vtbdrake.optimization.risk import Risk, make_risk
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.optimization.sweep import Sweep, as_points, borrowed, grid, make_sweep, numeric, roll_out
@@ -272,6 +272,10 @@ class Problem:
             ValueError: The point has another number of entries, or one lies outside its range.
         """
         return checked_point(self.parameters, point)
+
+    def points(self, points: Sequence[Point]) -> list[Point]:
+        """Check points s^0; see `point`."""
+        return checked_points(self.parameters, points)
 
     def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
         """Return the values that a point sets in s0, address -> value, and those of a condition if it is given.

@@ -97,6 +97,7 @@ class DecisionRun:
         self._results: dict[RolloutKey, RolloutResult] = {}
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
+        self._evaluations: dict[Point, Evaluation] = {}
         # What each candidate sets, address -> value.
         self._planned: dict[Point, dict[str, Any]] = {KEEP: {}}
         # The plan in use as a point of the search, if it is one.
@@ -116,7 +117,7 @@ class DecisionRun:
         """Try candidates; return how the method ended."""
         reasoner, rollouts = self._reasoner, self._budget.rollouts
         start = self._user_plan or self._in_use()
-        if start is not None and same_values(self._values(start), self._plan_in_use):
+        if start is not None and same_values(self._values([start])[0], self._plan_in_use):
             self._point_in_use = start
         first = [KEEP] if start is None else [KEEP, start]
         # The plan in use is never simulated twice.
@@ -141,11 +142,13 @@ class DecisionRun:
         except ValueError:
             return None
 
-    def _values(self, point: Point) -> dict[str, Any]:
-        """Return the values that a candidate sets, address -> value."""
-        if point not in self._planned:
-            self._planned[point] = self._reasoner.space.values(point, self._plan_in_use, self._time)
-        return self._planned[point]
+    def _values(self, points: Sequence[Point]) -> list[dict[str, Any]]:
+        """Return the values that candidates set, address -> value for each of them."""
+        new = [point for point in dict.fromkeys(points) if point not in self._planned]
+        if new:
+            values = self._reasoner.space.values(new, self._plan_in_use, self._time)
+            self._planned |= zip(new, values, strict=True)
+        return [self._planned[point] for point in points]
 
     def _iterate(self, solver: Solver, first: Sequence[Point], evaluated: Sequence[Evaluation]) -> str:
         """Try the candidates that a method asks for; return how it ended.
@@ -160,7 +163,7 @@ class DecisionRun:
             proposals = ask_within(solver, self._deadline - time.monotonic())
             if proposals is None:
                 raise _BudgetSpentError(TIME, f"{self._time_spent()}, before {solver.name} proposed more candidates")
-            points = [self._problem.point(point) for point in proposals]
+            points = self._problem.points(proposals)
             before = self._count
             evaluations = self._try([*first, *points])
             if not points and rollouts is not None and rollouts - self._count < self._reasoner.samples:
@@ -181,6 +184,7 @@ class DecisionRun:
             batch = points[k : k + count]
             self._proposed |= dict.fromkeys(p for p in batch if (p, 0) not in self._results and p != self._point_in_use)
             evaluations += self._evaluator.evaluate(batch)
+        self._evaluations |= zip(points, evaluations, strict=True)
         return evaluations
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
@@ -190,7 +194,7 @@ class DecisionRun:
         new = [key for key in keys if key[0] != self._point_in_use]
         affordable = new if rollouts is None else new[: rollouts - self._count]
         if affordable:
-            points = [self._values(point) for point, _ in affordable]
+            points = self._values([point for point, _ in affordable])
             starts = [self._starts[sample] for _, sample in affordable]
             self._collect(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), affordable)
         if self._point_in_use is not None:
@@ -275,7 +279,7 @@ class DecisionRun:
 
     def _candidate(self, number: int, point: Point) -> Candidate:
         results = [self._results.get((point, sample)) for sample in range(self._reasoner.samples)]
-        evaluation = self._evaluator.evaluation(point)
+        evaluation = self._evaluations.get(point) or self._evaluator.evaluation(point)
         finished = tuple(result for result in results if result is not None)
         if evaluation.failed:
             status = FAILED
@@ -288,7 +292,7 @@ class DecisionRun:
         has_quality = status in (ELIGIBLE, VIOLATES, CUT_OFF)
         return Candidate(
             number=number,
-            values=self._values(point) or dict(self._plan_in_use),
+            values=self._planned[point] or dict(self._plan_in_use),
             status=status,
             quality=self._evaluator.in_user_terms(evaluation)[0] if has_quality else nan,
             violations=evaluation.violations,

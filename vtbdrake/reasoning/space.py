@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -87,22 +87,22 @@ class DecisionSpace:
                 point.append(element.as_value(value))
         return tuple(point)
 
-    def values(self, point: Point, plan: Mapping[str, Any], time: float) -> dict[str, Any]:
-        """Return the values that a point of the search sets, address -> value as the DPS takes it.
+    def values(self, points: Sequence[Point], plan: Mapping[str, Any], time: float) -> list[dict[str, Any]]:
+        """Return the values that points of the search set, address -> value as the DPS takes it, for each of them.
 
         Args:
-            point: One value per parameter.
+            points: Points, with one value per parameter.
             plan: The plan in use, address -> value; a trajectory with limited rate continues from its value.
             time: The time of the decision in seconds, at which a trajectory begins.
         """
-        values = {}
+        columns: list[Iterable[Any]] = []
         for element, part in zip(self.elements, self._parts, strict=True):
+            entries = [point[part] for point in points]
             if isinstance(element, Trajectory):
-                knots = element.limited(point[part], start=_value_at(element, plan[element.address], time))
-                values[element.address] = element.plan(knots, time)
+                columns.append(element.plans(entries, time, start=_value_at(element, plan[element.address], time)))
             else:
-                (values[element.address],) = point[part]
-        return values
+                columns.append(value for (value,) in entries)
+        return [dict(zip(self.addresses, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def _value_at(trajectory: Trajectory, plan: np.ndarray, time: float) -> np.ndarray | None:

@@ -158,6 +158,21 @@ class Trajectory:
         """
         return np.concatenate(([float(begin)], self._matrix(knots).ravel()))
 
+    def plans(self, knots: ArrayLike, begin: float, *, start: ArrayLike | None = None) -> Array:
+        """Return the whole plans [t_begin, knots] of N trajectories within the limits, see `limited`.
+
+        Args:
+            knots: Shape (N, n m).
+            begin: Time t_begin in seconds.
+            start: The value at which the trajectories begin, a scalar or shape (m,); None: that of the first knot.
+
+        Returns:
+            Shape (N, 1 + n m).
+        """
+        n, m = self.spline.knots, self.size
+        W = self._within_limits(np.asarray(knots, dtype=float).reshape(-1, n, m), start)
+        return np.column_stack((np.full(len(W), float(begin)), W.reshape(-1, n * m)))
+
     def values(self, knots: ArrayLike, times: ArrayLike, derivative: int = 0) -> Array:
         """Return the trajectory, or a derivative, at some times.
 
@@ -201,16 +216,21 @@ class Trajectory:
         Returns:
             Knots in the shape of those given.
         """
+        return self._within_limits(self._matrix(knots)[np.newaxis], start).reshape(np.shape(knots))
+
+    def _within_limits(self, W: Array, start: ArrayLike | None) -> Array:
+        """Return the nearest knots within the limits, of N trajectories, shape (N, n, m)."""
         lower, upper = self._limits[:2]
-        w = np.clip(self._matrix(knots), lower, upper)
+        W = np.clip(W, lower, upper)
         if start is not None:
-            w[0] = np.clip(start, lower, upper)
+            W[:, 0] = np.clip(start, lower, upper)
         if not (self.spline.stays_within_knots and self._has_only_range):
-            exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
-            for j in np.flatnonzero(exceeded).tolist():
-                projected = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
-                w[:, j] = self._slowed(projected, j)
-        return w.reshape(np.shape(knots))
+            for w in W:
+                exceeded = np.max([*self._beyond(w).values()], axis=0) > 0.0
+                for j in np.flatnonzero(exceeded).tolist():
+                    projected = np.clip(self._projected(w[:, j], j, fixed=int(start is not None)), lower[j], upper[j])
+                    w[:, j] = self._slowed(projected, j)
+        return W
 
     def _slowed(self, w: Array, j: int) -> Array:
         """Return the knots of entry ``j``, drawn together towards the first one until the limits of rates are kept.

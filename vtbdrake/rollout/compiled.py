@@ -194,7 +194,9 @@ class _CompiledTask:
             except (UnsupportedTestbedError, ValueError) as error:
                 _log.warning("%d rollouts are simulated in Drake: %s", len(indices), error)
                 continue
-            rows.setdefault(t0, []).append((indices, np.broadcast_to(filled, (len(indices), filled.shape[1]))))
+            if not values:
+                filled = np.repeat(filled, len(indices), axis=0)
+            rows.setdefault(t0, []).append((indices, filled))
         for t0, parts in rows.items():
             batch = self._rollouts.from_z(np.concatenate([part for _, part in parts]), t0)
             order = [i for indices, _ in parts for i in indices]
@@ -220,7 +222,7 @@ class _CompiledTask:
     def _results(
         self, points: Sequence[Parameters], batch: CompiledBatch, wall_time: float
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Yield (row, result) of the rollouts of a batch, without those that only Drake can make, or tell how f fails."""
+        """Yield (row, result) of the rollouts of a batch, except those that Drake makes: invalid, or f fails."""
         task, f = self._task, self._task.quality
         valid, samples = batch.valid.copy(), []
         counts = np.full(len(points), len(batch.times))
@@ -255,26 +257,28 @@ class _CompiledTask:
             h, quality = f.quality(value), f.quality(samples[0])
             exceeded, of_measures = exceeds(samples[0], task.threshold, minimize=task.minimize), samples[1:]
         measures = [measure.read(times, each) for measure, each in zip(task.measures, of_measures, strict=True)]
-        finite = np.isfinite(np.array([*measures, *([] if f is None else [value])]).reshape(-1, len(rows))).all(axis=0)
-        numbers = zip(*(each.tolist() for each in (t_star, h, value, exceeded.any(axis=1), finite)), strict=True)
-        rows_of_measures = np.array(measures).reshape(-1, len(rows)).T.tolist()
-        for k, (row, (at, best, cost, is_beyond, is_finite)) in enumerate(zip(rows.tolist(), numbers, strict=True)):
-            if is_finite:
-                yield row, RolloutResult(
+        # One row per rollout.
+        numbers = np.array([t_star, h, value, *measures]).T
+        finite = np.isfinite(numbers[:, 3 if f is None else 2 :]).all(axis=1)
+        ends = np.where(exceeded.any(axis=1), THRESHOLD, HORIZON).tolist()
+        for k, (row, (t, best, reported, *of_row)) in enumerate(zip(rows.tolist(), numbers.tolist(), strict=True)):
+            if finite[k]:
+                result = RolloutResult(
                     parameters=dict(points[row]),
-                    end=THRESHOLD if is_beyond else HORIZON,
+                    end=ends[k],
                     times=times,
                     quality=quality[k],
-                    t_star=at,
+                    t_star=t,
                     h=best,
-                    value=cost,
-                    measures=tuple(rows_of_measures[k]),
+                    value=reported,
+                    measures=tuple(of_row),
                     threshold=task.f_m,
                     exceedances=times[exceeded[k]],
                     record={address: batch.outputs[address][row, :m] for address in task.record},
                     wall_time=wall_time,
                     computed=COMPILED,
                 )
+                yield row, result
 
     def _samples(
         self, k: int, measure: Measure, outputs: Mapping[str, np.ndarray], counts: np.ndarray, valid: np.ndarray

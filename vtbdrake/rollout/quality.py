@@ -27,12 +27,12 @@ def _worst(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.nda
 
 
 def _end(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
-    return np.broadcast_to(times[-1], samples.shape[:-1]), samples[..., -1]
+    return np.full(samples.shape[:-1], times[-1]), samples[..., -1]
 
 
 def _integral(times: np.ndarray, samples: np.ndarray, larger: bool) -> tuple[np.ndarray, np.ndarray]:
     with np.errstate(over="ignore"):
-        return np.broadcast_to(times[-1], samples.shape[:-1]), np.trapezoid(samples, times)
+        return np.full(samples.shape[:-1], times[-1]), np.trapezoid(samples, times)
 
 
 def _at(times: np.ndarray, samples: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -186,7 +186,7 @@ def test_it_refuses_to_be_told_of_other_points(name):
         solver.ask()
     with pytest.raises(SolverError, match="to be told of those first"):
         solver.tell([evaluation((0.123, 0.456), SPHERE.cost)] * len(points))
-    with pytest.raises(SolverError, match="1 values, not 2"):
+    with pytest.raises(SolverError, match="1 values and 0 violations, not 2 and 0"):
         solver.tell([Evaluation(p, (0.0, 0.0)) for p in points])
     solver.close()
 

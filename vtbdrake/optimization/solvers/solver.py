@@ -37,7 +37,7 @@ class PointValues:
     def failed(self) -> bool:
         """Return whether the point has no value because a simulation failed."""
         # An infinite bound is no failure: it belongs to a dropped point of which little is known.
-        return any(not isfinite(value) and (self.exact or isnan(value)) for value in self.values)
+        return not all(map(isfinite, self.values)) and (self.exact or any(map(isnan, self.values)))
 
     @property
     def feasible(self) -> bool:
@@ -77,7 +77,7 @@ class Evaluation(PointValues):
     @property
     def usable(self) -> bool:
         """Return whether the simulation gave numbers, feasible or not."""
-        return not self.failed and not any(isnan(violation) for violation in self.violations)
+        return not self.failed and not any(map(isnan, self.violations))
 
     @property
     def total_violation(self) -> float:
@@ -366,13 +366,13 @@ class Solver(ABC):
                 f"{self.name} asked for {count} points and is to be told of those first, in their order; "
                 f"it was told of {len(evaluations)}"
             )
+        sizes = self.search.objectives, self.search.constraints
         for evaluation in evaluations:
-            for name, numbers, expected in (
-                ("values", evaluation.values, self.search.objectives),
-                ("violations", evaluation.violations, self.search.constraints),
-            ):
-                if len(numbers) != expected:
-                    raise SolverError(f"an evaluation of this problem has {expected} {name}, not {len(numbers)}")
+            if (len(evaluation.values), len(evaluation.violations)) != sizes:
+                raise SolverError(
+                    f"an evaluation of this problem has {sizes[0]} values and {sizes[1]} violations, not "
+                    f"{len(evaluation.values)} and {len(evaluation.violations)}"
+                )
         self._pending = []
         used = sum(evaluation.effort for evaluation in evaluations)
         self._used += used
