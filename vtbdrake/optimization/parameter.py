@@ -262,15 +262,14 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
 
 
 def checked_points(parameters: Sequence[Dimension], points: Sequence[Sequence[Any]]) -> list[tuple[Any, ...]]:
-    """Check points and return their values; see `checked_point`."""
-    if {type(value) for point in points for value in point} == {float} and {*map(len, points)} == {len(parameters)}:
-        # Many floats are compared as arrays.
-        ranges = [(p.lower, p.upper) for p in parameters if isinstance(p, Parameter) and not p.integer]
+    """Check points and return their values; see `checked_point`. Floats are compared with the ranges all at once."""
+    continuous = [parameter for parameter in parameters if isinstance(parameter, Parameter) and not parameter.integer]
+    are_floats = {type(value) for point in points for value in point} == {float}
+    if are_floats and len(continuous) == len(parameters) and {*map(len, points)} == {len(parameters)}:
+        lower, upper = np.array([(parameter.lower, parameter.upper) for parameter in continuous]).T
         numbers = np.array(points)
-        if len(ranges) == len(parameters):
-            lower, upper = np.array(ranges).T
-            if ((numbers >= lower) & (numbers <= upper)).all():
-                return [tuple(point) for point in points]
+        if ((numbers >= lower) & (numbers <= upper)).all():
+            return [tuple(point) for point in points]
     return [checked_point(parameters, point) for point in points]
 
 

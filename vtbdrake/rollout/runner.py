@@ -474,7 +474,7 @@ class _Samples:
 
     def result(self, parameters: dict[str, Any], end: str, message: str, started: float) -> RolloutResult:
         task = self._runner.task
-        result = result_of_samples(
+        result = _result_of_samples(
             task,
             parameters,
             np.array(self._times),
@@ -500,7 +500,7 @@ class _Samples:
         return runner.state(parameters, t_star, start=runner._start_context.start)
 
 
-def result_of_samples(
+def _result_of_samples(
     task: RolloutTask,
     parameters: dict[str, Any],
     times: np.ndarray,
@@ -508,8 +508,9 @@ def result_of_samples(
     record: Mapping[str, Any],
     *,
     end: str,
-    message: str = "",
-    reachable: float | None = None,
+    message: str,
+    reachable: float | None,
+    wall_time: float,
 ) -> RolloutResult:
     """Return the outcome of a rollout, equations (14) to (17), from what was sampled.
 
@@ -522,6 +523,7 @@ def result_of_samples(
         end: Why it ended, if no sample has exceeded the threshold.
         message: The reason.
         reachable: For a pruned rollout, the best that it could still have reached.
+        wall_time: Wall time in seconds.
     """
     f = task.quality
     of_quality = samples[0] if f is not None else np.array([])
@@ -552,6 +554,7 @@ def result_of_samples(
         times=times,
         quality=f.quality(of_quality) if f is not None else np.array([]),
         record=record,
+        wall_time=wall_time,
     )
 
 
