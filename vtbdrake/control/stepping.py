@@ -9,7 +9,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
 from vtbdrake.control.bridge import Bridge
@@ -78,13 +78,6 @@ def time_after(steps: int, *, start: float, period: float) -> float:
     if steps and abs(first * period - start) <= _ON_GRID * period:
         return (first + steps) * period
     return start + steps * period
-
-
-def times_after(steps: NDArray[np.int64], *, start: float, period: float) -> NDArray[np.float64]:
-    """Return `time_after` of every entry of ``steps``, bit for bit."""
-    first = round(start / period)
-    on_grid = abs(first * period - start) <= _ON_GRID * period
-    return np.where(steps, (first + steps) * period if on_grid else start + steps * period, start)
 
 
 def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:

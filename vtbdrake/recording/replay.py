@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydrake.systems.analysis import InitializeParams, Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
-from pydrake.systems.primitives import Demultiplexer, TrajectorySource, VectorLogSink
-from pydrake.trajectories import DiscreteTimeTrajectory
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from vtbdrake.control.stepping import (
     Change,
@@ -22,7 +17,6 @@ from vtbdrake.control.stepping import (
     RealPorts,
     numeric_parameters,
     time_after,
-    times_after,
 )
 from vtbdrake.control.switching import throw
 from vtbdrake.failures import FAILURES, error_text
@@ -37,16 +31,12 @@ from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.interrupt import Interruptible
 from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE, Position
 
-_log = logging.getLogger(__name__)
-
 IDENTICAL, DIFFERENT, NOT_COMPARED = "identical", "different", "not compared"
 
 Target = VirtualTestbed | DpsAlone
 
 _TICK = "tick"  # key of a sample's number in a result of a slow part
 _KEPT_PERIOD, _MOST_KEPT = 1.0, 500  # s between two states that are kept, and how many
-_BATCH = 250  # cycles; a trajectory source searches all its samples in every step
-_TOLERANCE = 1e-9  # s, of the time of a sample
 
 
 class Difference(NamedTuple):
@@ -131,10 +121,11 @@ def replay(
         AddressError: An address is unknown.
     """
     log = log if isinstance(log, ControlLog) else read_log(log)
-    run = None if target or values or record else _replay_in_batches(log)
-    if run is None:
-        run = _Replay(log, target or _recorded_target(log), dict(values or {}), record)
-        run.run()
+    run = _Replay(log, target or _recorded_target(log), dict(values or {}), record)
+    with Interruptible() as interruptible:
+        while run.index < run.count:
+            interruptible.raise_interrupt()
+            run.advance()
     differences = run.differences()
     outcome = NOT_COMPARED if values else DIFFERENT if differences else IDENTICAL
     here = installed_versions()
@@ -188,10 +179,10 @@ class _Replay:
         header = log.header
         self.same_kind = target_kind(target) == header.target
         self._log, self._target, self._values = log, target, values
-        self._context = context = self._new_context()
+        self._context = context = target.default_context()
         _restore(log, target, context)
         target.write(context, values)
-        self._simulator = self._new_simulator()
+        self._simulator = self._new_simulator(restored=header.initialized)
         # Keep alive: stops pydrake from re-wrapping the parameters in every step.
         self._parameters = numeric_parameters(target.diagram, context)
         self._ports = RealPorts(target, context)
@@ -200,6 +191,14 @@ class _Replay:
         self._digest = StateDigest(target, context)
         self._readers = {address: target.reader(address) for address in record}
         self._decoders = _abstract_decoders(log, target)
+        # Where each vector sensor signal has a new value, its name, and its values.
+        self._vectors = [
+            (_changed(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()
+        ]
+        self._changes: dict[int, list[Change]] = {}
+        for i, change in log.changes:
+            self._changes.setdefault(i, []).append(change)
+        self._digested = {i for i, _ in log.digests}
         self._handlers: dict[str, Callable[[Mapping[str, Any]], None]] = {
             ChangeKind.WRITE: self._write,
             ChangeKind.SWITCH: self._switch,
@@ -220,36 +219,13 @@ class _Replay:
         self._outputs: list[tuple[Callable[[Context], Any], np.ndarray | None, np.ndarray]] = []
         self._find_outputs()
 
-    def _new_context(self) -> Context:
-        return self._target.default_context()
-
-    def _new_simulator(self) -> Simulator:
-        simulator = self._target.simulator(self._context, restored=self._log.header.initialized)
+    def _new_simulator(self, *, restored: bool) -> Simulator:
+        simulator = self._target.simulator(self._context, restored=restored)
         simulator.set_target_realtime_rate(0.0)
         return simulator
 
     def _time(self, steps: int) -> float:
         return time_after(steps, start=self._log.header.start_time, period=self._log.header.period)
-
-    @cached_property
-    def _vectors(self) -> list[tuple[list[bool], str, np.ndarray]]:
-        """Return where each vector sensor signal has a new value, its name, and its values."""
-        log = self._log
-        return [(_changed(values, log.sources[name]).tolist(), name, values) for name, values in log.fed.items()]
-
-    @cached_property
-    def _changes(self) -> Mapping[int, list[Change]]:
-        return self._changes_by_cycle()
-
-    @cached_property
-    def _digested(self) -> set[int]:
-        return {i for i, _ in self._log.digests}
-
-    def run(self) -> None:
-        with Interruptible() as interruptible:
-            while self.index < self.count:
-                interruptible.raise_interrupt()
-                self.advance()
 
     def advance(self) -> None:
         """Replay the next cycle."""
@@ -280,8 +256,7 @@ class _Replay:
         """Stand again where the replay has stood."""
         log, stepped = self._log, state.steps > self._log.header.steps
         self._target.restore(self._context, state.snapshot)
-        self._simulator = self._target.simulator(self._context, restored=log.header.initialized or stepped)
-        self._simulator.set_target_realtime_rate(0.0)
+        self._simulator = self._new_simulator(restored=log.header.initialized or stepped)
         for name, values in log.fed.items():
             if log.sources[name][: state.cycles].any():
                 self._ports.feed(name, values[state.cycles - 1])
@@ -357,12 +332,6 @@ class _Replay:
         return sorted(differences, key=lambda difference: difference.cycle)
 
     # -- changes
-
-    def _changes_by_cycle(self) -> Mapping[int, list[Change]]:
-        changes: dict[int, list[Change]] = {}
-        for i, change in self._log.changes:
-            changes.setdefault(i, []).append(change)
-        return changes
 
     def _apply(self, change: Change) -> None:
         if change.kind not in self._handlers:
@@ -557,120 +526,3 @@ def _message_decoder(log: ControlLog, channel: str, decoder: Decoder, name: str)
         return decoder(log.events.data(*places[event]))[1][name]
 
     return decode
-
-
-# -- the quick way
-
-
-class _BatchError(RuntimeError):
-    """A DPS that can only be replayed cycle by cycle."""
-
-
-def _replay_in_batches(log: ControlLog) -> _Replay | None:
-    """Return the replay of the DPS alone if that was recorded and replays identically in batches, otherwise None.
-
-    A difference proves nothing here: the replay cycle by cycle decides.
-    """
-    if log.header.target != DPS:
-        return None
-    try:
-        run = _BatchReplay(log, cast(DpsAlone, _recorded_target(log)))
-        run.run()
-    except LogError:
-        raise
-    except FAILURES as error:
-        _log.info("replayed cycle by cycle: %s", error)
-        return None
-    if differences := run.differences():
-        _log.info("replayed cycle by cycle: %s", differences[0])
-        return None
-    return run
-
-
-class _BatchReplay(_Replay):
-    """A replay of the DPS alone without Python per cycle: systems in C++ feed it and log its actuator commands.
-
-    A sensor value exists at the time of its cycle's beginning only: a DPS that reads its inputs at another time raises.
-    Actuator commands are logged where a cycle ends, before what is updated at that time.
-
-    Raises:
-        _BatchError: A signal is abstract, the DPS has continuous state, or its actuator commands have direct
-            feedthrough from its sensor values.
-    """
-
-    def __init__(self, log: ControlLog, target: DpsAlone) -> None:
-        interface, inner = target.interface, target.diagram
-        if not all(signal.is_vector for signal in (*interface.sense, *interface.act)) or not interface.sense:
-            raise _BatchError("a signal is abstract, or there is no sensor signal")
-        sense = [inner.GetInputPort(f"real.sense.{signal.name}") for signal in interface.sense]
-        act = {signal.name: inner.GetOutputPort(f"real.act.{signal.name}") for signal in interface.act}
-        if any(inner.HasDirectFeedthrough(i.get_index(), o.get_index()) for i in sense for o in act.values()):
-            raise _BatchError("the actuator commands have direct feedthrough from the sensor values")
-        self._fed = np.hstack([log.fed[signal.name] for signal in interface.sense])
-        builder = DiagramBuilder()
-        builder.AddSystem(inner)
-        nothing = DiscreteTimeTrajectory([0.0], [np.zeros((self._fed.shape[1], 1))])
-        self._source = builder.AddSystem(TrajectorySource(nothing))
-        split = builder.AddSystem(Demultiplexer([port.size() for port in sense]))
-        builder.Connect(self._source.get_output_port(), split.get_input_port())
-        for i, port in enumerate(sense):
-            builder.Connect(split.get_output_port(i), port)
-        self._sinks = {}
-        for name, output in act.items():
-            self._sinks[name] = builder.AddSystem(VectorLogSink(output.size(), {TriggerType.kPerStep}, 0.0))
-            builder.Connect(output, self._sinks[name].get_input_port())
-        self._diagram: Diagram = builder.Build()
-        if self._diagram.CreateDefaultContext().num_continuous_states():
-            raise _BatchError("the DPS has continuous state")
-        super().__init__(log, target, {}, ())
-
-    def _new_context(self) -> Context:
-        context = self._diagram.CreateDefaultContext()
-        self._target.attach(context)
-        return context
-
-    def _new_simulator(self) -> Simulator:
-        simulator = Simulator(self._diagram, self._context)
-        if self._log.header.initialized:
-            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
-        return simulator
-
-    def _find_outputs(self) -> None:
-        """Do nothing: a DPS alone commands all its signals, from its beginning on."""
-
-    def run(self) -> None:
-        log, header = self._log, self._log.header
-        changes, digests = self._changes_by_cycle(), {i for i, _ in log.digests}
-        switched = [i for i, change in log.changes if change.kind == ChangeKind.SWITCH]
-        first = min([*switched, self.count] if self._idle else [0])
-        steps = self._steps + np.arange(self.count - first + 1)
-        times = times_after(steps, start=header.start_time, period=header.period)
-        self.times[:first], self.times[first:] = self._now, times[1:]
-        if first < self.count and not all(source[: first + 1].any() for source in log.sources.values()):
-            raise _BatchError("the DPS begins without a value of every sensor signal")
-        stops = {*changes, *(i + 1 for i in digests), *range(first + 1)}
-        for i, end in pairwise([*sorted(i for i in stops if i < self.count), self.count]):
-            for change in changes.get(i, ()):
-                self._apply(change)
-            if i >= first:
-                self._advance(i, end, times[i - first : end - first + 1])
-            if end - 1 in digests:
-                self.digests.append((end - 1, self._digest()))
-        self._take_actuation(first, times[1:])
-
-    def _advance(self, first: int, end: int, times: np.ndarray) -> None:
-        """Step the cycles ``first`` to ``end`` - 1, which begin and end at ``times``."""
-        for a, b in pairwise([*range(first, end, _BATCH), end]):
-            begins = times[a - first : b - first].tolist()
-            values = list(self._fed[a:b, :, np.newaxis])
-            self._source.UpdateTrajectory(DiscreteTimeTrajectory(begins, values, _TOLERANCE))
-            self._simulator.AdvanceTo(times[b - first])
-
-    def _take_actuation(self, first: int, times: np.ndarray) -> None:
-        for name, sink in self._sinks.items():
-            logged = sink.FindLog(self._context)
-            where = np.minimum(np.searchsorted(logged.sample_times(), times), logged.num_samples() - 1)
-            if not np.array_equal(logged.sample_times()[where], times):
-                raise _BatchError("the steps do not end where cycles do")
-            self.actuation[name][first:] = logged.data().T[where]
-            self.commanded[name][first:] = True

@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.argument_checks import as_addresses, suggestion
-from vtbdrake.control.stepping import times_after
+from vtbdrake.control.stepping import time_after
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.replay import replay
 from vtbdrake.rollout import RolloutResult
@@ -179,7 +179,8 @@ def simulate(
     simulator = testbed.simulator(context, restored=restored)
     if not restored:
         simulator.Initialize()
-    times = times_after(np.arange(count + 1), start=context.get_time(), period=sample_period)
+    start = context.get_time()
+    times = np.array([time_after(k, start=start, period=sample_period) for k in range(count + 1)])
     samples = [[read(context) for read in readers]]
     for time in times[1:].tolist():
         simulator.AdvanceTo(time)
