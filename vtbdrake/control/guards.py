@@ -238,7 +238,9 @@ class Guards:
                         raise ActuationError(FaultKind.MISSING, "is missing")
                     if limiter.needs_start and not limiter.has_start:
                         raise ActuationError(
-                            FaultKind.NOT_STARTED, "is limited in rate or acceleration, but has no start"
+                            FaultKind.NOT_STARTED,
+                            "has nothing to depart from within its limits of rate or acceleration: no command of it is "
+                            "recent, and no measurement of it is reliable",
                         )
                     checked_commands.append((name, limiter, limiter.checked(actuation[name])))
                 except ActuationError as problem:
