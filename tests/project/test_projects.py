@@ -33,7 +33,12 @@ ROBOTS = {
     "desk": EXAMPLES / "kuka_iiwa_arm" / "models" / "desk" / "transcendesk55inch.sdf",
 }
 
+# Other files of the acrobot: the same joints and actuators.
+ALIKE = ("acrobot_sdf", "acrobot_no_collision")
+
 STATIONS = {"torque_station": "Torque", "position_station": "Position", "mixed_station": "PositionAndTorque"}
+# One for each parser of Drake, and a station: the rest of Drake is the same for all.
+EACH_KIND = ("small_arm", "mujoco_arm", "hand", "torque_station")
 
 
 @pytest.fixture(scope="module")
@@ -69,22 +74,27 @@ def test_projects_pass_ruff(projects: Path) -> None:
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("name", ["small_arm", "hand", "torque_station"])
-def test_robots_hold_and_move_by_the_projects_tests(projects: Path, name: str) -> None:
-    check_tests_pass(projects / f"my_{name}", "-k", "hold or move")
-
-
-def test_dps_of_a_project_drives_its_machine(projects: Path) -> None:
-    check_tests_pass(projects / "my_scara", "-k", "machine")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ROBOTS, *STATIONS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in EACH_KIND else [pytest.mark.one_python])
+        for name in [*ROBOTS, *STATIONS]
+        if name not in ALIKE
+    ],
+)
 def test_projects_pass_their_tests(projects: Path, name: str) -> None:
     check_tests_pass(projects / f"my_{name}")
 
 
+@pytest.mark.one_python
+@pytest.mark.parametrize("name", ALIKE)
+def test_other_files_of_a_robot_hold_move_and_drive(projects: Path, name: str) -> None:
+    check_tests_pass(projects / f"my_{name}", "-k", "hold or move or machine")
+
+
 @pytest.mark.slow
+@pytest.mark.one_python
 def test_the_program_of_a_project_drives_a_machine(projects: Path) -> None:
     done = python("-m", "my_small_arm.drive", cwd=projects / "my_small_arm")
     assert "the log repeats, bit for bit: True" in done.stdout, done.stdout + done.stderr
@@ -92,12 +102,14 @@ def test_the_program_of_a_project_drives_a_machine(projects: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.one_python
 def test_optimization_of_a_project_finds_feasible_gains(projects: Path) -> None:
     done = python("-m", "my_small_arm.optimize", cwd=projects / "my_small_arm")
     assert "dps.frequency" in done.stdout, done.stdout + done.stderr
 
 
 @pytest.mark.slow
+@pytest.mark.one_python
 @pytest.mark.parametrize("name", ["pendulum", "torque_station"])
 def test_notebook_of_a_project_runs(projects: Path, name: str) -> None:
     import nbformat
