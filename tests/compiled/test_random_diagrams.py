@@ -62,6 +62,7 @@ def test_begins_at_any_time(t0: float) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.one_python
 def test_two_hundred_are_the_diagram() -> None:
     differences = {seed: difference(seed, t0=float(seed % 3) * 0.05) for seed in range(1000, 1200)}
     assert max(differences.values()) <= 1e-11

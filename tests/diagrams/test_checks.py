@@ -48,8 +48,16 @@ EXPECTED = {
 }
 
 
-# Scenarios of studies: variants of others, for which one Python is enough.
-VARIANTS = (ArmMotionScenario, LightingScenario, ApproachScenario, RouteScenario)
+# Variants of others, for which one Python is enough.
+VARIANTS = (
+    ArmMotionScenario,
+    LightingScenario,
+    ApproachScenario,
+    RouteScenario,
+    PlainScenario,
+    CraterScenario,
+    TorqueLimitedPendulumScenario,
+)
 
 
 @parametrize_with_checks(

@@ -30,7 +30,14 @@ def _run(executor, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        SerialExecutor,
+        pytest.param(lambda: ThreadExecutor(2), marks=pytest.mark.one_python),
+        pytest.param(lambda: ProcessExecutor(2), marks=pytest.mark.one_python),
+    ],
+)
 def test_memory_stays_flat_over_ten_thousand_rollouts(make):
     others = set(child_pids())
     with make() as executor:

@@ -35,6 +35,8 @@ from vtbdrake.testing.assertions import (
 from vtbdrake.testing.failure import failures_in
 from vtbdrake.testing.trace import ENERGY, Trace, TraceError, simulate
 
+pytestmark = pytest.mark.one_python
+
 ANGLE = "plant.state"
 
 

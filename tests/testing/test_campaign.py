@@ -26,6 +26,8 @@ from vtbdrake.optimization.study_file import StudyError
 from vtbdrake.testing.campaign import Campaign, CampaignError
 from vtbdrake.testing.campaign_results import Comparison, interval, largest_rate, least_rate
 
+pytestmark = pytest.mark.one_python
+
 FUNCTIONS = "tests.testing.campaign_functions"
 STATED = {
     "scenario": "tests.testbeds:PendulumScenario",

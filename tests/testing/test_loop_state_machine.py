@@ -29,6 +29,8 @@ from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.motions import Motion
 
+pytestmark = pytest.mark.one_python
+
 
 @dataclass
 class MovedServo(ServoMachineScenario):

@@ -17,6 +17,8 @@ from vtbdrake.testing.mutants import KINDS, Mutant, mutants_of, mutate, mutation
 from vtbdrake.testing.trace import simulate
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
+pytestmark = pytest.mark.one_python
+
 pytest_plugins = ["pytester"]
 
 START = {"sim.sys.Acrobot.shoulder.position": 0.5, "sim.sys.Acrobot.elbow.position": -0.2}

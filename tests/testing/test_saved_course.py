@@ -16,6 +16,8 @@ from vtbdrake.rollout import Quality, RolloutTask
 from vtbdrake.rollout.course import Course
 from vtbdrake.testing.saved_course import SavedCourseError, save_course
 
+pytestmark = pytest.mark.one_python
+
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = '''
 """A pendulum with friction in its joint, held by a spring."""

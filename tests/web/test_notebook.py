@@ -28,6 +28,8 @@ from vtbdrake.web import View, view
 from vtbdrake.web.notebook import page_bundle
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
+pytestmark = pytest.mark.one_python
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "vtbdrake" / "web" / "page" / "notebook.js"
 ANGLE = "sim.sys.cart_pole.pole_pin.position"

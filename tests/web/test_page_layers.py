@@ -22,7 +22,7 @@ from vtbdrake_diagrams.satellite import SatelliteScenario
 
 ORANGE, RED = np.array([214, 94, 0]), np.array([214, 0, 0])
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.slow, pytest.mark.one_python, needs_chromium]
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from vtbdrake.web.viewer import view_loop
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.slow, pytest.mark.one_python, needs_chromium]
 
 
 def test_loop_is_watched_until_it_ends(browser: Browser) -> None:

@@ -20,7 +20,7 @@ from vtbdrake.web import Session, StudyView, view_study
 
 PURPLE = np.array([204, 51, 153])  # the ghost of the point at the pointer
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.slow, pytest.mark.one_python, needs_chromium]
 
 
 def page_of(browser: Browser, view: StudyView) -> AbstractContextManager[Page]:

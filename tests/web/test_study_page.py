@@ -25,6 +25,8 @@ from vtbdrake.rollout import Quality
 from vtbdrake.web import StudyView, view_study
 from vtbdrake.web.study_worker import PointError, PointSimulator
 
+pytestmark = pytest.mark.one_python
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -37,6 +37,8 @@ from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.leading import REST
 from vtbdrake_diagrams.manipulator.motions import Motion
 
+pytestmark = pytest.mark.one_python
+
 TOOL = RigidTransform([0.1, 0.2, 0.3])
 
 

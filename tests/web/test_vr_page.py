@@ -28,7 +28,7 @@ XRReferenceSpace.prototype.getOffsetReferenceSpace = function (offset) {
 };
 """
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.slow, pytest.mark.one_python, needs_chromium]
 
 
 def pose(numbers: list[float]) -> RigidTransform:
