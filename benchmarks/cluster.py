@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
+from distributed import Client
 
 from benchmarks.dask_cluster import dask_cluster
 from benchmarks.measure import HIGHER, Benchmark
@@ -47,7 +50,7 @@ def _elapsed(slots: int, each: int) -> float:
     """Return how long a cluster of so many slots needs for its rollouts, so many for each, in s."""
     task = RolloutTask(SpaceClimberScenario(), 15.0, Quality(abs, MASS))
     points = [{MASS: float(mass)} for mass in np.linspace(0.0, 20.0, each * slots)]
-    with dask_cluster(workers=PROCESSES, threads=slots // PROCESSES) as cluster, _Waiting(cluster.client) as executor:
+    with dask_cluster(workers=PROCESSES, threads=slots // PROCESSES) as cluster, Waiting(cluster.client) as executor:
         list(executor.run(task, points[: 2 * slots]))
         begin = time.perf_counter()
         count = sum(1 for _ in executor.run(task, points))
@@ -55,17 +58,45 @@ def _elapsed(slots: int, each: int) -> float:
         return time.perf_counter() - begin
 
 
+class Waiting(DaskExecutor):
+    """An executor on a Dask cluster whose rollouts only wait for ``duration`` (s), so that its slots may be many.
+
+    They cost what `cost` says.
+    """
+
+    def __init__(self, client: Client | str, *, duration: float = DURATION) -> None:
+        super().__init__(client)
+        self._function = partial(wait_on_dask, duration)
+
+
 def wait_on_dask(
-    name: str, indices: Sequence[int], points: Sequence[bytes], starts: Sequence[bytes], time_limit: float
+    duration: float,
+    name: str,
+    indices: Sequence[int],
+    points: Sequence[bytes],
+    starts: Sequence[bytes],
+    time_limit: float,
 ) -> list[bytes]:
     """Take the time of rollouts on a worker, and return results of the usual size."""
     answers = []
-    for index, point in zip(indices, points, strict=True):
-        time.sleep(DURATION)
-        result = RolloutResult(pickle.loads(point), "horizon", TIMES, np.cos(TIMES), wall_time=DURATION)
+    for index, content in zip(indices, points, strict=True):
+        time.sleep(duration)
+        point = pickle.loads(content)
+        value = cost(point)
+        result = RolloutResult(
+            point,
+            "horizon",
+            TIMES,
+            np.cos(TIMES),
+            t_star=0.0,
+            h=1.0 / (1.0 + value),
+            value=value,
+            wall_time=duration,
+        )
         answers.append(pickle.dumps((index, result)))
     return answers
 
 
-class _Waiting(DaskExecutor):
-    _function = staticmethod(wait_on_dask)
+def cost(point: Mapping[str, Any]) -> float:
+    """Return the cost of a rollout that only waits: the sum of squares of what is set in s0."""
+    return float(sum(np.sum(np.square(value)) for value in point.values()))

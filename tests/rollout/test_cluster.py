@@ -3,9 +3,14 @@
 import logging
 import os
 import queue
+import signal
+import sqlite3
+import subprocess
+import sys
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import dask
@@ -13,8 +18,11 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster, get_task_stream
 
-from benchmarks.dask_cluster import dask_cluster
+from benchmarks.cluster import Waiting, cost
+from benchmarks.dask_cluster import ROOT, dask_cluster
+from tests.optimization.studies import StatedExecutor
 from tests.rollout.scenarios import HANG, KILL, KILL_PARENT, RecordedScenario, TreacherousScenario
+from tests.rollout.waiting_study import ROLLOUTS, SLOTS, waiting_study
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, Start, WorkerError, make_executor
 from vtbdrake.rollout import cluster as cluster_module
@@ -239,6 +247,55 @@ def test_cluster_without_workers_is_reported_while_it_is_waited_for(monkeypatch)
             assert len(waiting.result(timeout=60.0)) == 2
     finally:
         log.removeHandler(handler)
+
+
+@pytest.mark.one_python
+def test_killed_study_on_many_slots_is_resumed(tmp_path):
+    path = tmp_path / "killed.db"
+    with LocalCluster(
+        n_workers=4,
+        threads_per_worker=SLOTS // 4,
+        processes=False,
+        protocol="tcp://",
+        host="127.0.0.1",
+        dashboard_address=None,
+    ) as many:
+        command = [sys.executable, "-m", "tests.rollout.waiting_study", str(path), many.scheduler_address]
+        process = subprocess.Popen(command, cwd=ROOT)
+        # It is killed in the midst of its second batch.
+        while _recorded(path) < 1.5 * SLOTS:
+            assert process.poll() is None, "the study ended before it could be killed"
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        with waiting_study(path) as study, Waiting(many.scheduler_address, duration=0.0) as executor:
+            before = set(study.rollouts)
+            assert 1.5 * SLOTS <= len(before) < ROLLOUTS
+            study.run(rollouts=ROLLOUTS, executor=executor, progress=False)
+            assert before < set(study.rollouts)
+            resumed = _table(study)
+    # The same study, never interrupted and without a cluster.
+    whole = waiting_study().run(
+        rollouts=ROLLOUTS, executor=StatedExecutor(lambda point: (cost(point), ())), progress=False
+    )
+    assert len(whole) == ROLLOUTS
+    assert resumed == _table(whole)
+
+
+def _recorded(path):
+    """Return the number of rollouts that a study in another process has recorded."""
+    if not path.exists():
+        return 0
+    with closing(sqlite3.connect(path)) as connection:
+        try:
+            return connection.execute("SELECT count(*) FROM rollouts").fetchone()[0]
+        except sqlite3.OperationalError:
+            return 0
+
+
+def _table(study):
+    rollouts = {row: (result.h, result.value, result.end) for row, result in study.rollouts.items()}
+    return [(trial.parameters, trial.values, trial.batch) for trial in study.trials], rollouts
 
 
 def test_missing_scheduler_is_an_error():
