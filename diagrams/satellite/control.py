@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import hypot
+
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
@@ -124,7 +126,7 @@ class ArmController(AddressedSystem):
                 away = np.concatenate((np.zeros(3), -p.back_off_speed * relative.R_BG[:, 2]))
                 rates = self._rates.value((q, away, [0.0, p.damping])).copy()
             else:
-                rates = np.clip(self._stowed - command[:ARM_JOINTS], -0.5 * p.joint_rate, 0.5 * p.joint_rate)
+                rates = (self._stowed - command[:ARM_JOINTS]).clip(-0.5 * p.joint_rate, 0.5 * p.joint_rate)
         elif guidance.follows:
             twist = self._twist(relative, guidance, p)
             rates = self._rates.value((q, twist, [p.posture_gain, p.damping])).copy()
@@ -141,10 +143,10 @@ class ArmController(AddressedSystem):
             rates, has, reaction = self._gentle(q, before, rates, had, most=most, holding=holding)
             momentum.momentum, momentum.holding = has, holding
             self._torque.mutable(state).reaction = reaction
-        following = np.clip(command[:ARM_JOINTS] + T * rates, q - p.lead, q + p.lead)
-        following = np.clip(following, self._lower, self._upper)
+        following = (command[:ARM_JOINTS] + T * rates).clip(q - p.lead, q + p.lead)
+        following = following.clip(self._lower, self._upper)
         fingers = command[ARM_JOINTS:]
-        fingers = fingers + np.clip(guidance.opening - fingers, -T * p.finger_rate, T * p.finger_rate)
+        fingers = fingers + (guidance.opening - fingers).clip(-T * p.finger_rate, T * p.finger_rate)
         self._command.mutable(state).joint_position = np.concatenate((following, fingers))
         memory.joint_rate_command, memory.measured_position = rates, measured
 
@@ -179,14 +181,14 @@ class ArmController(AddressedSystem):
         e_p = relative.p_BH + offset - relative.p_BG
         e_R = rotation_vector(R_BD @ relative.R_BG.T)
         v_BD = relative.v_BH + cross_matrix(relative.w_BH) @ offset - guidance.rate * axis
-        distance = float(np.linalg.norm(e_p))
+        distance = hypot(*e_p.tolist())
         speed = stopping_speed(distance, gain=p.position_gain, acceleration=p.acceleration)
         v = min(p.speed, speed) * e_p / max(distance, 1e-9)
         return np.concatenate((relative.w_BH + _limited(p.orientation_gain * e_R, p.turn_rate), v_BD + v))
 
 
 def _limited(vector: Array, length: float) -> Array:
-    norm = float(np.linalg.norm(vector))
+    norm = hypot(*vector.tolist())
     return vector if norm <= length else vector * (length / norm)
 
 
@@ -234,7 +236,7 @@ class AttitudeController(AddressedSystem):
         # The rotation vector of a small turn, whichever the sign of the quaternion; the same in B and in I. And
         # R_IB' w_IB: for the rate, too, the base's turn is small.
         theta, w = 2.0 * np.copysign(1.0, base[1]) * base[2:5], base[8:11]
-        angle = float(np.linalg.norm(theta))
+        angle = hypot(*theta.tolist())
         brakes = 0.5 * self._torque / float(J.diagonal().max())
         back = stopping_speed(angle, gain=0.5 * bandwidth, acceleration=brakes) * theta / max(angle, 1e-9)
         self._command.mutable(state).wheel_torque = self._reaction.Eval(context) - J @ (2.0 * bandwidth * (w + back))

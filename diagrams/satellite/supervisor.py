@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import hypot
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
@@ -231,7 +232,8 @@ class Supervisor(AddressedSystem):
         p, last, memory = self._settings.view(context), self._instructions.view(context), self._memory.view(context)
         mode = last.mode
         relative = Relative.of(self._relative.Eval(context))
-        arm, fingers = np.split(self._joints.Eval(context), [ARM_JOINTS])
+        joints = self._joints.Eval(context)
+        arm, fingers = joints[:ARM_JOINTS], joints[ARM_JOINTS:]
         behind = arm - self._smooth.array(context)
         rests = float(np.abs(behind).max()) < p.still_rate * _SMOOTHING
         go = float(self._capture.Eval(context)[0])
@@ -320,19 +322,20 @@ class Supervisor(AddressedSystem):
         """Return the reason for an abort, or None."""
         if mode not in (Mode.APPROACH, Mode.TRACK, Mode.GRIP):
             return Reason.COMMANDED if go < -0.5 and mode in (Mode.RETREAT, Mode.HOLD) else None
-        checks = {
-            Reason.COMMANDED: go < -0.5,
-            Reason.LOST: relative.age > p.lost_after or not relative.valid,
-            Reason.OUT_OF_REACH: self._unreachable(relative, p),
-            Reason.TOO_FAST: float(np.linalg.norm(relative.v_BH)) > p.largest_speed,
-            Reason.TIMEOUT: since > p.time_limit,
-        }
-        return next((reason for reason, is_present in checks.items() if is_present), None)
+        if go < -0.5:
+            return Reason.COMMANDED
+        if relative.age > p.lost_after or not relative.valid:
+            return Reason.LOST
+        if self._unreachable(relative, p):
+            return Reason.OUT_OF_REACH
+        if hypot(*relative.v_BH.tolist()) > p.largest_speed:
+            return Reason.TOO_FAST
+        return Reason.TIMEOUT if since > p.time_limit else None
 
     def _unreachable(self, relative: Relative, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""
         wrist = relative.p_BH - self._wrist * relative.R_BH[:, 2]
-        far = float(np.linalg.norm(wrist - self._shoulder)) > p.reach
+        far = hypot(*(wrist - self._shoulder).tolist()) > p.reach
         return far or relative.R_BH[0, 2] < np.cos(p.largest_angle)
 
     def _errors(self, relative: Relative, distance: float, flip: float) -> tuple[float, float]:
@@ -340,4 +343,4 @@ class Supervisor(AddressedSystem):
         R_BD = Guidance(0.0, True, distance, 0.0, 0.0, flip > 0.5).turned(relative.R_BH)
         offset = relative.p_BH - distance * relative.R_BH[:, 2] - relative.p_BG
         turn = rotation_vector(R_BD @ relative.R_BG.T)
-        return float(np.linalg.norm(offset)), float(np.linalg.norm(turn))
+        return hypot(*offset.tolist()), hypot(*turn.tolist())

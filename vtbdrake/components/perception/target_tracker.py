@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, inf
+from functools import lru_cache
+from math import ceil, hypot, inf, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -113,32 +114,24 @@ class MotionModel:
 
     def predict(self, track: Track, time: float) -> Track:
         """Return the track at a later (or the same) time."""
-        dt = time - track.time
-        F = self._transition(track, dt)
-        return replace(self.moved(track, time), P=F @ track.P @ F.T + self._noise(dt))
+        flight = list(self._flight(track, time - track.time))
+        F = self._transition(track, time - track.time, flight)
+        return replace(_landed(track, time, flight), P=F @ track.P @ F.T + self._noise(time - track.time))
 
     def moved(self, track: Track, time: float) -> Track:
         """Return the track at another time, without its covariance there."""
-        dt = time - track.time
-        *_, (R, _, w) = self._flight(track, dt)
-        return replace(track, time=time, R=R, p=track.p + dt * track.v, w=w)
-
-    def _inertia(self) -> Array:
-        """Return J in T, (3, 3)."""
-        xx, yy, zz, xy, xz, yz = self.inertia
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return _landed(track, time, list(self._flight(track, time - track.time)))
 
     def _flight(self, track: Track, dt: float) -> Iterator[tuple[Array, Array, Array]]:
         """Yield R_IT and ω after each of some equal steps over ``dt``, with J_I^-1 in the middle of it: (R, J_I^-1, ω).
 
         The steps are of second order, and exact for a `SPHERE`.
         """
-        J = self._inertia()
-        inverse = np.linalg.inv(J)
+        J, inverse = _inertia(*self.inertia)
         R, w = track.R, track.w
         L = R @ (J @ (w @ R))
         # Each step turns the body by at most 0.1 rad, unless the track has long been lost.
-        steps = min(max(1, ceil(float(np.linalg.norm(w)) * abs(dt) / 0.1)), 30)
+        steps = min(max(1, ceil(hypot(*w.tolist()) * abs(dt) / 0.1)), 30)
         h = dt / steps
         for _ in range(steps):
             middle = rotation_matrix(0.5 * h * w) @ R
@@ -147,10 +140,10 @@ class MotionModel:
             w = R @ (inverse @ (L @ R))
             yield R, K, w
 
-    def _transition(self, track: Track, dt: float) -> Array:
-        """Return F(dt), which carries the error of a track over ``dt``, (12, 12)."""
-        J = track.R @ self._inertia() @ track.R.T
-        flight = list(self._flight(track, dt))
+    def _transition(self, track: Track, dt: float, flight: list[tuple[Array, Array, Array]]) -> Array:
+        """Return F(dt), which carries the error of a track over its flight during ``dt``, (12, 12)."""
+        J_T, _ = _inertia(*self.inertia)
+        J = track.R @ J_T @ track.R.T
         turning, h = cross_matrix(J @ track.w), dt / len(flight)
         before = J @ cross_matrix(track.w) - turning  # δL = before θ + J δω
         A, B = np.eye(3), np.zeros((3, 3))  # θ = A θ(0) + B δL
@@ -162,7 +155,7 @@ class MotionModel:
         F = np.eye(12)
         F[:3, :3], F[:3, 6:9] = A + B @ before, B @ J
         R, _, w = flight[-1]
-        J_after = R @ self._inertia() @ R.T
+        J_after = R @ J_T @ R.T
         after = J_after @ cross_matrix(w) - turning
         F[6:9, :3] = np.linalg.solve(J_after, before - after @ F[:3, :3])
         F[6:9, 6:9] = np.linalg.solve(J_after, J - after @ F[:3, 6:9])
@@ -183,12 +176,15 @@ class MotionModel:
         They are the roots of the mean variances, of first order in the angle turned since.
         """
         dt = time - track.time
-        deviations = []
-        for place, density in ((0, self.rate_noise**2), (3, self.velocity_noise**2)):
-            P, a, b = track.P, slice(place, place + 3), slice(place + 6, place + 9)
-            total = P[a, a].trace() + 2.0 * dt * P[a, b].trace() + dt**2 * P[b, b].trace()
-            deviations.append(float(total / 3.0 + density * dt**3 / 3.0) ** 0.5)
-        return deviations[0], deviations[1]
+        # The variances of the pose's six numbers, and their covariances with their rates.
+        variances, shared = track.P.diagonal(), track.P.diagonal(6)
+        rotation, translation = (
+            (variances[:6] + 2.0 * dt * shared + dt**2 * variances[6:]).reshape(2, 3).sum(1).tolist()
+        )
+        return (
+            sqrt((rotation + self.rate_noise**2 * dt**3) / 3.0),
+            sqrt((translation + self.velocity_noise**2 * dt**3) / 3.0),
+        )
 
     def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
         r"""Return the track with a measured pose, and the normalized innovation squared (six degrees of freedom).
@@ -201,7 +197,10 @@ class MotionModel:
         if estimate.time > track.time:
             track = self.predict(track, estimate.time)
         dt = estimate.time - track.time
-        H, there = self._transition(track, dt)[:6], self.moved(track, estimate.time)
+        H, there = np.eye(6, 12), track
+        if dt < 0.0:
+            flight = list(self._flight(track, dt))
+            H, there = self._transition(track, dt, flight)[:6], _landed(track, estimate.time, flight)
         nu = np.concatenate([rotation_vector(estimate.matrix[:, :3] @ there.R.T), estimate.matrix[:, 3] - there.p])
         step, P, squares = kalman_update(track.P, nu, H=H, R=estimate.covariance + self._noise(-dt)[:6, :6])
         fused = replace(
@@ -213,6 +212,19 @@ class MotionModel:
             P=P,
         )
         return fused, float(squares)
+
+
+@lru_cache
+def _inertia(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[Array, Array]:
+    """Return the inertia J in T, (3, 3), and its inverse."""
+    J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return J, np.linalg.inv(J)
+
+
+def _landed(track: Track, time: float, flight: list[tuple[Array, Array, Array]]) -> Track:
+    """Return the track at the end of a flight, without its covariance there."""
+    R, _, w = flight[-1]
+    return replace(track, time=time, R=R, p=track.p + (time - track.time) * track.v, w=w)
 
 
 STATE_SIZE, STATUS_SIZE = 13, 4
@@ -316,6 +328,9 @@ class TargetTracker(AddressedSystem):
             lost_after=Quantity(3.0, "s", (0.0, 3600.0)),
         )
         self._inertia = self.declare_parameters(inertia=Quantity(model.inertia, "kg m^2", (-1e6, 1e6)))
+        groups = (self._settings, self._inertia)
+        tickets = {self.numeric_parameter_ticket(group.index) for group in groups}
+        self._model = self.declare_cache("motion model", self._calc_model, tickets)
         self.DeclareStateOutputPort("state", self._state.index)
         self.DeclareStateOutputPort("status", self._status.index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -327,15 +342,19 @@ class TargetTracker(AddressedSystem):
         track = Track.of(self._track.array(context))
         return PoseEstimate.of(track.X, track.P[:6, :6], time=track.time)
 
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        settings, counts = self._settings.view(context), self._counts.mutable(state)
-        model = MotionModel(
+    def _calc_model(self, context: Context) -> MotionModel:
+        settings = self._settings.view(context)
+        return MotionModel(
             rate_noise=settings.rate_noise,
             velocity_noise=settings.velocity_noise,
             first_rate=settings.first_rate,
             first_velocity=settings.first_velocity,
             inertia=self._inertia.array(context).tolist(),
         )
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        settings, counts = self._settings.view(context), self._counts.mutable(state)
+        model: MotionModel = self._model(context)
         times = counts.last_times
         track = Track.of(self._track.array(context)) if counts.fused else None
         fresh: list[tuple[float, int, PoseEstimate]] = []
