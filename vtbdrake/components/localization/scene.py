@@ -89,21 +89,25 @@ class Scene:
         Raises:
             ValueError: The points or the place of the scanner have another shape, or are not finite.
         """
-        points, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
-        if points.ndim != 2 or points.shape[1] != 3 or eye.shape != (3,):
-            raise ValueError(f"points have the shape (n, 3), the scanner's place (3,), not {points.shape}, {eye.shape}")
-        if not (np.isfinite(points).all() and np.isfinite(eye).all()):
-            raise ValueError("points and the scanner's place are finite numbers: leave rays without a return out")
-        points = points - eye
-        distances = np.hypot(points[:, 0], points[:, 1])
-        near = np.flatnonzero((distances <= detector.reach) & (distances > 0.0))
-        points, distances = points[near], distances[near]
-        feet = np.array([0.0, 0.0, detector.ground_height - eye[2]])
+        points, distances = _around(points_H, p_HoLo_H, detector.reach)
+        feet = np.array([0.0, 0.0, detector.ground_height - float(np.asarray(p_HoLo_H)[2])])
         heights = _heights(points, feet, detector.reach)
         scene = cls(points, distances, np.arctan2(points[:, 1], points[:, 0]), points[:, 2] / distances, heights)
         if _shows_ground(heights) or not _shows_ground(_heights(points * [1.0, 1.0, -1.0], feet, detector.reach)):
             return scene
         return scene.select(np.zeros(0, dtype=np.intp))
+
+    @classmethod
+    def planar(cls, points_H: ArrayLike, p_HoLo_H: ArrayLike, detector: ScanDetectorConfig, *, height: float) -> Scene:
+        """Return the points of a planar scan, which shows no ground: all are at one height (m) over it.
+
+        Raises:
+            ValueError: As in `of`.
+        """
+        points, distances = _around(points_H, p_HoLo_H, detector.reach)
+        points = points * [1.0, 1.0, 0.0]
+        azimuths, level = np.arctan2(points[:, 1], points[:, 0]), np.zeros(len(points))
+        return cls(points, distances, azimuths, level, np.full(len(points), height))
 
     def __len__(self) -> int:
         return len(self.distances)
@@ -111,6 +115,19 @@ class Scene:
     def select(self, rows: Indices) -> Scene:
         """Return the points with these indices."""
         return Scene(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def _around(points_H: ArrayLike, p_HoLo_H: ArrayLike, reach: float) -> tuple[Array, Array]:
+    """Return the points (n, 3) within the reach of a scanner, from which they are counted, and their distances (n,)."""
+    points, eye = np.asarray(points_H, dtype=float), np.asarray(p_HoLo_H, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3 or eye.shape != (3,):
+        raise ValueError(f"points have the shape (n, 3), the scanner's place (3,), not {points.shape}, {eye.shape}")
+    if not (np.isfinite(points).all() and np.isfinite(eye).all()):
+        raise ValueError("points and the scanner's place are finite numbers: leave rays without a return out")
+    points = points - eye
+    distances = np.hypot(points[:, 0], points[:, 1])
+    near = np.flatnonzero((distances <= reach) & (distances > 0.0))
+    return points[near], distances[near]
 
 
 def _heights(points: Array, feet: Array, reach: float) -> Array:
@@ -200,6 +217,11 @@ class Clusters:
     def azimuths(self) -> Array:
         """The directions of the points in rad, counted from those of their clusters, (n,)."""
         return wrap(self.scene.azimuths[self.rows] - self.bearings[self.owners])
+
+    def select(self, keep: NDArray[np.bool_]) -> Clusters:
+        """Return the clusters of a mask, (k,)."""
+        rows = keep[self.owners]
+        return Clusters(self.scene, self.rows[rows], (np.cumsum(keep) - 1)[self.owners[rows]])
 
     def sums(self, values: Array) -> Array:
         """Return the sums over the clusters, (k, ...), of values of the points, (n, ...)."""

@@ -21,8 +21,8 @@ over the heights measures it. Covariances are those of the weighted least square
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, replace
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -131,8 +131,47 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    scene = Scene.of(points_H, p_HoLo_H, detector)
-    clusters, trunks = _upright(scene, detector), []
+    return _trunks(_upright(Scene.of(points_H, p_HoLo_H, detector), detector), detector, p_HoLo_H)
+
+
+def detect_planar_trunks(
+    points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_H: ArrayLike, field: tuple[float, float] = (-pi, pi)
+) -> Landmarks:
+    """Find the trunks in the points of a planar scan: round, opaque objects of their width, apart from others.
+
+    One row of rays does not show whether an object is upright, so that the map has to tell trunks from posts, legs and
+    corners: fewer detections are trunks than those of `detect_trunks`. A trunk takes three rays.
+
+    Args:
+        points_H: The points in the level frame H of the carrier, shape (n, 3) in m, in any order; their z is ignored.
+        detector: The settings; the elevation step, the heights and the share of rows mean nothing here.
+        p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
+        field: The directions in H in rad of the last ray to the right and to the left. Objects are left out of which
+            these may show a part only.
+
+    Returns:
+        The trunks in H, with the covariances of the fit and the floors. Edges that something nearer hides are not used.
+
+    Raises:
+        ValueError: The points have another shape, or are not finite; the field is not from the right to the left.
+    """
+    right, left = field
+    if not 0.0 < left - right <= 2.0 * pi:
+        raise ValueError(f"field is the direction of the ray to the right, then that to the left, not {field!r}")
+    detector = replace(detector, reference_height=float(np.mean(detector.heights)))
+    scene = Scene.planar(points_H, p_HoLo_H, detector, height=detector.reference_height)
+    cells = Cells.of(scene.points, size=detector.cell, reach=detector.reach)
+    clusters = Clusters(scene, *cells.connected(np.arange(len(scene))))
+    if len(clusters.rows) and left - right < 2.0 * pi - detector.azimuth_step:
+        half = 0.5 * (left - right)
+        aside = np.abs(wrap(scene.azimuths[clusters.rows] - right - half))
+        clusters = clusters.select(clusters.sums((aside > half - 1.5 * detector.azimuth_step).astype(float)) == 0.0)
+    return _trunks(clusters, detector, p_HoLo_H)
+
+
+def _trunks(clusters: Clusters, detector: TrunkDetectorConfig, p_HoLo_H: ArrayLike) -> Landmarks:
+    """Return the clusters that are trunks."""
+    trunks = []
     for persistence in _PERSISTENCE:
         if not len(clusters.rows):
             break
@@ -222,9 +261,7 @@ class _Fit:
     @property
     def rest(self) -> Clusters:
         """The clusters that `trunks` found no trunk in."""
-        keep = ~self._good[self._clusters.owners]
-        owners = np.cumsum(~self._good) - 1
-        return Clusters(self._clusters.scene, self._clusters.rows[keep], owners[self._clusters.owners[keep]])
+        return self._clusters.select(~self._good)
 
     def _start(self) -> tuple[Array, NDArray[np.bool_]]:
         """Return first cylinders (k, 5), and which points may be on them (n,)."""
