@@ -99,7 +99,7 @@ def main(seconds: float, trials: int, disturbance: float, seed: int) -> None:
         machine=MachineConfig(disturbance={TORQUE: disturbance} if disturbance else {}),
         values={PLAN: motion(scenario).plan(begin=scenario.period)},
     )
-    click.echo(f"{trials} logs of {seconds:g} s at {1.0 / scenario.period:g} Hz, disturbed by {disturbance:g} N m\n")
+    click.echo(f"{len(result.trials)} logs of {seconds:g} s at {1.0 / scenario.period:g} Hz, disturbed by {disturbance:g} N m\n")
     click.echo(f"{result}\n\n{group_table(result)}")
 
 

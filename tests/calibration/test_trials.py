@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import signal
+
 import numpy as np
 import pytest
 
@@ -17,6 +20,18 @@ FRICTION, PAYLOAD = "sim.act.drives.coulomb[1]", "sim.sys.arm.tool.mass"
 KNOTS = np.tile(Arm().home, (11, 1))
 KNOTS[3:-3] += 0.15 * np.array([[1.0], [-1.0], [0.5], [1.0], [-1.0]])
 PLANNED = {PLAN: np.append(0.001, KNOTS.ravel())}
+
+
+class InterruptAt(logging.Handler):
+    """Ctrl-C as soon as a message begins so."""
+
+    def __init__(self, begin: str) -> None:
+        super().__init__()
+        self._begin = begin
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.getMessage().startswith(self._begin):
+            signal.raise_signal(signal.SIGINT)
 
 
 @pytest.mark.one_python
@@ -37,20 +52,27 @@ def test_model_repeats_the_log_of_a_machine_to_rounding() -> None:
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_hidden_truths_are_recovered_and_covered() -> None:
+def test_hidden_truths_are_recovered_and_covered_as_far_as_an_interrupt_lets_them(caplog: pytest.LogCaptureFixture) -> None:
     parameters = [Parameter(PAYLOAD, 0.2, 2.0), Parameter(FRICTION, 0.1, 0.8), Parameter(DELAY, 0.0, 6.0)]
     noise = Noise(np.full(JOINTS, 1e-5), np.full(JOINTS, 0.05), 0.05)
-    result = self_test(
-        SCENARIO,
-        parameters,
-        position=POSITION,
-        torque=TORQUE,
-        seconds=2.0,
-        trials=3,
-        machine=MachineConfig(noise={POSITION: 1e-5}, disturbance={TORQUE: 0.05}),
-        values=PLANNED,
-        noise=noise,
-    )
+    logger, interrupt = logging.getLogger("vtbdrake.calibration.trials"), InterruptAt("trial 3 of 100")
+    caplog.set_level(logging.INFO, logger.name)
+    logger.addHandler(interrupt)
+    try:
+        result = self_test(
+            SCENARIO,
+            parameters,
+            position=POSITION,
+            torque=TORQUE,
+            seconds=2.0,
+            trials=100,
+            machine=MachineConfig(noise={POSITION: 1e-5}, disturbance={TORQUE: 0.05}),
+            values=PLANNED,
+            noise=noise,
+        )
+    finally:
+        logger.removeHandler(interrupt)
+    assert "interrupted: 3 of 100 trials are done" in caplog.text
     truths = [trial.truth for trial in result.trials]
     assert len({truth[PAYLOAD] for truth in truths}) == 3 and all(truth[DELAY].is_integer() for truth in truths)
     assert abs(result.errors(PAYLOAD)).max() < 0.02 and abs(result.errors(DELAY)).max() < 0.5

@@ -131,28 +131,37 @@ def self_test(
         values: Values of variables of the DPS at the start, such as the plan of `excitation`, by address.
         **options: Further arguments of `calibrate`.
 
+    An interrupt (Ctrl-C) ends it with the trials that are done by then.
+
     Raises:
         CalibrationError: As in `calibrate`, and if the machine cannot be commanded.
+        KeyboardInterrupt: The first trial was interrupted.
     """
     if trials < 1:
         raise CalibrationError(f"a self-test takes at least one trial, not {trials}")
     generator, testbed, results = np.random.default_rng(seed), scenario.build(), []
     context = testbed.default_context()
-    for number in range(trials):
-        truth = {parameter.address: _drawn(parameter, generator) for parameter in parameters}
-        for inertia in inertias:
-            start = [
-                testbed.read(context, f"{inertia.address}.{name}") for name in ("mass", "center_of_mass", "inertia")
-            ]
-            truth |= _drawn_body(inertia.address, log_cholesky(float(start[0]), start[1], start[2]), generator)
-        config = replace(machine or MachineConfig(), seed=int(generator.integers(2**31)))
-        config = replace(config, values={**config.values, **truth})
-        log = machine_log(scenario, seconds, machine=config, values=values)
-        calibration = calibrate(
-            scenario, log, parameters, inertias=inertias, position=position, torque=torque, **options
-        )
-        results.append(SelfTestTrial(truth, calibration))
-        _log.info("trial %d of %d is done", number + 1, trials)
+    try:
+        for number in range(trials):
+            begin = time.process_time()
+            truth = {parameter.address: _drawn(parameter, generator) for parameter in parameters}
+            for inertia in inertias:
+                start = [
+                    testbed.read(context, f"{inertia.address}.{name}") for name in ("mass", "center_of_mass", "inertia")
+                ]
+                truth |= _drawn_body(inertia.address, log_cholesky(float(start[0]), start[1], start[2]), generator)
+            config = replace(machine or MachineConfig(), seed=int(generator.integers(2**31)))
+            config = replace(config, values={**config.values, **truth})
+            log = machine_log(scenario, seconds, machine=config, values=values)
+            calibration = calibrate(
+                scenario, log, parameters, inertias=inertias, position=position, torque=torque, **options
+            )
+            results.append(SelfTestTrial(truth, calibration))
+            _log.info("trial %d of %d is done, in %.0f s of CPU", number + 1, trials, time.process_time() - begin)
+    except KeyboardInterrupt:
+        if not results:
+            raise
+        _log.warning("interrupted: %d of %d trials are done", len(results), trials)
     return SelfTest(tuple(results))
 
 
