@@ -99,7 +99,8 @@ def main(seconds: float, trials: int, disturbance: float, seed: int) -> None:
         machine=MachineConfig(disturbance={TORQUE: disturbance} if disturbance else {}),
         values={PLAN: motion(scenario).plan(begin=scenario.period)},
     )
-    click.echo(f"{len(result.trials)} logs of {seconds:g} s at {1.0 / scenario.period:g} Hz, disturbed by {disturbance:g} N m\n")
+    count, rate = len(result.trials), 1.0 / scenario.period
+    click.echo(f"{count} logs of {seconds:g} s at {rate:g} Hz, disturbed by {disturbance:g} N m\n")
     click.echo(f"{result}\n\n{group_table(result)}")
 
 

@@ -52,7 +52,7 @@ def test_model_repeats_the_log_of_a_machine_to_rounding() -> None:
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_hidden_truths_are_recovered_and_covered_as_far_as_an_interrupt_lets_them(caplog: pytest.LogCaptureFixture) -> None:
+def test_hidden_truths_are_recovered_and_covered_until_an_interrupt(caplog: pytest.LogCaptureFixture) -> None:
     parameters = [Parameter(PAYLOAD, 0.2, 2.0), Parameter(FRICTION, 0.1, 0.8), Parameter(DELAY, 0.0, 6.0)]
     noise = Noise(np.full(JOINTS, 1e-5), np.full(JOINTS, 0.05), 0.05)
     logger, interrupt = logging.getLogger("vtbdrake.calibration.trials"), InterruptAt("trial 3 of 100")

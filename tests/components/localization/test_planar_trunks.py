@@ -63,9 +63,9 @@ def test_circles_are_where_they_are_and_as_certain_as_claimed():
 
 
 def test_a_trunk_that_is_half_hidden_is_less_certain_and_covered():
-    place, diameter = EYE[:2] + [6.0, 0.0], 0.5
+    place, diameter = EYE[:2] + np.array([6.0, 0.0]), 0.5
     # A post whose left edge is seen in the direction of the trunk's axis.
-    post, width = EYE[:2] + [3.0, -0.06], 0.12
+    post, width = EYE[:2] + np.array([3.0, -0.06]), 0.12
     squares, deviations = [], {"free": [], "half hidden": []}
     for seed in range(60):
         for name, (places, diameters) in {
@@ -114,7 +114,8 @@ def test_the_tilt_and_the_height_of_the_scanner_do_not_matter():
     places, diameters = ring(np.random.default_rng(1))
     points = scan(places, diameters)
     trunks = detect_planar_trunks(points, EXACT, p_HoLo_H=EYE)
-    lifted = detect_planar_trunks(points + [0.0, 0.0, 7.0], EXACT, p_HoLo_H=EYE + [0.0, 0.0, -2.0])
+    up, down = np.array([0.0, 0.0, 7.0]), np.array([0.0, 0.0, -2.0])
+    lifted = detect_planar_trunks(points + up, EXACT, p_HoLo_H=EYE + down)
     np.testing.assert_array_equal(trunks.positions, lifted.positions)
     assert len(trunks) >= 8
 
