@@ -127,6 +127,7 @@ class CompiledRollouts:
         self._updates: dict[tuple[int, ...], casadi.Function] = {}
         self._programs: dict[tuple[int, tuple[tuple[int, ...], ...]], _Program] = {}
         self._last_schedule: tuple[float, list[Instant]] = np.nan, []
+        self._last_plan: tuple[list[Instant], _Program, Array] | None = None
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
         self._lock = threading.Lock()
         self._refuse_initialization()
@@ -189,12 +190,12 @@ class CompiledRollouts:
             if not (z[:, entries] == self._z0[entries]).all():
                 raise UnsupportedTestbedError(f"{path} differs from what was compiled: {why}")
         instants = self.schedule_at(t0)
-        program = self._program(instants)
+        program, plan = self._planned(instants)
         chunks = list(_chunks(len(z)))
         noise = self._noise(z, instants, program.count)
 
         def run(chunk: slice) -> tuple[Array, Array]:
-            return program.run(z[chunk], None if noise is None else noise[chunk], instants)
+            return program.run(z[chunk], None if noise is None else noise[chunk], plan)
 
         if self._workers > 1 and len(z) > _LARGEST_CHUNK:
             with ThreadPoolExecutor(self._workers) as pool:
@@ -264,9 +265,9 @@ class CompiledRollouts:
     def arguments(self) -> tuple[Array, Array]:
         """Return what `function` takes beside z: the instants, shape (3, count), and the random numbers of s0."""
         instants = self.schedule_at(self.walker.context.get_time())
-        program = self._program(instants)
+        program, plan = self._planned(instants)
         noise = self._noise(self._z0[np.newaxis], instants, program.count)
-        return program.plan(instants).T, np.zeros((self._w.numel(), program.count)) if noise is None else noise[0].T
+        return plan.T, np.zeros((self._w.numel(), program.count)) if noise is None else noise[0].T
 
     # -- how it is done
 
@@ -331,6 +332,14 @@ class CompiledRollouts:
             self._programs[count, dues] = program
             return program
 
+    def _planned(self, instants: list[Instant]) -> tuple[_Program, Array]:
+        """Return the program for some instants, and its plan of them; those of the last begin are kept."""
+        last = self._last_plan
+        if last is None or last[0] is not instants:
+            program = self._program(instants)
+            last = self._last_plan = instants, program, program.plan(instants)
+        return last[1:]
+
     def _noise(self, z: Array, instants: Sequence[Instant], count: int) -> Array | None:
         """Return the random numbers of all rollouts and instants, shape (n, count, noise)."""
         if not self.walker.noise:
@@ -375,14 +384,13 @@ class _Program:
         plan[: len(instants)] = [(i.time, numbers.get(i.updates, _NO_UPDATE), i.is_sample) for i in instants]
         return plan
 
-    def run(self, z: Array, noise: Array | None, instants: Sequence[Instant]) -> tuple[Array, Array]:
-        """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny)."""
+    def run(self, z: Array, noise: Array | None, plan: Array) -> tuple[Array, Array]:
+        """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny); see `plan`."""
         n, nz = z.shape
         with self._lock:
             if n not in self._buffers:
                 self._buffers[n] = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
         arguments, evaluate, result = self._buffers[n].parts
-        plan = self.plan(instants)
         arguments[: n * nz] = z.ravel()
         arguments[n * nz : n * (nz + plan.size)].reshape(n, -1)[:] = plan.ravel()
         if noise is not None:
@@ -391,8 +399,7 @@ class _Program:
         # The thread's next call overwrites the result.
         rows = result.reshape(n, -1)
         recorded = rows[:, nz:].reshape(n, self.count, -1)
-        sampled = [k for k, instant in enumerate(instants) if instant.is_sample]
-        return rows[:, :nz].copy(), recorded[:, sampled]
+        return rows[:, :nz].copy(), recorded[:, plan[:, 2] != 0.0]
 
 
 def _rollout(updates: Sequence[casadi.Function], record: casadi.Function, count: int) -> casadi.Function:

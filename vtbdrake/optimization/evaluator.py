@@ -195,9 +195,9 @@ class Evaluator:
         return tuple(float(sign * value) + 0.0 for sign, value in zip(self._signs, evaluation.values, strict=True))
 
     def _remember(self, evaluation: Evaluation) -> None:
-        if len(self._signs) > 1 or not evaluation.counts or not self._allows(evaluation.point):
+        if len(self._signs) > 1 or (self.best is not None and not evaluation.values[0] > self.best.values[0]):
             return
-        if self.best is None or evaluation.values[0] > self.best.values[0]:
+        if evaluation.counts and self._allows(evaluation.point):
             self.best = evaluation
 
 

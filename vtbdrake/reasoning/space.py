@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.argument_checks import all_of
-from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter, checked_points
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.reasoning.trajectory import Trajectory
 from vtbdrake.state import Variables
@@ -25,6 +25,7 @@ class DecisionSpace:
 
     Attributes:
         elements: The decided elements.
+        addresses: Those that a decision sets.
         parameters: The parameters of the search: one for a parameter or a choice, the knots of a trajectory.
 
     Raises:
@@ -45,12 +46,8 @@ class DecisionSpace:
         parts = [e.parameters if isinstance(e, Trajectory) else (e,) for e in self.elements]
         self.parameters: tuple[Dimension, ...] = tuple(parameter for part in parts for parameter in part)
         ends = np.cumsum([len(part) for part in parts]).tolist()
+        self.addresses = tuple(element.address for element in self.elements)
         self._parts = [slice(end - len(part), end) for end, part in zip(ends, parts, strict=True)]
-
-    @property
-    def addresses(self) -> tuple[str, ...]:
-        """Return the addresses that a decision sets."""
-        return tuple(element.address for element in self.elements)
 
     def find(self, variables: Variables) -> None:
         """Check that a testbed has the variables of the trajectories; `Problem` checks those of the parameters.
@@ -80,8 +77,7 @@ class DecisionSpace:
             value = plan[element.address]
             if isinstance(element, Trajectory):
                 begin, *knots = element.as_numbers(value)
-                for parameter, knot in zip(element.parameters, knots, strict=True):
-                    parameter.as_value(knot)
+                checked_points(element.parameters, [knots])
                 point += element.shifted(knots, time - begin).tolist()
             else:
                 point.append(element.as_value(value))

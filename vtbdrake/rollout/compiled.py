@@ -69,11 +69,8 @@ class CompiledExecutor(Executor):
             ValueError: The task needs what compiled rollouts cannot do: pruning, a recorded motion, states.
         """
         starts = start_of_each(start, len(points))
-        by_fields: dict[Hashable, list[int]] = {}
-        for index, point in enumerate(points):
-            by_fields.setdefault(values_key(split(point)[0]), []).append(index)
         with Interruptible() as interruptible:
-            for indices in by_fields.values():
+            for indices in _by_fields(points):
                 of_fields = [points[i] for i in indices]
                 compiled = self._of(task, of_fields)
                 if cutoff is not None and cutoff.is_over:
@@ -313,6 +310,16 @@ class _CompiledTask:
         if task.threshold is None or task.run_on:
             return False
         return bool(exceeds(np.array(sample), task.threshold, minimize=task.minimize))
+
+
+def _by_fields(points: Sequence[Parameters]) -> list[list[int]]:
+    """Return the numbers of the points, in groups with the same values of the scenario's fields."""
+    if not any(address.startswith(FIELD) for address in frozenset().union(*points)):
+        return [list(range(len(points)))]
+    groups: dict[Hashable, list[int]] = {}
+    for i, point in enumerate(points):
+        groups.setdefault(values_key(split(point)[0]), []).append(i)
+    return list(groups.values())
 
 
 def _variables(addresses: Iterable[str]) -> list[str]:
