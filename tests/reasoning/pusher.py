@@ -73,6 +73,8 @@ class PusherScenario(Scenario):
     # Of the receding horizon; 0 decides on request.
     every: float = 0.0
     rollouts: int = 12
+    # Whether a loop waits for decisions, however long they take; else their time is limited by the latency.
+    waits: bool = False
     horizon: float = 1.0
     method: str = "CEM"
     # The largest position that a rollout may reach.
@@ -101,9 +103,10 @@ class PusherScenario(Scenario):
                 decision=[Parameter(CANDIDATE, -1.0, 1.0)],
                 quality=Quality(missed_by, of=[STATE, "u.goal"], minimize=True, reading="end"),
                 horizon=self.horizon,
-                budget=Budget(rollouts=self.rollouts),
+                budget=Budget(rollouts=self.rollouts, seconds=60.0 if self.waits else None),
                 period=self.every or PERIOD,
                 latency=self.latency,
+                patience=300.0 if self.waits else 3.0,
                 on_request=not self.every,
                 believed={"state": 2},
                 mental=not self.reasons,
