@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import queue
 import threading
 import time
 import traceback
@@ -30,7 +29,7 @@ from vtbdrake.web.drive import Driven, Driver, Handle, handles
 from vtbdrake.web.fork import CommandLimits, Differences, Fork
 from vtbdrake.web.interventions import Interventions
 from vtbdrake.web.layers import Layers
-from vtbdrake.web.requests import result_of
+from vtbdrake.web.requests import Requests
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -257,7 +256,7 @@ class Session:
         self.meshcat_url = self.loop_url = ""
         self._start, self._values = start, dict(values or {})
         self._interventions = Interventions(self.config.step)
-        self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
+        self._commands = Requests(SessionError, "the session has ended", _failure)
         self._watched: dict[object, tuple[str, ...]] = {}
         self._shown: dict[object, tuple[str, ...]] = {}
         self._frame_ready = threading.Condition()
@@ -275,7 +274,7 @@ class Session:
 
     def close(self) -> None:
         """End the simulation and its Meshcat."""
-        self._commands.put(None)
+        self._commands.end()
         self._thread.join()
 
     # -- commands
@@ -460,11 +459,7 @@ class Session:
             return self.latest if self.latest is not None and self.latest.number > after else None
 
     def _do(self, action: Callable[[], _Result]) -> _Result:
-        if self._closed:
-            raise SessionError("the session has ended")
-        future: Future[_Result] = Future()
-        self._commands.put((action, future))
-        return result_of(future, self._thread, SessionError("the session has ended"))
+        return self._commands.ask(self._thread, action)
 
     # -- in the thread of the session
 
@@ -555,8 +550,8 @@ class Session:
 
     def _work(self) -> None:
         """Carry out commands until the next frame is due, simulate, and show it."""
-        self._carry_out_commands()
-        if self._closed:
+        if not self._commands.carry_out(max(self._idle_time(), 0.0)):
+            self._closed = True
             return
         begin = time.monotonic()
         deadline = begin + _SHARE / self.config.frame_rate
@@ -567,24 +562,6 @@ class Session:
         now = time.monotonic()
         if now >= self._next_frame:
             self._show(now)
-
-    def _carry_out_commands(self) -> None:
-        """Carry out what other threads have asked for; wait for it while there is nothing else to do."""
-        wait = self._idle_time()
-        while True:
-            try:
-                command = self._commands.get(timeout=wait) if wait > 0.0 else self._commands.get_nowait()
-            except queue.Empty:
-                return
-            wait = 0.0
-            if command is None:
-                self._closed = True
-                return
-            action, future = command
-            try:
-                future.set_result(action())
-            except FAILURES as error:  # It is raised in the thread that has asked.
-                future.set_exception(_failure(error))
 
     def _idle_time(self) -> float:
         """Return the wall time, in seconds, until there is something to do."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.failures import one_line
 from vtbdrake.rollout.testbeds import Testbeds
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.camera import fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
-from vtbdrake.web.requests import result_of
+from vtbdrake.web.requests import Requests
 from vtbdrake.web.study_worker import PointError, PointRollout
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class StudyScene:
 
     def __init__(self) -> None:
         self.meshcat_url = ""
-        self._commands: queue.SimpleQueue[tuple[Callable[[], object], Future[object]] | None] = queue.SimpleQueue()
+        self._commands = Requests(PointError, "the page has ended", _failure)
         ready: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="vtbdrake scene", daemon=True)
         self._thread.start()
@@ -74,7 +73,7 @@ class StudyScene:
 
     def close(self) -> None:
         """End the scene and its Meshcat."""
-        self._commands.put(None)
+        self._commands.end()
         self._thread.join()
 
     def show(self, role: str, rollout: PointRollout | None) -> None:
@@ -90,9 +89,7 @@ class StudyScene:
         self._do(lambda: self._set_time(time))
 
     def _do(self, action: Callable[[], object]) -> None:
-        future: Future[object] = Future()
-        self._commands.put((action, future))
-        result_of(future, self._thread, PointError("the page has ended"))
+        self._commands.ask(self._thread, action)
 
     # -- in the thread of the scene
 
@@ -103,12 +100,8 @@ class StudyScene:
         self._actors: dict[str, _Actor] = {}
         self._scenery: Drawing | None = None
         ready.set_result(None)
-        while (command := self._commands.get()) is not None:
-            action, future = command
-            try:
-                future.set_result(action())
-            except FAILURES as error:
-                future.set_exception(error if isinstance(error, PointError) else PointError(one_line(error)))
+        while self._commands.carry_out():
+            pass
         for name in ("_actors", "_scenery", "_testbeds", "_meshcat"):
             del self.__dict__[name]
         gc.collect()  # Meshcat ends in the thread that made it.
@@ -162,3 +155,8 @@ class StudyScene:
         self._time = time
         for actor in self._actors.values():
             actor.pose(self._time)
+
+
+def _failure(error: BaseException) -> PointError:
+    """Return what another thread raises for an error of the scene's."""
+    return error if isinstance(error, PointError) else PointError(one_line(error))

@@ -9,10 +9,8 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -31,7 +29,7 @@ from vtbdrake.testbed.hand import HandCommand
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.web.hand import HandError, HandMessage, Lead
 from vtbdrake.web.host import CLOSED, first_of, send
-from vtbdrake.web.requests import result_of
+from vtbdrake.web.requests import Requests
 from vtbdrake.web.session import Session
 
 _TICK = 0.01  # s, between two commands while a hand leads
@@ -243,13 +241,13 @@ class VirtualReality:
         self._refusals: dict[object, str] = {}
         self._sent = 0
         self._released = True
-        self._inbox: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._inbox = Requests(HandError, "the server has ended: no hand leads", self._failure)
         self._thread = threading.Thread(target=self._run, name="vtbdrake hand", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Release the robot, and end."""
-        self._inbox.put(None)
+        self._inbox.end()
         self._thread.join()
 
     def arm(self) -> None:
@@ -258,43 +256,26 @@ class VirtualReality:
         Raises:
             ValueError: The robot cannot be led, or the server has ended.
         """
-        self._call(self._arm)
+        self._inbox.ask(self._thread, self._arm)
 
     def disarm(self) -> None:
         """Release the robot, and let nobody lead it until it is armed again."""
-        self._call(lambda: self._lead.disarm("disarmed by hand"))
+        self._inbox.ask(self._thread, lambda: self._lead.disarm("disarmed by hand"))
 
     def receive(self, headset: object, message: HandMessage) -> None:
         """Take a message of a headset."""
         now = time.monotonic()
-        self._inbox.put(lambda: self._receive(headset, message, now))
+        self._inbox.tell(lambda: self._receive(headset, message, now))
 
     def gone(self, headset: object) -> None:
         """Note that the page of a headset is closed, or has left virtual reality."""
-        self._inbox.put(lambda: self._forget(headset))
-
-    def _call(self, action: Callable[[], None]) -> None:
-        future: Future[None] = Future()
-
-        def carry_out() -> None:
-            try:
-                action()
-            except _FORESEEN as error:
-                future.set_exception(error)
-            except FAILURES as error:
-                future.set_exception(error)
-                raise  # It disarms.
-            else:
-                future.set_result(None)
-
-        self._inbox.put(carry_out)
-        result_of(future, self._thread, HandError("the server has ended: no hand leads"))
+        self._inbox.tell(lambda: self._forget(headset))
 
     # -- in the thread
 
     def _run(self) -> None:
         try:
-            while self._take():
+            while self._inbox.carry_out(_TICK):
                 self._work()
         finally:
             self._lead.disarm("the server has ended")
@@ -306,19 +287,11 @@ class VirtualReality:
             _log.error("the robot is released, as leading it has failed", exc_info=error)
         self._lead.disarm(one_line(error))
 
-    def _take(self) -> bool:
-        """Carry out what has arrived, after a tick at most; return whether to go on."""
-        try:
-            action = self._inbox.get(timeout=_TICK)
-            while action is not None:
-                try:
-                    action()
-                except FAILURES as error:
-                    self._fail(error)
-                action = self._inbox.get_nowait()
-        except Empty:
-            return True
-        return False
+    def _failure(self, error: BaseException) -> Exception:
+        """Return what is raised where somebody has asked; what is not foreseen disarms."""
+        if not isinstance(error, _FORESEEN):
+            self._fail(error)
+        return error if isinstance(error, Exception) else HandError(one_line(error))
 
     def _work(self) -> None:
         """Give the command of this instant: while a hand leads, and once when it has let go."""

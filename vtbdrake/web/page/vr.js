@@ -20,6 +20,15 @@ function standing([x, y, heading]) {
   return new XRRigidTransform({ x, y: 0, z: -y }, { x: 0, y: Math.sin(half), z: 0, w: Math.cos(half) });
 }
 
+// Meshcat's button asks for no tracked hands, and a headset tracks those only for a page that asks.
+function askForHands() {
+  for (const name of ["requestSession", "offerSession"]) {
+    const begin = navigator.xr?.[name]?.bind(navigator.xr);
+    const withHands = ({ optionalFeatures = [], ...rest } = {}) => ({ ...rest, optionalFeatures: [...optionalFeatures, "hand-tracking"] });
+    if (begin) navigator.xr[name] = (mode, options) => begin(mode, withHands(options));
+  }
+}
+
 export class VirtualReality {
   constructor(page) {
     this.page = page;
@@ -42,6 +51,7 @@ export class VirtualReality {
     this.vr = vr;
     this.root.hidden = false;
     this.arm.title = vr.real ? "let a hand lead the machine" : "let a hand lead the simulated robot";
+    askForHands();
     viewer.handle_command({ type: "enable_webxr", mode: "vr" });
     this.buttons.append(viewer.xr_button);
     viewer.renderer.xr.addEventListener("sessionstart", () => this.#begin(viewer.renderer.xr.getSession()));
