@@ -16,9 +16,11 @@ from vtbdrake.lcm.hub import Hub
 from vtbdrake.monitoring import LiveClient
 from vtbdrake.state import AddressError
 from vtbdrake.web import LoopSession, SessionError
+from vtbdrake.web.layers import LayerError
 from vtbdrake.web.viewer import view_loop
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
+from vtbdrake_diagrams.satellite import SatelliteScenario
 
 CART = 0.3  # m
 
@@ -49,6 +51,23 @@ def test_poses_values_and_switches_are_those_of_the_loop(hub: Hub) -> None:
                 message = msgpack.unpackb(meshcat.recv(PATIENCE))
                 if message["type"] == "set_transform" and message["path"] == "/drake/now/cart_pole/cart":
                     place = message["matrix"][12]
+
+
+def test_layers_of_a_loop_are_those_that_poses_tell(hub: Hub) -> None:
+    with LoopSession(SatelliteScenario(), hub.url) as session:
+        assert dict(session.layers) == {"cameras": "camera frusta"}
+        assert session.cameras == ()
+        with pytest.raises(LayerError, match="no layer 'forces'"):
+            session.show("me", ["forces"])
+        session.show("me", ["cameras"])
+        frame(session, lambda shown: "cameras" in shown.layers)
+        with connect(session.meshcat_url.replace("http", "ws"), max_size=None) as meshcat:
+            path = ""
+            while not path.startswith("/drake/layers/cameras/"):
+                message = msgpack.unpackb(meshcat.recv(PATIENCE))
+                path = message.get("path", "") if message["type"] == "set_object" else ""
+        session.show("me", [])
+        frame(session, lambda shown: not shown.layers)
 
 
 def test_loop_in_a_notebook_is_its_page_without_a_picture(hub: Hub) -> None:

@@ -10,6 +10,7 @@ from tests.chromium import PATIENCE, needs_chromium
 from tests.web.loops import cart_pole_loop
 from tests.web.test_page import drawn, picture, settle, watch
 from vtbdrake.lcm.hub import Hub
+from vtbdrake.monitoring import LiveClient
 from vtbdrake.web.viewer import view_loop
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
@@ -42,6 +43,20 @@ def test_loop_is_watched_until_it_ends(browser: Browser) -> None:
             page.fill("[data-address='u.plan'] input[aria-label='u.plan[1]']", "7")
             page.keyboard.press("Enter")
             drawn(page, "vtb.watched.get('u.plan').values[1] === 7")
+            # Esc ends a drag: the release tells the loop nothing.
+            box = page.locator("[data-address='u.plan'] .vtb-pad").bounding_box()
+            assert box is not None
+            page.mouse.move(box["x"] + 20, box["y"] + 20)
+            page.mouse.down()
+            page.mouse.move(box["x"] + 70, box["y"] + 70, steps=3)
+            drawn(page, "vtb.watched.get('u.plan').draft === 'open'")
+            page.keyboard.press("Escape")
+            page.mouse.up()
+            settle(page)
+            with LiveClient(bus.url) as client:
+                assert client.get(["u.plan"])["u.plan"][1] == 7.0
+            page.check("#vtb-layer-names")
+            assert page.locator("#vtb-names span:text-is('cart')").count() == 1
         page.wait_for_selector("body[data-loop=silent]", state="attached")
         assert "the loop has ended" in page.inner_text("#vtb-messages")
         assert page.inner_text("#vtb-mode") == "unknown"

@@ -134,6 +134,11 @@ class Drawing:
             self._boxes = [(frame, _boxes(query.inspector(), frame)) for frame, _ in self._frames]
         return np.hstack([np.empty((3, 0)), *(query.GetPoseInWorld(frame) @ box for frame, box in self._boxes)])
 
+    def diagonal(self, context: Context) -> float:
+        """Return the diagonal of the box around what moves, in m; 0 if nothing does."""
+        corners = self.corners(context)
+        return float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
+
     def fit_camera(self, context: Context, camera: Camera | None = None) -> None:
         """Move the camera so that what moves is in view, with room around it; or to a camera."""
         corners = self.corners(context)

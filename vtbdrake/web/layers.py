@@ -361,18 +361,21 @@ class Layers:
         meshcat: The server that shows them; only the thread that made it may use them.
         testbed: The testbed.
         size: The diagonal of the robot's box in m.
+        only_poses: Whether nothing but the poses of bodies is known, as of a loop that runs elsewhere.
 
     Attributes:
         titles: The layers for which the testbed has a source: name -> title.
         cameras: The names of its cameras with a colour image.
     """
 
-    def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float) -> None:
+    def __init__(self, meshcat: Meshcat, testbed: VirtualTestbed, size: float, *, only_poses: bool = False) -> None:
         self._meshcat, self._testbed, self._size = meshcat, testbed, size or 1.0
-        kinds = _KINDS if testbed.scene_graph is not None else ()
+        kinds = [kind for kind in _KINDS if not only_poses or (kind.is_of_world and not kind.is_measured)]
+        if testbed.scene_graph is None:
+            kinds.clear()
         self._kinds = {kind.name: kind for kind in kinds if kind.has_source(testbed)}
         self.titles = {name: kind.title for name, kind in self._kinds.items()}
-        self._cameras = cameras(testbed)
+        self._cameras = {} if only_poses else cameras(testbed)
         self.cameras = tuple(self._cameras)
         self._shown: dict[str, Layer] = {}
         self._failures: dict[str, str] = {}
@@ -382,11 +385,19 @@ class Layers:
         """Return what there is to say about each layer that is shown."""
         return {name: self._failures.get(name) or layer.note for name, layer in self._shown.items()}
 
-    def show(self, names: Collection[str]) -> None:
-        """Show these layers, and no others."""
+    def check(self, names: Collection[str]) -> None:
+        """Raise an error if there is no such layer; in any thread.
+
+        Raises:
+            LayerError: There is none.
+        """
         for name in names:
             if name not in self._kinds:
                 raise LayerError(f"this testbed has no layer {name!r}; it has: {', '.join(self._kinds) or 'none'}")
+
+    def show(self, names: Collection[str]) -> None:
+        """Show these layers, and no others."""
+        self.check(names)
         for name in self._shown.keys() - set(names):
             self._shown.pop(name).close()
             self._failures.pop(name, None)

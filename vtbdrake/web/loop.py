@@ -19,6 +19,7 @@ from vtbdrake.monitoring.live.messages import MAX_ADDRESSES
 from vtbdrake.state import AddressError
 from vtbdrake.visualization.drawing import Drawing
 from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.web.layers import Layers
 from vtbdrake.web.session import Frame, Session, SessionError, describe, plain
 
 if TYPE_CHECKING:
@@ -110,7 +111,16 @@ class LoopSession(Session):
         """Do nothing: a loop is not driven by a page."""
 
     def show(self, viewer: object, layers: Collection[str]) -> None:
-        """Do nothing: a loop has no layers."""
+        """Show layers to one of several viewers; an empty list ends it.
+
+        Raises:
+            LayerError: A loop has no such layer.
+        """
+        self._layers.check(layers)
+        with self._frame_ready:
+            self._shown.pop(viewer, None)
+            if layers:
+                self._shown[viewer] = tuple(layers)
 
     def still(self) -> None:
         """Return None: what a loop looks like now is drawn in the page alone."""
@@ -147,10 +157,15 @@ class LoopSession(Session):
         self._meshcat = make_meshcat()
         self.meshcat_url = self._meshcat.web_url()
         self._drawing, self.bodies, self.followed = None, tuple[str, ...](), ""
+        size = 0.0
         if testbed.scene_graph is not None:
             self._drawing = Drawing(self._meshcat, testbed, self._context, "now")
             self._drawing.fit_camera(self._context)
             self.bodies, self.followed = self._drawing.places, self._drawing.floating
+            size = self._drawing.diagonal(self._context)
+        # The state of the DPS's systems, scans and images are in the loop's process.
+        self._layers = Layers(self._meshcat, testbed, size, only_poses=True)
+        self.layers = self._layers.titles
         dps = {a: v for a, v in testbed.variables().items() if a.startswith(("dps.", "u.")) or a == "time"}
         self.variables = {address: describe(variable) for address, variable in dps.items()}
         self._ports = frozenset(a for a in testbed.addresses() if a.startswith("dps."))
@@ -183,6 +198,7 @@ class LoopSession(Session):
             return
         with self._frame_ready:
             watched = tuple(dict.fromkeys(address for group in self._watched.values() for address in group))
+            layers = tuple(dict.fromkeys(name for group in self._shown.values() for name in group))
         if watched != self._viewed.addresses:
             self._viewed.close()
             self._viewed = _Feed(self._url, watched, self._every)
@@ -192,6 +208,8 @@ class LoopSession(Session):
             note = self._draw_belief(*sample)
         elif not self._testbed.believes:
             note = "this testbed declares no belief: the picture stands still"
+        self._layers.show(layers)
+        self._layers.draw(self._context)
         latest, status = self.latest, self._status
         assert latest is not None
         now = time.monotonic() if sample is None else sample[0]
@@ -209,6 +227,7 @@ class LoopSession(Session):
             history=(latest.time, latest.time),
             warnings=(*latched, *((note,) if note else ())),
             failure=failure,
+            layers=self._layers.notes,
             loop={} if status is None or failure else _plain_status(status),
         )
         with self._frame_ready:

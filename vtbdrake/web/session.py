@@ -502,8 +502,7 @@ class Session:
             self._drawing.fit_camera(self._world, None if self._start is None else camera_of(self._start))
             self.bodies = self._drawing.places
             self.followed = "" if self._start is not None and camera_of(self._start) else self._drawing.floating
-            corners = self._drawing.corners(self._context)
-            size = float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
+            size = self._drawing.diagonal(self._context)
         self._layers = Layers(self._meshcat, self._testbed, size)
         self.layers, self.cameras = self._layers.titles, self._layers.cameras
         self.variables = {address: describe(variable) for address, variable in self._testbed.variables().items()}
