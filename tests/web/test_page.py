@@ -150,6 +150,18 @@ def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None
             assert running.session.snapshot()["u.angle"] == pytest.approx(expected, abs=0.03)
 
 
+def test_text_that_is_refused_gives_way_to_the_present_value(browser: Browser) -> None:
+    scenario = LimitedPendulumScenario()
+    with view(scenario, values={"u.angle": 0.5}) as running, opened_page(browser, running.url, ready=READY) as page:
+        watch(page, "u.angle")
+        for text, reason in (("999", "u.angle must lie in [-1, 1] rad"), (" ", "u.angle takes a number")):
+            page.fill(".vtb-watched input[type=text]", text)
+            page.keyboard.press("Enter")
+            drawn(page, f"vtb.messages.textContent.includes('{reason}')")
+            drawn(page, "document.querySelector('.vtb-watched input[type=text]').value === '0.5'")
+        assert running.session.snapshot()["u.angle"] == 0.5
+
+
 def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Browser) -> None:
     pose, handle = "sim.sys.cube.pose", ".vtb-place"
     # Where the viewer draws the body, which the server has placed.

@@ -9,7 +9,7 @@ import webbrowser
 import click
 
 from vtbdrake.cli.options import grouped, option
-from vtbdrake.cli.output import show
+from vtbdrake.cli.output import say, show
 
 page_options = grouped(
     "page",
@@ -27,6 +27,6 @@ def serve(url: str, *, browser: bool) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     show(url, {"url": url})
-    if browser:
-        webbrowser.open(url)
+    if browser and not webbrowser.open(url):
+        say("no browser could be opened: open the address in one")
     ended.wait()

@@ -53,8 +53,12 @@ class Watched {
       type: "text",
       readOnly: !settable,
       "aria-label": `${this.address}[${index}]`,
-      onchange: () => this.commit({ [index]: Number(text.value) }),
+      onchange: () => {
+        this.typing = false; // What was refused gives way to the present value.
+        this.commit({ [index]: text.value.trim() ? Number(text.value) : NaN });
+      },
       onfocus: () => (this.typing = true),
+      oninput: () => (this.typing = true),
       onblur: () => (this.typing = false),
     });
     if (!settable) return { text, row: element("div", { className: "vtb-entry fixed" }, text) };
