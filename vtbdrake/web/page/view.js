@@ -436,6 +436,7 @@ class Page {
     if (!option) chosen.append((option = element("option", { hidden: true }, position)));
     option.selected = true;
     chosen.disabled = Boolean(this.loop);
+    if (this.loop) chosen.title = "a running loop alone throws its switches";
   }
 
   #throw(chosen, side, signal) {
