@@ -56,7 +56,7 @@ def test_loop_is_watched_until_it_ends(browser: Browser) -> None:
             with LiveClient(bus.url) as client:
                 assert client.get(["u.plan"])["u.plan"][1] == 7.0
             page.check("#vtb-layer-names")
-            assert page.locator("#vtb-names span:text-is('cart')").count() == 1
+            page.wait_for_selector("#vtb-names span:text-is('cart')", state="attached")
         page.wait_for_selector("body[data-loop=silent]", state="attached")
         assert "the loop has ended" in page.inner_text("#vtb-messages")
         assert page.inner_text("#vtb-mode") == "unknown"
