@@ -278,16 +278,24 @@ class Guards:
         self._unsent = {name: self._unsent.get(name, 0) + 1 for name in commanded - left}
         self._departing -= left
 
-    def latch(self, reason: str, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> Verdict:
+    def latch(
+        self,
+        reason: str,
+        now: float,
+        received: Mapping[str, ReceivedSignal],
+        *,
+        at: float = nan,
+        level: int = logging.ERROR,
+    ) -> Verdict:
         """Latch for a reason from outside, whether or not anything is on real; return the verdict of a cycle.
 
-        ``at`` is as in `judge`.
+        ``at`` is as in `judge`; ``level`` is that of the message in the log of Python's ``logging``.
         """
         self._depart_anew(now, received, _NONE)
         fault = Fault(now, None, FaultKind.TOLD, reason)
         self.log.append(fault)
         if not self._latched:
-            self._latch((fault,))
+            self._latch((fault,), level=level)
         return Verdict(self.fall_back(now, received, at=at), False, (*self._faults, fault))
 
     def reset(
@@ -397,11 +405,11 @@ class Guards:
         self._faults, self._causes = (*causes, *sensor_faults), tuple(causes)
         self.log.extend(fault for fault in self._faults if (fault.signal, fault.kind) not in previous)
 
-    def _latch(self, faults: tuple[Fault, ...]) -> None:
+    def _latch(self, faults: tuple[Fault, ...], *, level: int = logging.ERROR) -> None:
         self._latched = faults
         self._begun.clear()
         self._failed.clear()
-        _log.error("the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
+        _log.log(level, "the fallbacks command from now on: %s", "; ".join(fault.reason for fault in faults))
 
     def fall_back(self, now: float, received: Mapping[str, ReceivedSignal], *, at: float = nan) -> dict[str, Any]:
         """Return the commands of the fallbacks, within the limits, for all signals that are on real or leave it.

@@ -423,7 +423,9 @@ class Runtime(Stepped):
         now = self.clock.now()
         # In cycles: on a busy computer they take longer, and each changes a limited command by a period's worth.
         left = 0.0 if self._in_lock_step else self.guards.leave_time / self.period
-        verdict = self.guards.latch(reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now)
+        verdict = self.guards.latch(
+            reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now, level=logging.INFO
+        )
         commands = verdict.actuation
         while commands:
             self.guards.note_unsent(self.bridge.publish(commands))
