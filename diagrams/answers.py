@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from vtbdrake.cli.output import number, table
+from vtbdrake.cli.output import table
 from vtbdrake_diagrams.tables import Crash, Registry, run, selected_names, write_json
 
 # Application -> payload(full) -> Answer
@@ -99,7 +99,7 @@ def answers_table(answers: Sequence[Answer | Crash]) -> str:
 
 
 def _row(answer: Answer) -> tuple[str, ...]:
-    value = answer.answer if isinstance(answer.answer, str) else number(answer.answer)
+    value = answer.answer if isinstance(answer.answer, str) else _number(answer.answer)
     parts = [value, answer.unit, _interval(answer.interval)]
     return (
         answer.id,
@@ -119,9 +119,14 @@ def _interval(interval: tuple[float, float] | None) -> str:
     if interval is None:
         return ""
     lower, upper = interval
-    left = "(-inf" if isinf(lower) else f"[{number(lower)}"
-    right = "inf)" if isinf(upper) else f"{number(upper)}]"
+    left = "(-inf" if isinf(lower) else f"[{_number(lower)}"
+    right = "inf)" if isinf(upper) else f"{_number(upper)}]"
     return f"in {left}, {right}"
+
+
+def _number(value: float) -> str:
+    """Return a number with as many digits as an answer may claim."""
+    return f"{value:.3g}"
 
 
 def write_answers(path: Path, answers: Sequence[Answer | Crash]) -> None:

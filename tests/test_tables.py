@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 
@@ -101,6 +102,11 @@ def test_answers_table_shows_what_does_not_hold() -> None:
     assert "straight on" in lines[4]
     assert lines[4].endswith("7.5 s  NO")
     assert lines[5:] == ["O4: 3 phases"]
+
+
+def test_answers_have_no_more_digits_than_they_may_claim() -> None:
+    answer = replace(SLOW, answer=31.937, unit="times", interval=(12.6539, 51.0627))
+    assert "31.9 times in [12.7, 51.1]" in answers_table([answer])
 
 
 def test_answers_file(tmp_path: Path) -> None:
