@@ -19,7 +19,7 @@ import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
 import vtbdrake as vtb
-from benchmarks.measure import LOWER, Benchmark
+from benchmarks.measure import HIGHER, LOWER, Benchmark
 from tests.testbeds import PendulumScenario
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
@@ -30,7 +30,8 @@ BUDGETS, SHORT_BUDGETS = (30, 100, 400), (30, 100)
 SEEDS = range(5)
 # Below this part of a typical gap, an optimum counts as found.
 SOLVED = 1e-4
-GOAL = 1.5
+# A row is good up to this ratio; so many of all rows shall be, none above the largest, and in none `auto` the worst.
+GOOD, GOAL, LARGEST = 1.5, 28 / 33, 5.0
 # The penalty of a violation of 1, far above the multiplier of the constraint.
 PENALTY = 10.0
 AUTO, STUDY = "auto", "study"
@@ -438,7 +439,7 @@ def auto_regret() -> list[Benchmark]:
 
 
 def auto_regret_full() -> list[Benchmark]:
-    """The median gap of `auto` over that of the best of the others: the median of all rows, and each row."""
+    """Return the median gap of `auto` over that of the best of the others, row by row, and in how many it is good."""
     return _regret("auto_regret_full", BUDGETS)
 
 
@@ -455,16 +456,19 @@ def _regret(title: str, budgets: Sequence[int]) -> list[Benchmark]:
             rows.append(_row(f"{title}_{name}_{budget}", medians))
     ratios = [row.value for row in rows]
     worst = [row.name for row in rows if "the worst" in row.note]
+    largest = max(rows, key=lambda row: row.value)
+    share = sum(ratio <= GOOD for ratio in ratios) / len(ratios)
     summary = Benchmark(
         name=title,
-        value=float(np.median(ratios)),
+        value=share,
         unit="1",
         goal=GOAL,
-        better=LOWER,
+        better=HIGHER,
         against="the best of TPE, CMA-ES, cmaes, dual annealing, multi-start BOBYQA",
-        holds=bool(np.median(ratios) <= GOAL and not worst),
-        note=f"at most {GOAL} in {sum(ratio <= GOAL for ratio in ratios)} of {len(ratios)} rows; "
-        f"the worst in {', '.join(worst) or 'none'}",
+        holds=share >= GOAL and largest.value <= LARGEST and not worst,
+        note=f"the share of {len(ratios)} rows whose ratio of gaps is at most {GOOD}; the median is "
+        f"{np.median(ratios):.2g}, the largest {largest.value:.2g} in {largest.name}, where the goal is {LARGEST:g}; "
+        f"the worst of all solvers in {', '.join(worst) or 'none'}",
     )
     return [summary, *rows]
 
