@@ -134,7 +134,7 @@ def _headless(testbed: VirtualTestbed, horizon: float, step: float) -> tuple[flo
     return (time.perf_counter() - begin) / seconds, (time.thread_time() - worked) / seconds
 
 
-def view_states(seconds: float = 20.0) -> list[Benchmark]:
+def view_states(seconds: float = 10.0) -> list[Benchmark]:
     """States that a client handles per second, of eleven robots that move in real time; beside it, their age.
 
     A state counts when the client has unpacked its last pose. Its age is the time since it was drawn. If there is a
