@@ -48,12 +48,13 @@ BELOW: dict[str, set[str]] = {
 # travel to them, when the names of a package are imported, what a cache keeps, arrays, splines, laser scans, and where
 # a model is valid.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "arrays", "child_process", "failures", "lazy"})
+    _layers.update({"argument_checks", "arrays", "child_process", "closing", "failures", "lazy"})
     _layers.update({"lru", "pickling", "scan", "settings", "spline", "validity_domain"})
 BELOW["spline"] = {"argument_checks", "arrays", "spline_kernel"}
 BELOW["spline_kernel"] = {"state"}
 BELOW["scan"] = {"arrays"}
 BELOW["arrays"] = set()
+BELOW["closing"] = set()
 BELOW["validity_domain"] = {"argument_checks", "arrays"}
 BELOW["pickling"] = set()
 BELOW["child_process"] = {"pickling"}

@@ -9,11 +9,12 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
 from math import floor, inf, isnan, nan
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.closing import Closing
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, SimulatedClock, Throttle, WallClock
 from vtbdrake.control.guards import MOST_UNSENT, Guards
@@ -43,7 +44,7 @@ _KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
 _WAIT = 0.1  # s, for newer samples after a pause
 
 
-class Runtime(Stepped):
+class Runtime(Closing, Stepped):
     """Steps a testbed, or the DPS alone, once per period, with the machine on the other side of a bridge.
 
     A cycle receives the newest messages, feeds them to the DPS, steps it by one period, lets the guards check its
@@ -168,12 +169,6 @@ class Runtime(Stepped):
     def close(self) -> None:
         """End the processes of the slow parts. Nothing can be done with the runtime afterwards."""
         self.slow_parts.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- the loop
 

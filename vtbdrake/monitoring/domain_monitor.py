@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from typing import Self
 
 import numpy as np
 
+from vtbdrake.closing import Closing
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
@@ -16,7 +16,7 @@ from vtbdrake.validity_domain import Departure, DomainWatch, ValidityDomain
 _log = logging.getLogger(__name__)
 
 
-class DomainMonitor:
+class DomainMonitor(Closing):
     """Watches a loop, and says once when its DPS leaves the validity domain of its model.
 
     It watches from its construction until `close`. Once per window of the domain, after the cycle's commands were sent,
@@ -69,9 +69,3 @@ class DomainMonitor:
     def close(self) -> None:
         """End the monitor."""
         self._runtime.unwatch(self)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.closing import Closing
 from vtbdrake.failures import safe_text
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.identity import (
@@ -53,7 +54,7 @@ _log = logging.getLogger(__name__)
 Callback = Callable[["Study", Trial], Any]
 
 
-class Study:
+class Study(Closing):
     """The rollouts and points of one problem, in one file or in memory.
 
     `Problem.study` begins a study, or resumes the one in a file. `open` opens a file for reading and for giving points,
@@ -157,12 +158,6 @@ class Study:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         where = "in memory" if self.path is None else str(self.path)

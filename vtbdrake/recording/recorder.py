@@ -9,11 +9,12 @@ import zlib
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from pydrake.systems.framework import Context
 
 from vtbdrake.child_process import ProcessStartError
+from vtbdrake.closing import Closing
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
@@ -59,7 +60,7 @@ class RecordingError(RuntimeError):
     """A recording that lacks cycles of the loop."""
 
 
-class Recorder:
+class Recorder(Closing):
     """Records a loop to a file from now on, until it is closed; a context manager.
 
     The loop only forms the bytes; a worker process writes them. If that process dies, or the disk is full, the loop
@@ -163,12 +164,6 @@ class Recorder:
                 f"the process {self.pid}, which writes {self.path}, does not start within {timeout:g} s: nothing would "
                 "be recorded; see its output above, and whether the computer is overloaded"
             )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- in the loop
 

@@ -9,15 +9,16 @@ import queue
 import sys
 import threading
 import weakref
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 from tqdm.auto import tqdm
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.closing import Closing
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
@@ -45,7 +46,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-class Executor(ABC):
+class Executor(Closing):
     """Runs rollouts of a task. It may be used for several tasks and is closed at the end (it is a context manager).
 
     Testbeds and runners are kept from call to call, so that a call with a single point costs little more than its
@@ -84,12 +85,6 @@ class Executor(ABC):
     def close(self) -> None:
         """Release threads, processes and testbeds."""
         return
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class SerialExecutor(Executor):

@@ -8,11 +8,12 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vtbdrake.closing import Closing
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lazy import extra_module
 from vtbdrake.lcm.connections import LcmLink
@@ -48,7 +49,7 @@ class LiveTimeoutError(TimeoutError):
     """No answer or no value came in time."""
 
 
-class LiveClient:
+class LiveClient(Closing):
     """Sets and reads variables of a DPS that runs with a `LiveService`, and resets its guards.
 
     ::
@@ -164,12 +165,6 @@ class LiveClient:
         """Close the connection."""
         self._link.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def watch(
     url: str, addresses: Sequence[str], *, every: int = 1, lease: float = 2.0, timeout: float = 5.0
@@ -255,7 +250,7 @@ def _samples(
         link.close()
 
 
-class LiveWatch:
+class LiveWatch(Closing):
     """A buffer of the newest watched values for plotting; a separate thread receives them.
 
     ::
@@ -367,12 +362,6 @@ class LiveWatch:
         """End the watch; the samples that are kept remain."""
         self._stop.set()
         self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 # -- checks

@@ -7,11 +7,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from math import inf
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
+from vtbdrake.closing import Closing
 from vtbdrake.control.background_process import BackgroundProcess, unpack
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
@@ -28,7 +29,7 @@ _PAUSE = 0.01
 _FAULTS = 5
 
 
-class LiveService:
+class LiveService(Closing):
     """Lets other processes set variables of a running DPS, read and watch variables and ports, and reset its guards.
 
     They can ask for the status of the loop, too.
@@ -84,12 +85,6 @@ class LiveService:
         """End the service and tell the clients that watch."""
         self._runtime.unwatch(self)
         self._worker.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __call__(self, cycle: Cycle) -> None:
         """Take one request and read the values that are due; the runtime calls it in every cycle."""

@@ -7,11 +7,11 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from math import ceil, inf, isnan, prod
-from typing import Self
 
 import numpy as np
 
 from vtbdrake.arrays import Array
+from vtbdrake.closing import Closing
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
@@ -51,7 +51,7 @@ class ResidualError(RuntimeError):
     """The worker process that computes the residuals does not start."""
 
 
-class ResidualMonitor:
+class ResidualMonitor(Closing):
     """Compares the machine with its model while the loop runs, and raises alarms where they differ.
 
     The monitor watches the loop from its construction until `close`. The loop only fills a row of numbers per cycle and
@@ -317,12 +317,6 @@ class ResidualMonitor:
         if self._worker is not None:
             self._worker.close()
             self._take_reports(self._worker)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _check(runtime: Runtime, mode: str, config: ResidualConfig, scenario: Scenario) -> None:
