@@ -31,10 +31,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from tests.components.compiled_plant.plants import cart_pole, inertia
 from vtbdrake.components.compiled_plant import (
     UnsupportedPlantError,
-    compiled_world,
     plant_dynamics,
     plant_step,
-    world,
 )
 
 
@@ -133,7 +131,7 @@ def test_connected_force_is_refused_by_name():
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
     with pytest.raises(UnsupportedPlantError, match="the input port applied_generalized_force"):
-        compiled_world(plant, plant.GetMyContextFromRoot(root))
+        plant_dynamics(plant, plant.GetMyContextFromRoot(root))
 
 
 @pytest.mark.parametrize("time_step", [0.0, 0.01])
@@ -220,12 +218,3 @@ def test_pose_that_carries_other_frames_is_no_input():
     with pytest.raises(ValueError, match="the frame top is attached to it"):
         plant_dynamics(plant, context, inputs=["stand.pose"])
     assert plant_dynamics(plant, context, inputs=["top.pose"]).name_in() == ["x", "u", "top_pose"]
-
-
-def test_world_is_checked_against_its_plant(monkeypatch):
-    coarse = cart_pole(0.02)
-    wrong = plant_step(coarse, coarse.CreateDefaultContext())
-    monkeypatch.setattr(world, "plant_step", lambda plant, context, inputs: wrong)
-    plant = cart_pole(0.01)
-    with pytest.raises(ArithmeticError, match="differs"):
-        compiled_world(plant, plant.CreateDefaultContext())

@@ -17,7 +17,6 @@ from vtbdrake.components.compiled_plant.momentum import (
     rotation_angle,
 )
 from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBatch
-from vtbdrake.components.compiled_plant.world import compiled_world
 
 __all__ = [
     "AppliedForce",
@@ -30,7 +29,6 @@ __all__ = [
     "RolloutBatch",
     "UnsupportedPlantError",
     "base_poses",
-    "compiled_world",
     "momentum_world",
     "plant_dynamics",
     "plant_step",
