@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.ray_kernel import keep_nearest, to_body, to_world
+from vtbdrake.lazy import extra_module
 
 if TYPE_CHECKING:
     from pydrake.geometry import Role, SceneGraph, Shape
@@ -88,15 +89,12 @@ class RayCaster:
             without: Bodies that rays pass through.
 
         Raises:
-            ImportError: Embree is not installed.
+            ModuleNotFoundError: Embree is not installed.
             ValueError: A geometry cannot be cast, or moves and does not belong to the plant.
         """
-        try:
-            from embreex.rtcore import EmbreeDevice
-        except ImportError as error:
-            raise ImportError("casting rays takes Embree: pip install 'vtbdrake[perception]'") from error
+        embree = extra_module("embreex.rtcore", purpose="casting rays", extra="perception")
         surfaces = body_surfaces(plant, scene_graph, role=role, without=without)
-        device = EmbreeDevice()
+        device = embree.EmbreeDevice()
         self._groups = tuple(_group(body, surfaces[body], device) for body in sorted(surfaces))
         self.bodies = tuple(group.body for group in self._groups)
 

@@ -106,7 +106,7 @@ class JointDrives(AddressedSystem):
         entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in by_joint.items()}
         self.max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
-        self._period, self._n = float(period), n
+        self.period, self._n = float(period), n  # sample period T in seconds
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
@@ -124,13 +124,8 @@ class JointDrives(AddressedSystem):
             delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
         velocities = [plant.num_positions() + joint.velocity_start() for joint in joints]
-        self.kernel = _kernel(velocities, plant.num_multibody_states(), period=self._period)
-        self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._update)
-
-    @property
-    def period(self) -> float:
-        """Return the sample period T in seconds."""
-        return self._period
+        self.kernel = _kernel(velocities, plant.num_multibody_states(), period=self.period)
+        self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
 
     def resume(self, context: Context, command: ArrayLike) -> None:
         """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import log
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ from vtbdrake.components.perception.estimate import (
     cross_matrix,
     rotation_matrix,
 )
+from vtbdrake.components.perception.opencv import grey_image, opencv
 from vtbdrake.components.textures import textured_mesh
 from vtbdrake.settings import check_settings, setting
 
@@ -152,21 +153,13 @@ def _mesh(board: MarkerBoard) -> Mesh:
 
 def _texture(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Return the markers side by side, in their white frames, as a grey image."""
-    aruco = _opencv().aruco
+    aruco = opencv().aruco
     dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
     tiles = [aruco.generateImageMarker(dictionary, int(k), _CELLS * _CELL_PIXELS) for k in ids]
     return np.hstack([np.pad(tile, _CELL_PIXELS, constant_values=255) for tile in tiles])
 
 
 # -- in an image
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("markers need OpenCV: pip install vtbdrake[perception]") from error
-    return cv2
 
 
 REFINEMENTS = ("lines", "subpixel", "none")
@@ -237,7 +230,7 @@ def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetec
         ImportError: OpenCV is missing.
     """
     detector = detector or MarkerDetectorConfig()
-    grey = _grey(image)
+    grey = grey_image(image)
     ids, corners = _search(grey, detector, scale=1)
     if detector.upscaling > 1:
         more_ids, more = _search(grey, detector, scale=detector.upscaling)
@@ -256,7 +249,7 @@ def _search(grey: NDArray[np.uint8], detector: MarkerDetectorConfig, *, scale: i
         detector: The settings.
         scale: The factor by which the image is enlarged for the search.
     """
-    cv2 = _opencv()
+    cv2 = opencv()
     aruco = cv2.aruco
     parameters = aruco.DetectorParameters()
     # A window has a middle, so that its edge is odd.
@@ -284,14 +277,6 @@ def _repeated(corners: Array, ids: NDArray[np.int64], first: Array, first_ids: N
     return np.asarray(((ids[:, None] == first_ids) & (gaps < 0.5 * widths)).any(axis=1))
 
 
-def _grey(image: ImageRgba8U | NDArray[np.uint8]) -> NDArray[np.uint8]:
-    cv2 = _opencv()
-    data = image if isinstance(image, np.ndarray) else image.data
-    if data.ndim == 2:
-        return np.ascontiguousarray(data)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(data[:, :, :3]), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
 _ALONG = np.linspace(0.08, 0.92, 13)  # Where an edge is searched for, as a share of its length.
 _ACROSS = np.linspace(-1.0, 1.0, 13)  # And across, as a share of the reach.
 
@@ -306,8 +291,7 @@ def fit_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
         grey: The image.
         corners: The corners (n, 4, 2), in pixels from the centre of the first pixel, within about one pixel.
     """
-    import cv2
-
+    cv2 = opencv()
     following = np.roll(corners, -1, axis=1)
     length = np.linalg.norm(following - corners, axis=2, keepdims=True)
     t = (following - corners) / np.maximum(length, 1e-9)
@@ -524,8 +508,7 @@ class _Corners:
 
 
 def _start(corners: _Corners) -> RigidTransform | None:
-    import cv2
-
+    cv2 = opencv()
     fx, fy, cx, cy = corners.intrinsics
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     try:

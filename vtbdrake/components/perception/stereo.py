@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import atan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.arrays import Array
+from vtbdrake.components.perception.opencv import grey_image, opencv
 from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
@@ -162,8 +163,8 @@ class StereoMatcher:
             ImportError: OpenCV is missing.
             ValueError: The images differ in size.
         """
-        cv2 = _opencv()
-        greys = [_grey(image) for image in (left, right)]
+        cv2 = opencv()
+        greys = [grey_image(image) for image in (left, right)]
         if greys[0].shape != greys[1].shape:
             sizes = " and ".join(f"{grey.shape[1]} x {grey.shape[0]}" for grey in greys)
             raise ValueError(f"left and right image of a rectified pair have the same size, not {sizes} pixels")
@@ -198,19 +199,3 @@ class StereoMatcher:
         unknown = (sixteenths < 0) | (contrast < self.texture) | (disparity > columns)
         disparity[unknown] = np.nan
         return disparity
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("stereo vision needs OpenCV: pip install vtbdrake[perception]") from error
-    return cv2
-
-
-def _grey(image: ImageRgba8U | NDArray[np.uint8]) -> NDArray[np.uint8]:
-    cv2 = _opencv()
-    data = image if isinstance(image, np.ndarray) else image.data
-    if data.ndim == 2:
-        return np.ascontiguousarray(data)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(data[:, :, :3]), cv2.COLOR_RGB2GRAY), dtype=np.uint8)

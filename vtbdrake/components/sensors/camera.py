@@ -176,7 +176,8 @@ class Camera(AddressedSystem):
             raise ValueError("Camera: the plant has no geometry; register it with a SceneGraph")
         info = info or CameraInfo(320, 240, np.pi / 4)
         self._width, self._height = info.width(), info.height()
-        self._period, self._stream = float(period), random_stream(self, stream)
+        self.period = float(period)  # time between two images in seconds
+        self._stream = random_stream(self, stream)
         self._clipping_near, self._clipping_far = float(clipping_near), float(clipping_far)
         self._depth_range = float(depth_range[0]), float(depth_range[1])
         self._supersampling = int(supersampling)
@@ -191,8 +192,8 @@ class Camera(AddressedSystem):
         self._declare_state(depth, max(errors.latency, errors.max_latency))
         self._scene = self.declare_cache("scene", lambda context: RenderedScene(), {self.nothing_ticket()})
         self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
-        self.timings = ((self._period, 0.0),)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, self._sample)
+        self.timings = ((self.period, 0.0),)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._sample)
 
     def _declare_parameters(
         self, X_PC: RigidTransform, info: CameraInfo, errors: ErrorModel, photon_noise: float
@@ -278,11 +279,6 @@ class Camera(AddressedSystem):
             depth_range=(reach.min_depth(), reach.max_depth()),
             **options,
         )
-
-    @property
-    def period(self) -> float:
-        """Return the time between two images (s)."""
-        return self._period
 
     def X_WC(self, context: Context) -> RigidTransform:
         """Return the pose of the camera frame C in the world."""
@@ -379,7 +375,7 @@ class Camera(AddressedSystem):
         return _counts(expected), np.zeros((0, 0), np.float32) if depth is None else depth
 
     def _tick(self, context: Context) -> int:
-        return round(context.get_time() / self._period)
+        return round(context.get_time() / self.period)
 
     def _begin(self, context: Context, state: State) -> EventStatus:
         """Take the first image, which also counts as all earlier ones that are in transit."""

@@ -106,7 +106,7 @@ class Imu(SampledSensor):
             mount=self._settings.array(context),
             g_W=self._g_W,
             memory=memory,
-            period=self._period,
+            period=self.period,
         )
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
@@ -114,7 +114,7 @@ class Imu(SampledSensor):
         super().resume(context, y)
         now = context.get_time()
         # The time since the last sample; what is due now has not been sampled yet.
-        elapsed = now - (ceil(now / self._period - 1e-6) - 1.0) * self._period
+        elapsed = now - (ceil(now / self.period - 1e-6) - 1.0) * self.period
         memory = self._memory.mutable(context.get_mutable_discrete_state())
         memory.sampled = 0.0
         self._sample_into(np.asarray(memory), context)

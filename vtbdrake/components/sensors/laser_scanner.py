@@ -211,20 +211,21 @@ class LaserScanner(AddressedSystem):
             if getattr(errors, name):
                 raise ValueError(f"LaserScanner: scans have no {name}; leave it out of the errors")
         self._caster, self._body = caster, int(frame.body().index())
-        self._slice_period, self._stream = float(slice_period), random_stream(self, stream)
+        self.slice_period = float(slice_period)  # length of a slice in seconds
+        self._stream = random_stream(self, stream)
         self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self._velocities_port = self.DeclareAbstractInputPort("body_spatial_velocities", Value[list[SpatialVelocity]]())
         self._haze_port = self.DeclareVectorInputPort("haze", HAZE.size)
         self._declare_parameters(frame.GetFixedPoseInBodyFrame(), config, errors)
         self._declare_state()
-        self.timings = ((self._slice_period, 0.0),)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self._slice_period, 0.0, self._end_slice)
+        self.timings = ((self.slice_period, 0.0),)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.slice_period, 0.0, self._end_slice)
 
     def _declare_parameters(self, X_BL: RigidTransform, config: LaserScannerConfig, errors: ErrorModel) -> None:
         settings = declared_settings(ErrorModel) | declared_settings(LaserScannerConfig)
         units = {name: settings[name].unit or "1" for name in (*_FIELDS, *_ERRORS)}
         units |= dict.fromkeys(("noise", "outlier_size", "bias", "quantization"), "m")  # as the ranges
-        bounds = {name: settings[name].bounds for name in units} | {"frequency": (0.0, 1.0 / self._slice_period)}
+        bounds = {name: settings[name].bounds for name in units} | {"frequency": (0.0, 1.0 / self.slice_period)}
         defaults = {name: getattr(config, name) for name in _FIELDS} | {name: getattr(errors, name) for name in _ERRORS}
         self._parameters = self.declare_parameters(
             pose=Quantity(pose_to_array(X_BL), POSE_UNIT),
@@ -248,11 +249,6 @@ class LaserScanner(AddressedSystem):
             fired=Quantity(),
         )
         self.DeclareStateOutputPort("scan", self._scan)
-
-    @property
-    def slice_period(self) -> float:
-        """Return the length of a slice (s)."""
-        return self._slice_period
 
     def points_W(self, context: Context) -> Array:
         """Return the points of the last scan in the world, each where its ray was fired, in m, shape (n, 3).
@@ -283,7 +279,7 @@ class LaserScanner(AddressedSystem):
         config = LaserScannerConfig(**{name: getattr(values, name) for name in _FIELDS})
         if float(config.rows).is_integer():
             config.rows = int(config.rows)
-        config.check(self._slice_period)
+        config.check(self.slice_period)
         errors = ErrorModel(**{name: getattr(values, name) for name in _ERRORS})
         return _Settings(pose_from_array(values.pose), config, errors)
 
@@ -296,10 +292,10 @@ class LaserScanner(AddressedSystem):
         fired = int(present.fired)
         slices = context.get_abstract_state(int(self._progress)).get_value().slices
         # No scan has begun, or the context has been set to a later time.
-        if not rows or start + (fired + 0.5) * period / (rows * columns) < now - 1.5 * self._slice_period:
+        if not rows or start + (fired + 0.5) * period / (rows * columns) < now - 1.5 * self.slice_period:
             start, slices, fired = now, (), 0
             period, rows, columns, by_columns = _next_scan(settings.config)
-        tick = round(now / self._slice_period)
+        tick = round(now / self.slice_period)
         stream = self._stream() if self._is_random(context, settings) else 0
         generator = noise_generator(seed=int(settings.errors.seed), stream=stream, tick=tick, channel=_CHANNEL)
         while True:

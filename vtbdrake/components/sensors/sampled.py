@@ -59,7 +59,7 @@ class SampledSensor(AddressedSystem):
         noise = noise or {}
         if not period > 0:
             raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
-        self._period = float(period)
+        self.period = float(period)  # time between two samples in seconds
         y0 = np.asarray(default, dtype=float)
         reading = self.declare_discrete_state(**{signal: Quantity(y0, unit)})
         self._output = int(reading.index)
@@ -79,15 +79,10 @@ class SampledSensor(AddressedSystem):
                 stream=stream,
                 default=y0,
                 output=self._output,
-                period=self._period,
+                period=self.period,
                 unit=unit,
             )
-        self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._sample)
-
-    @property
-    def period(self) -> float:
-        """Return the time between two samples (s)."""
-        return self._period
+        self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._sample)
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
         """Continue like a sensor that has shown ``y`` last, which also counts as the samples in transit.

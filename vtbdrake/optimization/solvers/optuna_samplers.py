@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 
@@ -131,10 +132,7 @@ def import_optuna(name: str) -> Any:
     Raises:
         ModuleNotFoundError: Optuna (or, for GP, torch) is not installed.
     """
-    try:
-        module = importlib.import_module("optuna")
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{name} needs Optuna: pip install 'vtbdrake[optuna]'") from error
+    module = extra_module("optuna", purpose=name, extra="optuna")
     if name == "GP":
         try:
             importlib.import_module("torch")
