@@ -66,7 +66,7 @@ def test_friction_of_a_sliding_block_is_that_of_the_closed_form() -> None:
     assert result.accepted and result.scenario.friction == mu.value
     assert result.values == {"scenario.friction": mu.value}
     assert "10 recordings, 8 windows: loss" in str(result)
-    assert result.scenario.pedigree.source_of("scenario.friction") == "calibrated"
+    assert result.scenario.pedigree.numbers["scenario.friction"].source == "calibrated"
     samples = [sample["scenario.friction"] for sample in result.scenario.samples(200)]
     assert np.std(samples) == pytest.approx(mu.deviation, rel=0.3) and len(result.scenario.pedigree.logs) == 10
 

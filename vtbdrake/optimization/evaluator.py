@@ -70,15 +70,10 @@ class Evaluator:
         self._bounds = [quality.bound(problem.task.horizon) for quality in problem.objectives]
         self.best: Evaluation | None = None  # the best evaluation so far; None if there are several qualities
         self._allows: Callable[[Point], bool] = lambda _: True
-        # Independent of the known ones, of which a resumed study has more.
-        self._needed: set[RolloutKey] = set()
+        # The rollouts that the evaluations so far have needed, whether they were known or run.
+        self.needed: set[RolloutKey] = set()
         # The number of rollouts that each point has needed since its last evaluation.
         self._untold: Counter[Point] = Counter()
-
-    @property
-    def needed(self) -> Collection[RolloutKey]:
-        """Return the rollouts that the evaluations so far have needed, whether they were known or run."""
-        return self._needed
 
     def restrict(
         self, allows: Callable[[Point], bool], evaluations: Sequence[Evaluation], *, budget: int | None
@@ -95,7 +90,7 @@ class Evaluator:
         while waiting:
             count = len(waiting)
             if self._racing:
-                left = (self._budget - len(self._needed)) / len(self._conditions)
+                left = (self._budget - len(self.needed)) / len(self._conditions)
                 count = max(1, int(min(left, count)))
             evaluations |= self._evaluate_together(waiting[:count])
             waiting = waiting[count:]
@@ -112,8 +107,8 @@ class Evaluator:
         return evaluations
 
     def _complete(self, keys: Sequence[RolloutKey]) -> None:
-        new = dict.fromkeys(key for key in keys if key not in self._needed)
-        self._needed.update(new)
+        new = dict.fromkeys(key for key in keys if key not in self.needed)
+        self.needed.update(new)
         self._untold.update(point for point, _ in new)
         missing = [key for key in keys if key not in self._outcomes]
         if missing:

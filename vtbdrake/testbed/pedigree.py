@@ -61,8 +61,3 @@ class Pedigree:
     def values(self) -> dict[str, float]:
         """Return the values that s0 begins with, by address."""
         return {address: each.value for address, each in self.numbers.items() if each.value is not None}
-
-    def source_of(self, address: str) -> str:
-        """Return where a number, or an array of which an entry has a pedigree, is from."""
-        entries = {n.source for a, n in self.numbers.items() if a == address or a.startswith(f"{address}[")}
-        return ", ".join(sorted(entries)) or SOURCES[0]

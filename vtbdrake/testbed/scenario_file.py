@@ -86,10 +86,21 @@ def scenario_text(scenario: Scenario) -> str:
     Raises:
         ScenarioError: A field is of a type that no file can hold.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scenario.yaml"
-        save_scenario(scenario, path)
-        return path.read_text("utf-8")
+    resolve_types(type(scenario))
+    try:
+        text = yaml_dump_typed(scenario, child_name=scenario.name())
+    except Exception:
+        for item in fields(scenario):
+            try:
+                yaml_dump_typed({"": getattr(scenario, item.name)}, schema=dict[str, item.type])  # type: ignore[name-defined]
+            except Exception as error:
+                raise ScenarioError(
+                    f"no file can hold {type(scenario).__name__}.{item.name}, a {_type_name(item.type)}: make it of "
+                    "numbers, texts, lists, dictionaries, dataclasses of them and Drake's configs"
+                ) from error
+        raise
+    # A file without a pedigree is one that hardware_sim reads, too.
+    return text if scenario.pedigree != Pedigree() else _PEDIGREE.sub("", text)
 
 
 def file_and_key(source: str) -> tuple[str, str]:
@@ -109,25 +120,11 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str], *, domain: V
     Raises:
         ScenarioError: A field is of a type that no file can hold.
     """
-    resolve_types(type(scenario))
     if domain is not None:
         file = Path(path).with_suffix(".domain.json")
         domain.save(file)
         scenario.pedigree.domain = file.name
-    try:
-        text = yaml_dump_typed(scenario, child_name=scenario.name())
-    except Exception:
-        for item in fields(scenario):
-            try:
-                yaml_dump_typed({"": getattr(scenario, item.name)}, schema=dict[str, item.type])  # type: ignore[name-defined]
-            except Exception as error:
-                raise ScenarioError(
-                    f"no file can hold {type(scenario).__name__}.{item.name}, a {_type_name(item.type)}: make it of "
-                    "numbers, texts, lists, dictionaries, dataclasses of them and Drake's configs"
-                ) from error
-        raise
-    # A file without a pedigree is one that hardware_sim reads, too.
-    Path(path).write_text(text if scenario.pedigree != Pedigree() else _PEDIGREE.sub("", text))
+    Path(path).write_text(scenario_text(scenario))
 
 
 def _type_name(kind: Any) -> str:

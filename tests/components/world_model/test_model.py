@@ -128,7 +128,7 @@ def test_objects_are_told_on_one_line() -> None:
 def test_status_selects(stand: WorldModel) -> None:
     model = WorldModel([tree("a", [0, 0, 0]), tree("b", [1, 0, 0], status="retired")])
     assert [one.identity for one in model.find(status="retired")] == ["b"]
-    assert [one.identity for one in model.without_unknown()] == ["a"]
+    assert [one.identity for one in model if one.is_known] == ["a"]
 
 
 def test_changes_leave_the_model_as_it_was() -> None:

@@ -199,7 +199,7 @@ def test_missing_tree_is_retired_and_stays_as_such() -> None:
     recovered = observe(model, [seen([0.0, 0.0, 0.0])], expected=["t"])
     assert recovered["t"].misses == 0
     model = observe(model, [], expected=["t"])
-    assert model["t"].status == "retired" and len(model.without_unknown()) == 0
+    assert model["t"].status == "retired" and not model["t"].is_known
     assert observe(model, [], expected=["t"])["t"] is model["t"]
     assert [one.status for one in observe(model, [seen([0.0, 0.0, 0.0])])] == ["retired", "tentative"]
 

@@ -41,11 +41,14 @@ class WorldModel:
         objects: The objects, in the order in which queries return them.
         created: How many identities `observe` has given to new objects so far; an identity is never given twice.
 
+    Attributes:
+        created: How many identities have been given to objects that observations have added.
+
     Raises:
         ValueError: Two objects have one identity, or a relation leads to an object that is not there.
     """
 
-    __slots__ = ("_created", "_index", "_objects")
+    __slots__ = ("_index", "_objects", "created")
 
     def __init__(self, objects: Iterable[WorldObject] = (), *, created: int = 0) -> None:
         self._objects: dict[str, WorldObject] = {}
@@ -58,13 +61,8 @@ class WorldModel:
                 if relation.other not in self._objects:
                     statement = f"{world_object.identity} {relation.kind} {relation.other!r}"
                     raise ValueError(f"{statement}, which is not an object of the model")
-        self._created = created
+        self.created = created
         self._index: _Index | None = None
-
-    @property
-    def created(self) -> int:
-        """How many identities have been given to objects that observations have added."""
-        return self._created
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -85,7 +83,7 @@ class WorldModel:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return partial(WorldModel, created=self._created), (tuple(self),)
+        return partial(WorldModel, created=self.created), (tuple(self),)
 
     def __repr__(self) -> str:
         kinds = [world_object.kind for world_object in self]
@@ -157,13 +155,6 @@ class WorldModel:
         """Return the objects to which an object has a relation (of ``kind``, if given)."""
         return tuple(self[r.other] for r in self[identity].relations if kind is None or r.kind == kind)
 
-    def without_unknown(self) -> WorldModel:
-        """Return the part of the model that is believed to be there, without tentative and retired objects.
-
-        Relations to what is left out are left out, too.
-        """
-        return self.without(world_object.identity for world_object in self if not world_object.is_known)
-
     def with_objects(self, *objects: WorldObject, created: int | None = None) -> WorldModel:
         """Return a model in which these objects replace those of the same identity, or are added.
 
@@ -172,7 +163,7 @@ class WorldModel:
             created: The new `created`; by default it remains.
         """
         updated = self._objects | {world_object.identity: world_object for world_object in objects}
-        return WorldModel(updated.values(), created=self._created if created is None else created)
+        return WorldModel(updated.values(), created=self.created if created is None else created)
 
     def without(self, identities: Iterable[str]) -> WorldModel:
         """Return a model without these objects, and without the relations to them.
@@ -182,7 +173,7 @@ class WorldModel:
         """
         gone = {self[identity].identity for identity in identities}
         left = [world_object for world_object in self if world_object.identity not in gone]
-        return WorldModel((_cut(world_object, gone) for world_object in left), created=self._created)
+        return WorldModel((_cut(world_object, gone) for world_object in left), created=self.created)
 
     def _near(self, point: ArrayLike, distance: float) -> Rows:
         """Return the objects within a distance of a point, by row."""

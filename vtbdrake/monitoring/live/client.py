@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from vtbdrake.closing import Closing
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.lazy import extra_module
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.monitoring.live.messages import (
@@ -336,23 +335,6 @@ class LiveWatch(Closing):
             samples = list(self._samples)
         columns = {"time": np.array([time for time, _, _ in samples]), "since": np.array([s for _, s, _ in samples])}
         return columns | {a: np.array([values[a] for _, _, values in samples]) for a in self._addresses}
-
-    def frame(self) -> Any:
-        """Return `arrays` as a pandas DataFrame with one column per number, over time.
-
-        Raises:
-            ModuleNotFoundError: Pandas is not installed.
-        """
-        pd = extra_module("pandas", purpose="a frame", extra="dataframe")
-        arrays = self.arrays()
-        time = arrays.pop("time")
-        del arrays["since"]
-        columns: dict[str, Any] = {}
-        for address, values in arrays.items():
-            flat = values.reshape(time.size, -1)
-            names = [address] if values.ndim < 2 else [f"{address}[{k}]" for k in range(flat.shape[1])]
-            columns |= dict(zip(names, flat.T, strict=True))
-        return pd.DataFrame(columns, index=pd.Index(time, name="time"))
 
     def _check(self) -> None:
         if self._error is not None:
