@@ -227,7 +227,7 @@ def detect_markers(image: ImageRgba8U | NDArray[np.uint8], detector: MarkerDetec
         detector: The settings of the detection.
 
     Raises:
-        ImportError: OpenCV is missing.
+        ModuleNotFoundError: OpenCV is missing.
     """
     detector = detector or MarkerDetectorConfig()
     grey = grey_image(image)

@@ -160,7 +160,7 @@ class StereoMatcher:
             right: The image of the right camera.
 
         Raises:
-            ImportError: OpenCV is missing.
+            ModuleNotFoundError: OpenCV is missing.
             ValueError: The images differ in size.
         """
         cv2 = opencv()
