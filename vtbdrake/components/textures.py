@@ -5,8 +5,6 @@ Cameras that measure distances by comparing two images need surfaces that look d
 
 from __future__ import annotations
 
-import struct
-import zlib
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,15 +93,12 @@ def tiled_mesh(surface: Surface, *, image: NDArray[np.uint8], tile: tuple[float,
 
 def png(image: NDArray[np.uint8]) -> bytes:
     """Return an image, shape (h, w, 3), or (h, w) if grey, as a PNG file in colours, as every renderer reads it."""
-    rgb = np.ascontiguousarray(np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image, dtype=np.uint8)
-    height, width = rgb.shape[:2]
-    rows = b"".join(b"\0" + row.tobytes() for row in rgb)
+    from pydrake.systems.sensors import ImageFileFormat, ImageIo, ImageRgb8U
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    height, width = image.shape[:2]
+    picture = ImageRgb8U(width, height)
+    picture.mutable_data[:] = image.reshape(height, width, -1)
+    return bytes(ImageIo().Save(picture, ImageFileFormat.kPng))
 
 
 def grain(color: ArrayLike, *, seed: int = 0) -> NDArray[np.uint8]:
