@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from math import expm1, inf
@@ -97,17 +98,12 @@ def nominal_residuals(
             f"a calibration needs at least {_MIN_WINDOWS} windows, not {len(table)}: run longer"
         )
     batches = table[: len(table) // _BATCH * _BATCH].reshape(-1, _BATCH, table.shape[1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        is_number = ~np.isnan(batches)
-        counts = is_number.sum(axis=1)
-        means = np.where(is_number, batches, 0.0).sum(axis=1) / counts
-        squares = np.where(is_number, batches - means[:, None], 0.0) ** 2
-        deviations = np.sqrt(squares.sum(axis=1) / (counts - 1))
-        mean = np.nan_to_num(np.where(counts > 0, means * counts, 0.0).sum(axis=0) / counts.sum(axis=0))
-        apart = np.where(counts > 0, np.abs(means - mean), 0.0).max(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings(action="ignore"):  # empty batches
+        means, deviations = np.nanmean(batches, axis=1), np.nanstd(batches, axis=1, ddof=1)
+        mean = np.nan_to_num(np.nanmean(batches, axis=(0, 1)))
         once, ratio = _scatter(table - mean)
-        deviation = np.fmax(np.where(counts > 1, deviations, 0.0).max(axis=0), once) * ratio
-        deviation = np.maximum(deviation, _SHARE * apart)
+        deviation = np.fmax(np.nan_to_num(deviations).max(axis=0), once) * ratio
+        deviation = np.maximum(deviation, _SHARE * np.nan_to_num(np.abs(means - mean)).max(axis=0))
     return NominalResiduals(
         mean={name: mean[place].tolist() for name, place in places.items()},
         deviation={name: deviation[place].tolist() for name, place in places.items()},
