@@ -13,7 +13,6 @@ from vtbdrake.monitoring.live.messages import (
     RequestError,
     SetRequest,
     StatusRequest,
-    nested,
     parse_request,
     request_id,
 )
@@ -70,10 +69,3 @@ def test_invalid_requests_are_rejected(channel, data, reason):
 def test_request_id_is_found():
     assert request_id(encoded(id="a", nonsense=1)) == "a"
     assert [request_id(data) for data in (b"{", b"[]", encoded(id=["a"]), b" " * 70_000)] == [""] * 4
-
-
-def test_nested_follows_the_shape():
-    assert nested((1.0,), ()) == 1.0
-    assert nested((1.0, 2.0), (2,)) == [1.0, 2.0]
-    assert nested(tuple(range(6)), (3, 2)) == [[0, 1], [2, 3], [4, 5]]
-    assert nested((), (0,)) == []

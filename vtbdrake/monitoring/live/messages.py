@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from operator import methodcaller
@@ -216,11 +215,3 @@ def is_number(value: Any) -> bool:
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
-
-
-def nested(entries: Sequence[float], shape: Sequence[int]) -> Any:
-    """Return entries in C order as nested lists of a shape, or as a number for the shape ()."""
-    if not shape:
-        return entries[0]
-    size = len(entries) // shape[0] if shape[0] else 0
-    return [nested(entries[k * size : (k + 1) * size], shape[1:]) for k in range(shape[0])]

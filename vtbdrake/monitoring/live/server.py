@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
+import numpy as np
+
 from vtbdrake.argument_checks import suggestion
 from vtbdrake.control.background_process import FrameConnection
 from vtbdrake.control.bridge import BridgeError
@@ -30,7 +32,6 @@ from vtbdrake.monitoring.live.messages import (
     ReadRequest,
     Request,
     RequestError,
-    nested,
     parse_request,
     request_id,
     to_json,
@@ -222,7 +223,7 @@ class LiveServer:
             return
         values, place = {}, 0
         for address, shape in zip(task.request.addresses, task.shapes, strict=True):
-            values[address] = nested(entries[place : place + prod(shape)], shape)
+            values[address] = np.reshape(entries[place : place + prod(shape)], shape).tolist()
             place += prod(shape)
         if task.channel == WATCH:
             self._publish(WATCHED + task.request.id, {"cycle": cycle, "since": since, "time": now, "values": values})
