@@ -321,5 +321,5 @@ def test_impossible_detector_is_rejected() -> None:
 
 def test_missing_opencv_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ImportError, match=r"pip install vtbdrake\[perception\]"):
+    with pytest.raises(ImportError, match=r"pip install 'vtbdrake\[perception\]"):
         detect_markers(np.zeros((8, 8), dtype=np.uint8))
