@@ -46,7 +46,7 @@ class SearchConfig:
     """How a reasoner searches: the method that proposes candidates, and where their rollouts run.
 
     Attributes:
-        method: Name of a solver from `vtbdrake.optimization.solvers` (``CEM``, ``predictive-sampling``, ``MPPI``,
+        method: Name of a solver from `vtbdrake.optimization.solvers` (``MPPI``, ``CEM``, ``predictive-sampling``,
             ``grid``, ``random``, ``CMA-ES``, ...), or a class derived from `Solver`.
         options: Options of the method.
         pruning: When to end the rollout of a candidate that cannot win any more. A quality is compared with the best
@@ -61,7 +61,7 @@ class SearchConfig:
             By default the horizon, but at least 10 s.
     """
 
-    method: str | type[Solver] = "CEM"
+    method: str | type[Solver] = "MPPI"
     options: Mapping[str, Any] = field(default_factory=dict)
     pruning: Pruning | None = None
     executor: str | Executor = "auto"
