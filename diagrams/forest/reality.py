@@ -8,14 +8,15 @@ spanner (GPL-3), which need ``laspy[lazrs]``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment, minimize_scalar
 from scipy.spatial import cKDTree
 
 from vtbdrake.arrays import Array
@@ -42,6 +43,10 @@ _EYE = 2.0
 _BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
 # A detection is right within this distance (m) of a stem; nearer than the second one to any ring, it is of a stem.
 _RIGHT, _STEM = 0.25, 0.6
+# The `outline` (m) with which the detector runs a second time: covariances are linear in its square.
+_OUTLINE = 0.05
+# Of two numbers and of one: 95 % of chi-square lie below.
+_CHI2_POSITION, _CHI2_DIAMETER = 5.99, 3.84
 
 
 def rioja_map(inventories: dict[str, Any], *, deviation: float = 0.3, diameter: float = 0.03) -> Landmarks:
@@ -151,7 +156,10 @@ class Detection:
         errors: Position error and error of the diameter of the detections that are right, (m, 2) in m.
         beside: Distances of detections of a stem that are off by more than `_RIGHT`.
         false: Distances of detections where the cloud shows no stem, not even one seen from one side.
+        stems: Which stems these are of, (m,).
+        matched: Which of the trunks these are, (m,).
         trunks: The detections, in the frame of the cloud turned by nothing, around the scanner.
+        outlined: The same with covariances for an outline of `_OUTLINE`.
         eye: The position of the scanner, (3,).
     """
 
@@ -160,7 +168,10 @@ class Detection:
     errors: Array
     beside: Array
     false: Array
+    stems: NDArray[np.intp]
+    matched: NDArray[np.intp]
     trunks: Landmarks
+    outlined: Landmarks
     eye: Array
 
 
@@ -179,11 +190,16 @@ def detections(cloud: Cloud, full: Array, partial: Array, *, noise: float, step:
                 continue
             eye = np.array([x, y, cloud.ground(np.array([x, y])) + _EYE])
             points = virtual_scan(cloud, eye, SCANNER)
-            trunks = detect_trunks(points - eye + [0.0, 0.0, _EYE], detector, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
-            yield _judged(points, eye, trunks, full, partial)
+            trunks, outlined = (
+                detect_trunks(points - eye + [0.0, 0.0, _EYE], each, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
+                for each in (detector, replace(detector, outline=_OUTLINE))
+            )
+            yield _judged(points, eye, trunks, outlined, full, partial)
 
 
-def _judged(points: Array, eye: Array, trunks: Landmarks, full: Array, partial: Array) -> Detection:
+def _judged(
+    points: Array, eye: Array, trunks: Landmarks, outlined: Landmarks, full: Array, partial: Array
+) -> Detection:
     shown = np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
     places = trunks.positions + eye[:2]
     apart = np.linalg.norm(full[:, None, :2] - places[None], axis=2)
@@ -197,7 +213,18 @@ def _judged(points: Array, eye: Array, trunks: Landmarks, full: Array, partial: 
     away = np.linalg.norm(places[rest] - eye[:2], axis=1)
     errors = np.column_stack([apart[stem, detection], trunks.diameters[detection] - full[stem, 2]])
     distances = np.linalg.norm(full[:, :2] - eye[:2], axis=1)
-    return Detection(distances[shown], right[shown], errors, away[nearest < _STEM], away[nearest >= _STEM], trunks, eye)
+    return Detection(
+        distances=distances[shown],
+        right=right[shown],
+        errors=errors,
+        beside=away[nearest < _STEM],
+        false=away[nearest >= _STEM],
+        stems=stem,
+        matched=detection,
+        trunks=trunks,
+        outlined=outlined,
+        eye=eye,
+    )
 
 
 def _is_shown(points: Array, eye: Array, stem: Array) -> bool:
@@ -230,6 +257,58 @@ def cloud_row(name: str, results: list[Detection]) -> tuple[str, ...]:
         f"{np.median(errors[:, 0]):.3f}",
         f"{np.median(errors[:, 1]):+.3f}, {np.sqrt(np.mean(errors[:, 1] ** 2)):.3f}",
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of positions (n, 2) and diameters (n,), and covariances as a function of the outline: P + (s / S)^2 dP."""
+
+    positions: Array
+    diameters: Array
+    P: Array
+    dP: Array
+    variances: Array
+    dvariances: Array
+
+    @classmethod
+    def of(cls, full: Array, results: list[Detection], *, half: int) -> Errors:
+        """Return those of every other stem, in the order of x."""
+        order = full[:, 0].argsort()[half::2]
+        parts: list[tuple[Array, ...]] = []
+        for each in results:
+            rows = np.isin(each.stems, order)
+            stem, k = full[each.stems[rows]], each.matched[rows]
+            trunks, outlined = each.trunks.select(k), each.outlined.select(k)
+            P, variances = trunks.covariances, trunks.diameter_deviations**2
+            places, diameters = trunks.positions + each.eye[:2] - stem[:, :2], trunks.diameters - stem[:, 2]
+            more = outlined.covariances - P, outlined.diameter_deviations**2 - variances
+            parts.append((places, diameters, P, more[0], variances, more[1]))
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def squares(self, outline: float) -> tuple[Array, Array, float]:
+        """Return the squared errors by their covariances, of positions and diameters, and -2 ln of the likelihood."""
+        share = (outline / _OUTLINE) ** 2
+        P, variances = self.P + share * self.dP, self.variances + share * self.dvariances
+        places = np.einsum("ki,ki->k", self.positions, np.linalg.solve(P, self.positions[:, :, None])[:, :, 0])
+        thick = self.diameters**2 / variances
+        unlikelihood = places.sum() + thick.sum() + np.log(np.linalg.det(P)).sum() + np.log(variances).sum()
+        return places, thick, float(unlikelihood)
+
+    def likeliest(self) -> float:
+        """Return the outline of the largest likelihood."""
+        return float(minimize_scalar(lambda s: self.squares(s)[2], bounds=(1e-3, 0.5), method="bounded").x)
+
+
+def outline_rows(name: str, full: Array, results: list[Detection]) -> Iterator[tuple[str, ...]]:
+    """Yield two rows: the outline by one half of the stems, and how often the errors of the other one are covered."""
+    halves_of = [Errors.of(full, results, half=half) for half in (0, 1)]
+    for fitted, judge in (halves_of, halves_of[::-1]):
+        outline = fitted.likeliest()
+        cells = []
+        for places, thick, _ in (judge.squares(0.0), judge.squares(outline)):
+            within = np.mean(places < _CHI2_POSITION), np.mean(thick < _CHI2_DIAMETER)
+            cells += [f"{places.mean() / 2.0:.1f}, {within[0]:.0%}", f"{thick.mean():.1f}, {within[1]:.0%}"]
+        yield name, f"{outline:.2f}", str(len(judge.diameters)), *cells
 
 
 def chain_row(name: str, full: Array, results: list[Detection]) -> tuple[str, ...]:
@@ -266,6 +345,15 @@ CLOUD_HEADER = (
     "position, m",
     "diameter, m: bias, RMS",
 )
+OUTLINE_HEADER = (
+    "cloud",
+    "outline, m",
+    "trunks",
+    "without: position",
+    "diameter",
+    "with it: position",
+    "diameter",
+)
 CHAIN_HEADER = ("cloud", "stems on the map", "trunks in a scan", "sure", "wrong", "error, m")
 
 
@@ -286,6 +374,8 @@ def main(folder: Path) -> None:
     print(table(FIELD_HEADER, list(field_rows(folder))), "\n")
     results = list(cloud_results(folder))
     print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, _, scans in results]), "\n")
+    rows = [row for name, full, scans in results for row in outline_rows(name, full, scans)]
+    print(table(OUTLINE_HEADER, rows), "\n")
     print(table(CHAIN_HEADER, [chain_row(name, full, scans) for name, full, scans in results]))
 
 

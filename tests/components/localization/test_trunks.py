@@ -113,6 +113,33 @@ def range_bound(distance, diameter, *, noise, detector):
     return np.diagonal(np.linalg.inv(information))[:3]
 
 
+def test_edges_that_are_not_seen_change_what_is_claimed_as_the_outline_says():
+    """Of each trunk one edge is dark, and returns no rays: the other ranges are as exact as before."""
+    outline, rng, rows = 0.05, np.random.default_rng(3), []
+    for seed in range(12):
+        scene = ring(seed, count=10, distance=(4.0, 6.0))
+        scene.diameters[:] = 0.4
+        points, hit = scene.scan(EYE, noise=0.02, seed=seed)
+        arms = (scene.places - EYE[:2]) / np.linalg.norm(scene.places - EYE[:2], axis=1)[:, None]
+        left = np.stack([-arms[:, 1], arms[:, 0]], axis=1) * rng.choice([-1.0, 1.0], (len(arms), 1))
+        dark = np.abs(outline * rng.normal(size=len(arms)))
+        beside = np.sum((points[:, :2] - scene.places[hit]) * left[hit], axis=1)
+        points = points[(hit < 0) | (beside < 0.2 - dark[hit])]
+        exact, rough = (detect_trunks(points, each, p_HoLo_H=EYE) for each in (EXACT, replace(EXACT, outline=outline)))
+        np.testing.assert_array_equal(exact.positions, rough.positions)
+        np.testing.assert_array_equal(exact.diameters, rough.diameters)
+        assert (np.linalg.eigvalsh(rough.covariances - exact.covariances) > -1e-12).all()
+        which, stem = pairs(rough.positions, scene.places, within=0.3)
+        errors, thick = rough.positions[which] - scene.places[stem], rough.diameters[which] - 0.4
+        for each in (exact, rough):
+            nees = np.einsum("ki,kij,kj->k", errors, np.linalg.inv(each.covariances[which]), errors)
+            rows.append([nees.mean() / 2.0, np.mean((thick / each.diameter_deviations[which]) ** 2)])
+    claimed, covered = np.array(rows).reshape(12, 2, 2).mean(axis=0)
+    # One of two edges deviates, so that less than 1 is expected with the outline.
+    assert (claimed > 2.0).all()
+    assert (covered < 1.2).all() and (covered > 0.2).all()
+
+
 def test_leaning_trunks_are_found_at_breast_height():
     leans = np.array([[0.08, 0.0], [0.0, 0.08], [-0.06, 0.06], [0.0, -0.1]])
     places = EYE[:2] + 5.0 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
