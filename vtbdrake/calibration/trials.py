@@ -18,7 +18,7 @@ from vtbdrake.calibration.calibration import Calibration, Verdict, calibrate
 from vtbdrake.calibration.model import CalibrationError, Inertia, inertia_of, log_cholesky
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
-from vtbdrake.machine import MachineConfig, MachineProcess
+from vtbdrake.machine import MachineConfig, MachineError, MachineProcess
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, read_log
 from vtbdrake.state.variables import text_table
@@ -131,11 +131,12 @@ def self_test(
         values: Values of variables of the DPS at the start, such as the plan of `excitation`, by address.
         **options: Further arguments of `calibrate`.
 
-    An interrupt (Ctrl-C) ends it with the trials that are done by then.
+    An interrupt (Ctrl-C), or a machine that does not start, ends it with the trials that are done by then.
 
     Raises:
         CalibrationError: As in `calibrate`, and if the machine cannot be commanded.
         KeyboardInterrupt: The first trial was interrupted.
+        MachineError: The first machine did not start.
     """
     if trials < 1:
         raise CalibrationError(f"a self-test takes at least one trial, not {trials}")
@@ -158,10 +159,10 @@ def self_test(
             )
             results.append(SelfTestTrial(truth, calibration))
             _log.info("trial %d of %d is done, in %.0f s of CPU", number + 1, trials, time.process_time() - begin)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, MachineError) as error:
         if not results:
             raise
-        _log.warning("interrupted: %d of %d trials are done", len(results), trials)
+        _log.warning("%s: %d of %d trials are done", str(error) or "interrupted", len(results), trials)
     return SelfTest(tuple(results))
 
 
