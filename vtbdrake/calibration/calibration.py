@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,7 +181,7 @@ def calibrate(
         scenario,
         logs,
         parameters,
-        inertias,
+        inertias=inertias,
         position=position,
         torque=torque,
         measured_torque=measured_torque,
@@ -195,35 +196,17 @@ def information(
     scenario: Scenario,
     logs: Log | Sequence[Log],
     parameters: Sequence[Parameter] = (),
-    *,
-    inertias: Sequence[Inertia] = (),
-    position: str,
-    torque: str,
-    measured_torque: bool = False,
-    period: float | None = None,
-    segment: float = 1.0,
-    noise: Noise | None = None,
+    **options: Any,
 ) -> Information:
     """Return what recordings, measured or simulated, can tell about parameters.
 
     It is that of the likeliest noise, or of the noise that is given, at the parameters that fit all segments best:
-    deviations by the model alone, without verdicts. For the arguments see `calibrate`.
+    deviations by the model alone, without verdicts. The arguments are those of `calibrate`, but for ``holdout``.
 
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
-    prepared = _Prepared(
-        scenario,
-        logs,
-        parameters,
-        inertias,
-        position=position,
-        torque=torque,
-        measured_torque=measured_torque,
-        period=period,
-        segment=segment,
-        noise=noise,
-    )
+    prepared = _Prepared(scenario, logs, parameters, **options)
     z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
     return prepared.information(noise, z)
 
@@ -236,13 +219,13 @@ class _Prepared:
         scenario: Scenario,
         logs: Log | Sequence[Log],
         parameters: Sequence[Parameter],
-        inertias: Sequence[Inertia],
         *,
+        inertias: Sequence[Inertia] = (),
         position: str,
         torque: str,
-        measured_torque: bool,
-        period: float | None,
-        segment: float,
+        measured_torque: bool = False,
+        period: float | None = None,
+        segment: float = 1.0,
         noise: Noise | None = None,
     ) -> None:
         logs = [logs] if isinstance(logs, Log) else list(logs)
@@ -302,13 +285,13 @@ class _Prepared:
         scalars = set(self.model.names[: self.model.scalars])
         if nothing := [name for name in self._first.nothing if name in scalars]:
             raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
-        held_back = _kept_back(self.segments.count, holdout)
+        held_back = kept_back(self.segments.count, holdout)
         z, noise = self.converged(~held_back)
         return _result(scenario, self, noise, z, held_back)
 
 
-def _kept_back(count: int, share: float) -> NDArray[np.bool]:
-    """Return which segments are kept back, spread over the recordings; one at least, unless there is only one."""
+def kept_back(count: int, share: float) -> NDArray[np.bool]:
+    """Return which parts are kept back, spread over all of them; one at least, unless there is only one."""
     number = min(max(round(share * count), 1), count - 1)
     held_back = np.zeros(count, bool)
     held_back[np.linspace(0, count - 1, number + 2)[1:-1].astype(int) if number else []] = True

@@ -107,6 +107,12 @@ def log_cholesky(mass: float, com: ArrayLike, inertia: ArrayLike) -> Array:
     return np.array([alpha, *np.log(U.diagonal()[:3]), U[0, 1], U[1, 2], U[0, 2], *U[:3, 3]])
 
 
+def body_numbers(testbed: VirtualTestbed, context: Context, body: str) -> Array:
+    """Return the ten numbers of a body in a context."""
+    mass, com, inertia = (testbed.read(context, f"{body}.{part}") for part in _PARTS)
+    return log_cholesky(float(mass), com, inertia)
+
+
 class JointModel:
     """Plant and drives as a function of the varied parameters z.
 
@@ -170,9 +176,8 @@ class JointModel:
         self.scalars = len(self.names)
         self.bodies = tuple(inertia.address for inertia in inertias)
         for body in self.bodies:
-            values = [testbed.read(context, f"{body}.{name}") for name in ("mass", "center_of_mass", "inertia")]
             self.names += [f"{body}.z[{k}]" for k in range(INERTIA_SIZE)]
-            start += log_cholesky(float(values[0]), values[1], values[2]).tolist()
+            start += body_numbers(testbed, context, body).tolist()
         if doubled := {name for name in self.names if self.names.count(name) > 1}:
             raise CalibrationError(f"given twice: {', '.join(sorted(doubled))}")
         infinite = [np.inf] * (len(self.names) - self.scalars)

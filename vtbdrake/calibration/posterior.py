@@ -26,6 +26,12 @@ def body_function() -> casadi.Function:
     return casadi.Function("inertia", [symbol], [physical, casadi.jacobian(physical, symbol)])
 
 
+def physical_numbers(body: str, z: Array) -> dict[str, float]:
+    """Return the `PHYSICAL` numbers of a body by their addresses."""
+    numbers = np.asarray(body_function()(z)[0]).ravel()
+    return {f"{body}.{part}": float(number) for part, number in zip(PHYSICAL, numbers, strict=True)}
+
+
 def samples(posterior: Posterior, count: int, *, seed: int) -> list[dict[str, float]]:
     """Return samples, address -> value; see `Scenario.samples`.
 
@@ -58,6 +64,5 @@ def _physical(posterior: Posterior, z: Array) -> dict[str, float]:
     sample = dict(zip(posterior.addresses, z[:size].tolist(), strict=True))
     for k, body in enumerate(posterior.inertias):
         first = size + INERTIA_SIZE * k
-        numbers = np.asarray(body_function()(z[first : first + INERTIA_SIZE])[0]).ravel()
-        sample |= {f"{body}.{part}": float(number) for part, number in zip(PHYSICAL, numbers, strict=True)}
+        sample |= physical_numbers(body, z[first : first + INERTIA_SIZE])
     return sample

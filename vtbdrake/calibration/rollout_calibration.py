@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, nan
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
-from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict, calibrated_scenario
+from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict, calibrated_scenario, kept_back
 from vtbdrake.calibration.fisher import Information
 from vtbdrake.calibration.model import CalibrationError
 from vtbdrake.optimization import Parameter
@@ -305,8 +306,7 @@ def _check_periods(windows: Sequence[Window]) -> None:
 def _split_sources(windows: Sequence[Window], share: float) -> tuple[list[Window], list[Window]]:
     """Return the windows of the fit, and those of the recordings that are kept back, spread over all."""
     sources = list(dict.fromkeys(window.source for window in windows))
-    number = min(max(round(share * len(sources)), 1), len(sources) - 1)
-    held_back = {sources[k] for k in np.linspace(0, len(sources) - 1, number + 2)[1:-1].astype(int)}
+    held_back = {sources[k] for k in np.flatnonzero(kept_back(len(sources), share))}
     parts: tuple[list[Window], list[Window]] = ([], [])
     for window in windows:
         parts[window.source in held_back].append(window)
@@ -566,9 +566,6 @@ def _start(scenario: Scenario, testbed: VirtualTestbed, parameter: Parameter) ->
     """Return the value that a parameter has in the scenario."""
     if not parameter.is_field:
         return float(testbed.read(testbed.default_context(), parameter.address))
-    owner: Any = scenario
-    for name in parameter.address.split(".")[1:]:
-        if not hasattr(owner, name):
-            scenario.with_fields({parameter.address.partition(".")[2]: 0.0})  # It says what is wrong.
-        owner = getattr(owner, name)
-    return float(owner)
+    name = parameter.address.partition(".")[2]
+    scenario.with_fields({name: 0.5 * (parameter.lower + parameter.upper)})  # It refuses what is no such field.
+    return float(attrgetter(name)(scenario))

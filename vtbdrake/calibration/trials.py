@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import casadi
 import numpy as np
 
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.calibration import Calibration, Verdict, calibrate
-from vtbdrake.calibration.model import CalibrationError, Inertia, inertia_of, log_cholesky
+from vtbdrake.calibration.model import CalibrationError, Inertia, body_numbers
+from vtbdrake.calibration.posterior import physical_numbers
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineConfig, MachineError, MachineProcess
@@ -29,7 +29,6 @@ _log = logging.getLogger(__name__)
 _PATIENCE = 60.0  # s
 # How far the numbers of a hidden inertia lie from those of the scenario: 0.05 is 10 % of the mass.
 _INERTIA_SPREAD = 0.05
-_BODY = ("mass", "center_of_mass", "inertia")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +146,10 @@ def self_test(
             begin = time.process_time()
             truth = {parameter.address: _drawn(parameter, generator) for parameter in parameters}
             for inertia in inertias:
-                start = [
-                    testbed.read(context, f"{inertia.address}.{name}") for name in ("mass", "center_of_mass", "inertia")
-                ]
-                truth |= _drawn_body(inertia.address, log_cholesky(float(start[0]), start[1], start[2]), generator)
+                start = body_numbers(testbed, context, inertia.address)
+                size = np.array([1.0] * 4 + [float(np.exp(start[1:4]).mean())] * 6)
+                z = start + _INERTIA_SPREAD * size * generator.normal(size=start.size)
+                truth |= physical_numbers(inertia.address, z)
             config = replace(machine or MachineConfig(), seed=int(generator.integers(2**31)))
             config = replace(config, values={**config.values, **truth})
             log = machine_log(scenario, seconds, machine=config, values=values)
@@ -218,17 +217,3 @@ def machine_log(
 def _drawn(parameter: Parameter, generator: np.random.Generator) -> float:
     value = float(parameter.from_unit(generator.uniform()))
     return float(round(value)) if parameter.address.endswith(".delay") else value
-
-
-def _drawn_body(address: str, start: Array, generator: np.random.Generator) -> dict[str, float]:
-    """Return mass, centre of mass and moments of a body near that of the ten numbers ``start``, by address."""
-    size = np.array([1.0] * 4 + [float(np.exp(start[1:4]).mean())] * 6)
-    symbol = casadi.SX.sym("z", start.size)
-    body = casadi.Function("body", [symbol], list(inertia_of(symbol)))
-    numbers = body(start + _INERTIA_SPREAD * size * generator.normal(size=start.size))
-    flat = {name: np.asarray(value).ravel() for name, value in zip(_BODY, numbers, strict=True)}
-    return {
-        f"{address}.{name}" + (f"[{i}]" if name != "mass" else ""): float(value)
-        for name, values in flat.items()
-        for i, value in enumerate(values)
-    }

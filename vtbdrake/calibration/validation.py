@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from html import escape
-from math import acos, hypot, inf, nan, pi, sqrt
+from math import acos, hypot, inf, isnan, nan, pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.state.archive import whole_file
+from vtbdrake.state.variables import text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,6 +31,20 @@ _LARGEST_DELAY = 0.25
 _MOST_LAGS, _LAG_SHARE = 40, 0.2
 # The share of the recording that a predicted band is to cover, and below which p-value residuals are called coloured.
 BAND, WHITE = 0.95, 0.01
+
+
+COLUMNS = {
+    "RMSE": ("rmse", 1.0),
+    "% of the range": ("normalized", 100.0),
+    "largest": ("largest", 1.0),
+    "at (s)": ("largest_at", 1.0),
+    "late by (ms)": ("delay", 1e3),
+    "magnitude": ("magnitude", 1.0),
+    "phase": ("phase", 1.0),
+    "coverage": ("coverage", 1.0),
+    "whiteness p": ("whiteness", 1.0),
+}
+"""By title, the field of a `SignalComparison` in tables, and the factor to the unit of the title."""
 
 
 class Verdict(StrEnum):
@@ -90,6 +105,12 @@ class SignalComparison(NamedTuple):
     beyond: tuple[str, ...]
     verdict: Verdict
 
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Return the numbers below `COLUMNS`; what cannot be computed is empty."""
+        numbers = (getattr(self, name) * factor for name, factor in COLUMNS.values())
+        return tuple("" if isnan(number) else f"{number:.4g}" for number in numbers)
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
@@ -112,13 +133,10 @@ class Comparison:
         return next((each for each in (Verdict.BEYOND, Verdict.WITHIN) if each in verdicts), Verdict.NOT_JUDGED)
 
     def __str__(self) -> str:
-        width = max(len(name) for name in self.signals)
-        lines = [f"{self.source}: {self.verdict}", f"{'':{width}}" + "".join(f"{title:>12}" for title in _COLUMNS)]
-        for name, result in self.signals.items():
-            cells = "".join(f"{getattr(result, field):12.4g}" for field in _COLUMNS.values())
-            lines.append(f"{name:{width}}{cells}  {result.verdict}")
-            lines += [f"{'':{width}}  {reason}" for reason in result.beyond]
-        return "\n".join(lines)
+        rows = [[name, *result.cells, str(result.verdict)] for name, result in self.signals.items()]
+        reasons = [f"{name}: {reason}" for name, result in self.signals.items() for reason in result.beyond]
+        head = ("signal", *COLUMNS, "verdict")
+        return "\n".join([f"{self.source}: {self.verdict}", text_table(head, rows), *reasons])
 
     def _repr_html_(self) -> str:
         from vtbdrake.visualization.comparisons import comparison_html
@@ -136,12 +154,6 @@ class Comparison:
         page = f'<!doctype html><meta charset="utf-8"><title>{escape(self.source)}</title>{self._repr_html_()}'
         with whole_file(path) as partial:
             partial.write_text(page, encoding="utf-8")
-
-
-_COLUMNS = {
-    "rmse": "rmse", "normalized": "normalized", "largest": "largest", "at / s": "largest_at", "delay / s": "delay",
-    "magnitude": "magnitude", "phase": "phase", "coverage": "coverage", "whiteness": "whiteness",
-}  # fmt: skip
 
 
 def compare(

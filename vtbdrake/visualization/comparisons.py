@@ -3,28 +3,12 @@
 from __future__ import annotations
 
 from html import escape
-from math import isnan
-from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
+from vtbdrake.calibration.validation import COLUMNS, Comparison
 from vtbdrake.visualization.plots import Picture, finish, image_html
 
-if TYPE_CHECKING:
-    from vtbdrake.calibration import Comparison
-
-# Title -> field of a `SignalComparison` and the factor to the unit of the title.
-_COLUMNS = {
-    "RMSE": ("rmse", 1.0),
-    "% of the range": ("normalized", 100.0),
-    "largest": ("largest", 1.0),
-    "at (s)": ("largest_at", 1.0),
-    "late by (ms)": ("delay", 1e3),
-    "magnitude": ("magnitude", 1.0),
-    "phase": ("phase", 1.0),
-    "coverage": ("coverage", 1.0),
-    "whiteness p": ("whiteness", 1.0),
-}
 _RECORDED, _SIMULATED = "0.2", "tab:orange"
 
 
@@ -54,13 +38,11 @@ def plot_comparison(comparison: Comparison) -> Figure:
 
 def comparison_html(comparison: Comparison) -> str:
     """Return HTML with the verdict, a table of the numbers and the plot."""
-    head = "".join(f"<th>{escape(title)}</th>" for title in ("signal", "verdict", *_COLUMNS, "samples"))
+    head = "".join(f"<th>{escape(title)}</th>" for title in ("signal", "verdict", *COLUMNS, "samples"))
     rows = []
     for name, result in comparison.signals.items():
-        values = (getattr(result, field) * factor for field, factor in _COLUMNS.values())
-        numbers = ("" if isnan(value) else f"{value:.4g}" for value in values)
         reasons = "".join(f"<br>{escape(reason)}" for reason in result.beyond)
-        cells = "".join(f"<td>{number}</td>" for number in (*numbers, result.samples))
+        cells = "".join(f"<td>{number}</td>" for number in (*result.cells, result.samples))
         rows.append(f"<tr><td>{escape(name)}</td><td>{result.verdict}{reasons}</td>{cells}</tr>")
     return (
         f"<div><b>{escape(f'{comparison.source}: {comparison.verdict}')}</b>"
