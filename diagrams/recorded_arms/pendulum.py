@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import scipy.signal
-from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia
-from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 
 import vtbdrake as vtb
 from vtbdrake.arrays import Array
 from vtbdrake.calibration import Calibration, JointRecording, TorqueRegressor, calibrate, equations, regress
-from vtbdrake.components.actuators import JointDrives
-from vtbdrake.components.sensors import JointEncoders
 from vtbdrake.recording import Log
 from vtbdrake.settings import setting
-from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.recorded_arms import plants
+from vtbdrake_diagrams.torque_driven import TorqueDrivenScenario
 
 BODY, DRIVES = "sim.sys.pendulum.rod", "sim.act.drives"
 HORIZON = 0.3
@@ -31,62 +27,32 @@ _SLOWEST, _SUBSTEPS, _STEEP, _SMOOTHED = 1.0, 4, 0.02, 0.06
 _FIT_PERIOD = 0.02
 
 
-def _continuous() -> MultibodyPlantConfig:
-    return MultibodyPlantConfig(time_step=0.0)
-
-
 @dataclass
-class TorqueLimitedPendulumScenario(Scenario):
+class TorqueLimitedPendulumScenario(TorqueDrivenScenario):
     """A rod with a weight on one motor; its numbers are guesses, to be calibrated.
 
     F. Wiebe and others, "Torque-limited simple pendulum", Journal of Open Source Software 7(74), 2022.
     """
 
-    plant_config: MultibodyPlantConfig = field(default_factory=_continuous)
+    size = 1
+
     period: float = setting(0.005, "The sample period of sensors, DPS and drive.", unit="s", gt=0)
+    torque_limit: float = setting(20.0, "The largest torque of the motor.", unit="N m", gt=0)
     mass: float = setting(0.5, "Mass.", unit="kg", gt=0)
     center: float = setting(0.3, "From the motor to the centre of mass.", unit="m", gt=0)
     moment: float = setting(0.02, "Moment about the centre of mass.", unit="kg m^2", gt=0)
     viscous: float = setting(0.02, "Viscous friction of the drive.", unit="N m s/rad", ge=0)
     coulomb: float = setting(0.1, "Coulomb friction of the drive.", unit="N m", ge=0)
 
-    def interface(self) -> Interface:
-        torque = {"size": 1, "unit": "N m", "lower": -20.0, "upper": 20.0}
-        return Interface(
-            sense=[Signal("joint_position", size=1, unit="rad", lower=-100.0, upper=100.0, max_age=5 * self.period)],
-            act=[Signal("torque", idle=0.0, **torque)],
-            commands=[Signal("torques", **torque)],
-        )
-
-    def make_dps(self) -> Diagram:
-        """Return a DPS that commands the torque that the command u asks for."""
-        builder = DiagramBuilder()
-        sense = builder.AddNamedSystem("sense", PassThrough(1))
-        impl = builder.AddNamedSystem("impl", ZeroOrderHold(self.period, 1))
-        builder.ExportInput(sense.get_input_port(), "joint_position")
-        builder.ExportInput(impl.get_input_port(), "torques")
-        builder.ExportOutput(impl.get_output_port(), "torque")
-        return builder.Build()
-
-    def add_world(self, builder: VirtualTestbedBuilder) -> None:
-        plant, _ = builder.add_plant(self.plant_config)
+    def add_links(self, plant: MultibodyPlant) -> list[RevoluteJoint]:
         instance = plant.AddModelInstance("pendulum")
         inertia = SpatialInertia.MakeFromCentralInertia(
             self.mass, [0.0, 0.0, -self.center], RotationalInertia(self.moment, self.moment, self.moment)
         )
         link = plant.AddRigidBody("rod", instance, inertia)
         joint = plant.AddJoint(RevoluteJoint("pivot", plant.world_frame(), link.body_frame(), [0.0, 1.0, 0.0]))
-        plant.AddJointActuator("motor", joint, 20.0)
-        plant.Finalize()
-        builder.add_sensor("joint_position", JointEncoders(plant, [joint], period=self.period))
-        drives = JointDrives(
-            plant, [joint], period=self.period, limit=20.0, viscous=self.viscous, coulomb=self.coulomb,
-            coulomb_velocity=0.02,
-        )  # fmt: skip
-        builder.add("act", "drives", drives)
-        builder.connect(plant.get_state_output_port(), drives.GetInputPort("state"))
-        builder.connect(drives.get_output_port(), plant.get_actuation_input_port())
-        builder.sim_actuator("torque", drives.GetInputPort("command"))
+        plant.AddJointActuator("motor", joint, self.torque_limit)
+        return [joint]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import click
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
+    assignment,
     option,
     output,
     parse_scaled_range,
@@ -26,13 +28,6 @@ if TYPE_CHECKING:
     from vtbdrake.optimization import Parameter
     from vtbdrake.recording import Log
     from vtbdrake.testbed import Scenario
-
-
-def _parse_unit(text: str) -> tuple[str, str]:
-    name, equals, unit = (part.strip() for part in text.partition("="))
-    if not (name and equals and unit):
-        raise click.BadParameter(f"expected NAME=UNIT, not {text!r}")
-    return name, unit
 
 
 @click.command()
@@ -57,7 +52,7 @@ def _parse_unit(text: str) -> tuple[str, str]:
     "--unit NAME=UNIT",
     "Of a table: the unit of a signal or of the times, if it is none of SI. May be repeated.",
     name="units",
-    parse=_parse_unit,
+    parse=partial(assignment, form="NAME=UNIT"),
     multiple=True,
 )
 @option("--save FILE", "Write the calibrated scenario: .yaml.", parse=output(".yaml"))

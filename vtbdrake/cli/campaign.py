@@ -17,8 +17,6 @@ from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.failures import one_line
 
 if TYPE_CHECKING:
-    from pydrake.geometry import Meshcat
-
     from vtbdrake.testing.campaign import Campaign, Rerun
     from vtbdrake.testing.campaign_report import Evidence
     from vtbdrake.testing.campaign_results import CampaignResult, CampaignRollout, Cell, Comparison
@@ -146,7 +144,6 @@ def _gather_evidence(
     from vtbdrake.testing.campaign_results import ERROR, FAIL
 
     firsts = {cell.having(FAIL, ERROR)[0].name: cell.having(FAIL, ERROR)[0] for cell in failed_cells(result)}
-    meshcat: Meshcat | None = None
     kept: dict[str, Evidence] = {}
     if not firsts:
         return kept
@@ -155,17 +152,11 @@ def _gather_evidence(
     with borrowed(result.campaign.problem, where, rollouts=1, time_limit=time_limit) as opened:
         for rollout in list(firsts.values())[:_MOST_EVIDENCE]:
             rerun = result.campaign.run_again(rollout.condition, rollout.seed, executor=opened)
-            if meshcat is None and rerun.motion is not None:
-                from vtbdrake.visualization import make_meshcat
-
-                meshcat = make_meshcat()
-            kept[rollout.name] = _written(result.campaign, rollout, rerun, folder, meshcat)
+            kept[rollout.name] = _written(result.campaign, rollout, rerun, folder)
     return kept
 
 
-def _written(
-    stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: Path, meshcat: Meshcat | None
-) -> Evidence:
+def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: Path) -> Evidence:
     """Write log and animation of a rollout that was run again, and return what there is of it."""
     from vtbdrake.testing.campaign_report import Evidence
 
@@ -178,11 +169,11 @@ def _written(
     if len(rerun.result.times):
         log = f"{stem}.npz"
         save_recording(folder / log, rerun.result.times, numeric)
-    if rerun.motion is not None and meshcat is not None:
-        from vtbdrake.visualization import show_motion
+    if rerun.motion is not None:
+        from vtbdrake.visualization import make_meshcat, show_motion
 
         try:
-            show_motion(meshcat, rerun.motion).save(folder / f"{stem}.html", shared=True)
+            show_motion(make_meshcat(), rerun.motion).save(folder / f"{stem}.html", shared=True)
             animation = f"{stem}.html"
         except ValueError as error:  # There is nothing to draw.
             notes.append(f"There is no animation: {one_line(error)}.")
@@ -195,12 +186,7 @@ def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
 
     rerun = stated.run_again(*name)
     folder.mkdir(parents=True, exist_ok=True)
-    meshcat = None
-    if rerun.motion is not None:
-        from vtbdrake.visualization import make_meshcat
-
-        meshcat = make_meshcat()
-    kept = _written(stated, rerun.rollout, rerun, folder, meshcat)
+    kept = _written(stated, rerun.rollout, rerun, folder)
     rows, wrong = [], 0
     for criterion_name, criterion in stated.criteria.items():
         cell = Cell(criterion_name, criterion, rerun.rollout.condition, (rerun.rollout,))
@@ -224,7 +210,7 @@ def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
 
 def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[Comparison], folder: Path) -> None:
     from vtbdrake.testing.campaign_report import failed_cells, passed_text, reason, warning
-    from vtbdrake.testing.campaign_results import ALL, ERROR, FAIL
+    from vtbdrake.testing.campaign_results import ALL, COMPARED, ERROR, FAIL
 
     criteria = list(result.campaign.criteria)
     rows = []
@@ -236,12 +222,7 @@ def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[C
         first = cell.having(FAIL, ERROR)[0]
         say(f"\n{cell.condition}, {cell.name}: {first.name}: {reason(cell, first)}\n  {commands[first.name]}")
     if comparisons:
-        rows = [
-            [c.condition, c.criterion, *map(str, (c.both, c.gained, c.lost, c.neither)), f"{c.p:.3g}", c.difference]
-            for c in comparisons
-        ]
-        head = ["condition", "criterion", "both pass", "only here", "only there", "neither", "p", "difference"]
-        say("\n" + table(head, rows))
+        say("\n" + table(COMPARED, [comparison.row for comparison in comparisons]))
     if caution := warning(result):
         say(f"\nWarning: {caution}")
     say(f"\n{passed_text(result)}: {folder / PAGE}")

@@ -101,7 +101,8 @@ def config_option(
     return option(usage, text, name=field, **settings)
 
 
-def _assignment(text: str, form: str) -> tuple[str, str]:
+def assignment(text: str, form: str) -> tuple[str, str]:
+    """Parse ``NAME=VALUE``; ``form`` names the two parts."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
         raise click.BadParameter(f"expected {form}, not {text!r}")
@@ -131,7 +132,7 @@ def parse_snapshot(path: str) -> Snapshot:
 
 def parse_setting(text: str) -> Setting:
     """Parse ``ADDRESS=VALUE``, where the value is a number or a JSON list of numbers."""
-    address, value = _assignment(text, "ADDRESS=VALUE")
+    address, value = assignment(text, "ADDRESS=VALUE")
     number = _json_or_text(value)
     if isinstance(number, bool) or not isinstance(number, int | float | list):
         raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
@@ -140,7 +141,7 @@ def parse_setting(text: str) -> Setting:
 
 def parse_field(text: str) -> tuple[str, Any]:
     """Parse ``NAME=VALUE``, where the value is JSON, or else a text."""
-    name, value = _assignment(text, "NAME=VALUE")
+    name, value = assignment(text, "NAME=VALUE")
     return name, _json_or_text(value)
 
 
@@ -153,7 +154,7 @@ def parse_choice(text: str) -> Choice:
     """Parse ``ADDRESS=OPTION,OPTION,...``, where each option is JSON, or else a text."""
     from vtbdrake.optimization import Choice
 
-    address, options = _assignment(text, "ADDRESS=OPTION,OPTION[,...]")
+    address, options = assignment(text, "ADDRESS=OPTION,OPTION[,...]")
     return Choice(address, [_json_or_text(option.strip()) for option in options.split(",")])
 
 
@@ -163,7 +164,7 @@ def parse_limits(text: str) -> tuple[str, dict[str, Any]]:
     Returns:
         The address, and ``lower`` and ``upper`` (None if missing), or ``options``.
     """
-    address, values = _assignment(text, "ADDRESS=LOWER:UPPER or ADDRESS=OPTION[,...]")
+    address, values = assignment(text, "ADDRESS=LOWER:UPPER or ADDRESS=OPTION[,...]")
     if ":" not in values:
         return address, {"options": [_json_or_text(option.strip()) for option in values.split(",")]}
     try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from functools import partial
+from collections.abc import Callable
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,9 @@ _trust_option = option(
     "vtbdrake need not be named. May be repeated.",
     name="trusted",
     multiple=True,
+)
+_solver_options = option(
+    "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
 )
 _point = click.argument(
     "point",
@@ -129,13 +133,7 @@ def _schema() -> dict[str, Any]:
 @grouped(
     "solving",
     option("--solver NAME", "The solver.  [default: auto, or that of FILE]"),
-    option(
-        "--option NAME=VALUE",
-        "An option of the solver. May be repeated.",
-        name="options",
-        parse=parse_field,
-        multiple=True,
-    ),
+    _solver_options,
     option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int),
     option(
         "--parallel N",
@@ -266,114 +264,101 @@ def _described(study: Study) -> dict[str, Any]:
     return {**record, "rollouts": len(study), "best": best, "points": study.to_dict()}
 
 
-_by = option("--by NAME", "Who makes the change.  [default: your login name]")
-_address = click.argument("address", shell_complete=complete_parameter)
+def _intervention(
+    kind: str, *arguments: Callable[[Any], Any], **options: Any
+) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
+    """Return a decorator that makes a command of a function from its arguments to the payload of an intervention."""
+
+    def decorate(payload_of: Callable[..., dict[str, Any]]) -> click.Command:
+        @wraps(payload_of)
+        def intervene(file: Path, by: str | None, **values: Any) -> None:
+            from vtbdrake.optimization import Study
+
+            with Study.open(file) as opened:
+                intervention = opened.intervene(kind, by=by, **payload_of(**values))
+                running = "" if opened.is_running else ", as soon as the study runs"
+                say(f"intervention {intervention.number} waits for the next batch{running}: {intervention.text}")
+                emit(intervention.to_dict())
+
+        by_option = option("--by NAME", "Who makes the change.  [default: your login name]")
+        command: Any = intervene
+        for add in reversed((_file, *arguments, by_option, json_option)):
+            command = add(command)
+        return study.command(kind, **options)(command)
+
+    return decorate
 
 
-def _intervene(file: Path, kind: str, by: str | None, **payload: Any) -> None:
-    from vtbdrake.optimization import Study
-
-    with Study.open(file) as opened:
-        intervention = opened.intervene(kind, by=by, **payload)
-        running = "" if opened.is_running else ", as soon as the study runs"
-        text = f"intervention {intervention.number} waits for the next batch{running}: {intervention.text}"
-        say(text)
-        emit(intervention.to_dict())
-
-
-@study.command("try")
-@_file
-@_point
-@_by
-@json_option
-def try_(file: Path, point: tuple[tuple[str, Any], ...], by: str | None) -> None:
+@_intervention("try", _point)
+def _try(point: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     """Try a point with the next batch."""
-    _intervene(file, "try", by, point=settings(point))
+    return {"point": settings(point)}
 
 
-@study.command()
-@_file
-@_by
-@json_option
-def pause(file: Path, by: str | None) -> None:
+@_intervention("pause")
+def _pause() -> dict[str, Any]:
     """Let the run finish its batch, and wait."""
-    _intervene(file, "pause", by)
+    return {}
 
 
-@study.command()
-@_file
-@_by
-@json_option
-def resume(file: Path, by: str | None) -> None:
+@_intervention("resume")
+def _resume() -> dict[str, Any]:
     """Let a paused run go on."""
-    _intervene(file, "resume", by)
+    return {}
 
 
-@study.command()
-@_file
-@_by
-@json_option
-def stop(file: Path, by: str | None) -> None:
+@_intervention("stop")
+def _stop() -> dict[str, Any]:
     """End the run after its batch."""
-    _intervene(file, "stop", by)
+    return {}
 
 
-@study.command("range")
-@_file
-@click.argument(
-    "limits",
-    callback=converted(parse_limits),
-    metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]",
-    shell_complete=complete_parameter,
+@_intervention(
+    "range",
+    click.argument(
+        "limits",
+        callback=converted(parse_limits),
+        metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]",
+        shell_complete=complete_parameter,
+    ),
 )
-@_by
-@json_option
-def range_(file: Path, limits: tuple[str, dict[str, Any]], by: str | None) -> None:
+def _range(limits: tuple[str, dict[str, Any]]) -> dict[str, Any]:
     """Narrow or widen the range of a parameter.
 
     An end that is left out stays: ADDRESS=:2.
     """
     address, ends = limits
-    _intervene(file, "range", by, address=address, **ends)
+    return {"address": address, **ends}
 
 
-@study.command()
-@_file
-@click.argument("parameter", metavar="ADDRESS[=VALUE]", shell_complete=complete_parameter)
-@_by
-@json_option
-def freeze(file: Path, parameter: str, by: str | None) -> None:
+@_intervention("freeze", click.argument("parameter", metavar="ADDRESS[=VALUE]", shell_complete=complete_parameter))
+def _freeze(parameter: str) -> dict[str, Any]:
     """Hold a parameter at a value.
 
     By default it is that of the best point.
     """
     address, value = parse_field(parameter) if "=" in parameter else (parameter, None)
-    _intervene(file, "freeze", by, address=address, **({} if value is None else {"value": value}))
+    return {"address": address} | ({} if value is None else {"value": value})
 
 
-@study.command()
-@_file
-@_address
-@_by
-@json_option
-def unfreeze(file: Path, address: str, by: str | None) -> None:
+@_intervention("unfreeze", click.argument("address", shell_complete=complete_parameter))
+def _unfreeze(address: str) -> dict[str, Any]:
     """Vary a frozen parameter again."""
-    _intervene(file, "unfreeze", by, address=address)
+    return {"address": address}
 
 
-@study.command()
-@_file
-@click.argument(
-    "region",
-    nargs=-1,
-    required=True,
-    callback=converted(parse_limits),
-    metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
-    shell_complete=complete_parameter,
+@_intervention(
+    "forbid",
+    click.argument(
+        "region",
+        nargs=-1,
+        required=True,
+        callback=converted(parse_limits),
+        metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
+        shell_complete=complete_parameter,
+    ),
 )
-@_by
-@json_option
-def forbid(file: Path, region: tuple[tuple[str, dict[str, Any]], ...], by: str | None) -> None:
+def _forbid(region: tuple[tuple[str, dict[str, Any]], ...]) -> dict[str, Any]:
     """Forbid a region.
 
     It is the box of all sides that are given. An end that is left out is open: ADDRESS=2:.
@@ -383,57 +368,41 @@ def forbid(file: Path, region: tuple[tuple[str, dict[str, Any]], ...], by: str |
       vtbdrake study forbid gait.db dps.impl.gait.period=:1.5 dps.impl.gait.stroke=0.2:
     """
     sides = {address: limits.get("options") or [limits["lower"], limits["upper"]] for address, limits in region}
-    _intervene(file, "forbid", by, region=sides)
+    return {"region": sides}
 
 
-@study.command()
-@_file
-@click.argument("number", type=int)
-@_by
-@json_option
-def allow(file: Path, number: int, by: str | None) -> None:
+@_intervention("allow", click.argument("number", type=int))
+def _allow(number: int) -> dict[str, Any]:
     """Allow the region that intervention NUMBER forbids."""
-    _intervene(file, "allow", by, number=number)
+    return {"number": number}
 
 
-@study.command()
-@_file
-@click.argument("rollouts", metavar="ROLLOUTS|none")
-@_by
-@json_option
-def budget(file: Path, rollouts: str, by: str | None) -> None:
+@_intervention("budget", click.argument("rollouts", metavar="ROLLOUTS|none"))
+def _budget(rollouts: str) -> dict[str, Any]:
     """Set the number of rollouts in the end.
 
     It holds for the present run and for later ones, whatever they are given. ``none`` is no limit.
     """
-    _intervene(file, "budget", by, rollouts=parse_optional(rollouts))
+    return {"rollouts": parse_optional(rollouts)}
 
 
-@study.command()
-@_file
-@click.argument("solver")
-@option(
-    "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
-)
-@_by
-@json_option
-def solver(file: Path, solver: str, options: tuple[tuple[str, Any], ...], by: str | None) -> None:
+@_intervention("solver", click.argument("solver"), _solver_options)
+def _solver(solver: str, options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     """Go on with another solver."""
-    _intervene(file, "solver", by, solver=solver, options=settings(options))
+    return {"solver": solver, "options": settings(options)}
 
 
-@study.command(context_settings={"ignore_unknown_options": True})  # A value may be negative.
-@_file
-@click.argument("targets", nargs=-1, required=True, metavar="VALUE ...|none")
-@_by
-@json_option
-def aspiration(file: Path, targets: tuple[str, ...], by: str | None) -> None:
+@_intervention(
+    "aspiration",
+    click.argument("targets", nargs=-1, required=True, metavar="VALUE ...|none"),
+    context_settings={"ignore_unknown_options": True},  # A value may be negative.
+)
+def _aspiration(targets: tuple[str, ...]) -> dict[str, Any]:
     """Aim at values of several qualities, one each.
 
     ``none`` is the whole Pareto front again.
     """
-    values = None if targets == ("none",) else [parse_optional(target) for target in targets]
-    _intervene(file, "aspiration", by, targets=values)
+    return {"targets": None if targets == ("none",) else [parse_optional(target) for target in targets]}
 
 
 @study.command()

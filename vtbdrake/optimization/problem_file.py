@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from math import inf
@@ -97,10 +98,27 @@ class StatedConstraint:
         default_factory=list, doc="The variables or vector output ports (path.port) that f is a function of."
     )
     f: str = setting("", f"{_FUNCTION}; by default the largest value, with at_least alone the smallest.")
-    at_most: float | None = setting(None, "The largest value that keeps the constraint.")
-    at_least: float | None = setting(None, "The smallest value that keeps the constraint.")
-    reading: str = setting("worst", "How the samples of f become one number.", choices=tuple(READINGS))
-    unit: str = setting("", "The unit of f, for plots.")
+    at_most: float | None = setting(None, "The largest number that is allowed.")
+    at_least: float | None = setting(None, "The smallest number that is allowed.")
+    reading: str = setting(
+        "worst",
+        "How the samples of f become one number; worst and best are those of the limit.",
+        choices=tuple(READINGS),
+    )
+    unit: str = setting("", "The unit of f, for plots and reports.")
+
+    @property
+    def is_lower(self) -> bool:
+        """Return whether the smallest number is the worst."""
+        return self.at_least is not None and self.at_most is None
+
+    def function(self) -> Callable[..., float]:
+        """Return f.
+
+        Raises:
+            ValueError: It does not exist.
+        """
+        return named_function(self.f or ("smallest" if self.is_lower else "largest"))
 
     def constraint(self) -> Constraint:
         """Return the constraint.
@@ -108,10 +126,9 @@ class StatedConstraint:
         Raises:
             ValueError: The function does not exist, or there is no limit.
         """
-        function = self.f or ("largest" if self.at_least is None or self.at_most is not None else "smallest")
         stated = {"at_most": self.at_most, "at_least": self.at_least}
         limits: dict[str, Any] = {name: limit for name, limit in stated.items() if limit is not None}
-        return Constraint(named_function(function), self.of, reading=self.reading, unit=self.unit, **limits)
+        return Constraint(self.function(), self.of, reading=self.reading, unit=self.unit, **limits)
 
 
 @dataclass

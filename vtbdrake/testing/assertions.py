@@ -23,6 +23,7 @@ from vtbdrake.recording.replay import Target
 from vtbdrake.recording.replay import replay as replay_log
 from vtbdrake.testbed import Signal
 from vtbdrake.testbed.switch import Position
+from vtbdrake.testing.campaign_results import least_rate
 from vtbdrake.testing.failure import fail
 from vtbdrake.testing.trace import ENERGY, Source, Trace, TraceError, trace_of
 
@@ -267,8 +268,6 @@ def assert_succeeds(
         ValueError: Not even success in all trials would show it.
     """
     __tracebackhide__ = True
-    from scipy.stats import binomtest
-
     if not (0.0 < rate < 1.0 and 0.0 < confidence < 1.0):
         raise ValueError(f"a rate and a confidence lie between 0 and 1, not at {rate} and {confidence}")
     least = ceil(log(1.0 - confidence) / log(rate) - 1e-9)
@@ -289,7 +288,7 @@ def assert_succeeds(
             f"succeed: {least} are needed"
         )
     successes = sum(outcomes)
-    shown = binomtest(successes, len(outcomes), alternative="greater").proportion_ci(confidence, "exact").low
+    shown = least_rate(successes, len(outcomes), confidence)
     if shown >= rate:
         return
     failed = [number for number, outcome in enumerate(outcomes) if not outcome]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +14,11 @@ import numpy as np
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.optimization import Motion, Problem, Study
 from vtbdrake.optimization.problem import PLANT_STATE
+from vtbdrake.optimization.problem_file import StatedConstraint
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult
 from vtbdrake.rollout.executor import run_rollouts
-from vtbdrake.rollout.named_function import largest, named_function, smallest
-from vtbdrake.rollout.quality import READINGS
+from vtbdrake.rollout.named_function import largest, named_function
 from vtbdrake.rollout.testbeds import split
 from vtbdrake.settings import schema, setting
 from vtbdrake.testbed import load_scenario
@@ -35,28 +35,12 @@ class CampaignError(ValueError):
 
 
 @dataclass
-class Criterion:
+class Criterion(StatedConstraint):
     """A number that is read of every rollout, with the limits that it has to keep, and how often.
 
     Without a limit the number is only reported.
     """
 
-    of: str | list[str] = setting(
-        default_factory=list, doc="The variables or vector output ports (path.port) that the number is a function of."
-    )
-    f: str = setting(
-        "",
-        "The function of their values, package.module:function; by default the value itself, of an array its largest "
-        "entry, and with at_least its smallest.",
-    )
-    reading: str = setting(
-        "worst",
-        "How the samples of f become one number; worst and best are those of the limit.",
-        choices=tuple(READINGS),
-    )
-    at_most: float | None = setting(None, "The largest number that passes.")
-    at_least: float | None = setting(None, "The smallest number that passes.")
-    unit: str = setting("", "The unit of the number, for the report.")
     rate: float = setting(
         1.0,
         "The share of rollouts that has to be shown to pass: the lower limit of its one-sided interval of Clopper and "
@@ -82,20 +66,11 @@ class Criterion:
         """Return whether rollouts can fail the criterion."""
         return self.at_most is not None or self.at_least is not None
 
-    @property
-    def is_lower(self) -> bool:
-        """Return whether the smallest number is the worst."""
-        return self.at_least is not None and self.at_most is None
-
     def passes(self, value: float) -> bool:
         """Return whether a number keeps the limits."""
         return not (
             (self.at_most is not None and value > self.at_most) or (self.at_least is not None and value < self.at_least)
         )
-
-    def function(self) -> Callable[..., float]:
-        """Return f."""
-        return named_function(self.f) if self.f else smallest if self.is_lower else largest
 
     def constraint(self) -> Constraint:
         """Return the constraint whose violation is the number, or its negative: the limits do not change a study."""

@@ -12,6 +12,7 @@ from vtbdrake.failures import one_line, safe_text
 from vtbdrake.testing.campaign import Criterion, Rerun
 from vtbdrake.testing.campaign_results import (
     ALL,
+    COMPARED,
     ERROR,
     FAIL,
     INCOMPLETE,
@@ -240,7 +241,7 @@ td b{font-size:1.05rem}tr.all th,tr.all td{border-top:3px double #86868b}
 .dots i{display:inline-block;width:7px;height:7px;margin:0 1px 1px 0;border-radius:1px}
 i.pass{background:#2f9e55}i.fail{background:#d1372a}i.error{background:#7a1fa2}i.not{background:#c7c7cc}
 .legend i{display:inline-block;width:9px;height:9px;margin:0 .25rem 0 .8rem}
-svg{display:block;max-width:100%;height:auto;margin:.6rem 0}.number{text-align:right}
+img{display:block;max-width:100%;height:auto;margin:.6rem 0}.number{text-align:right}
 """
 
 
@@ -333,59 +334,33 @@ def _failure(cell: Cell, commands: Mapping[str, str], evidence: Mapping[str, Evi
 
 def _curve(cell: Cell, rerun: Rerun) -> str:
     """Draw the samples of a criterion over time, with its limits."""
+    from vtbdrake.visualization.plots import FAILED, Picture, finish, image_html, label
+
     samples, times = rerun.samples[cell.name], rerun.result.times
     count = min(len(samples), len(times))
     if count < 2:
         return ""
-    limits = [limit for limit in (cell.criterion.at_least, cell.criterion.at_most) if limit is not None]
-    # The limit of an integral is not one of its samples.
-    limits = [] if cell.criterion.reading == "integral" else limits
-    every = max(1, count // 600)
-    t, y = times[:count:every], samples[:count:every]
-    low, high = min([*y, *limits]), max([*y, *limits])
-    margin = 0.06 * (high - low) or 1.0
-    width, height, left, bottom = 640.0, 200.0, 70.0, 26.0
-
-    def at(time: float, value: float) -> tuple[float, float]:
-        share = (value - low + margin) / (high - low + 2.0 * margin)
-        return left + (width - left - 8.0) * (time - t[0]) / (t[-1] - t[0]), (height - bottom) * (1.0 - share)
-
-    line = " ".join("{:.1f},{:.1f}".format(*at(a, b)) for a, b in zip(t, y, strict=True))
-    parts = [f'<polyline points="{line}" fill="none" stroke="#1f6feb" stroke-width="1.5"/>']
-    for limit in limits:
-        (x0, h), (x1, _) = at(t[0], limit), at(t[-1], limit)
-        parts.append(
-            f'<line x1="{x0:.1f}" x2="{x1:.1f}" y1="{h:.1f}" y2="{h:.1f}" stroke="#d1372a" stroke-dasharray="5 4"/>'
-        )
-    marks = [(left - 6, at(t[0], v)[1] + 4, "end", f"{v:.3g}") for v in (low, high)]
-    marks += [(at(v, low)[0], height - 8, anchor, f"{v:.3g} s") for v, anchor in ((t[0], "start"), (t[-1], "end"))]
-    parts += [
-        f'<text x="{x:.1f}" y="{v:.1f}" text-anchor="{a}" font-size="12" fill="#55555a">{s}</text>'
-        for x, v, a, s in marks
-    ]
-    label = html.escape(f"{cell.name} over time", quote=True)
-    return (
-        f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img" '
-        f'aria-label="{label}">'
-        f'<rect x="{left:g}" y="0" width="{width - left - 8:g}" height="{height - bottom:g}" fill="#fafafa" '
-        f'stroke="#d2d2d7"/>{"".join(parts)}</svg>'
-    )
+    figure = Picture(8.0, 2.6)
+    axes = figure.add_subplot()
+    axes.plot(times[:count], samples[:count], lw=1.4)
+    for limit in (cell.criterion.at_least, cell.criterion.at_most):
+        if limit is not None and cell.criterion.reading != "integral":  # Its limit is not one of its samples.
+            axes.axhline(limit, color=FAILED, lw=1.2, ls=(0, (4, 2)))
+    axes.set(xlabel="time t [s]", ylabel=label(cell.name, cell.criterion.unit))
+    finish(axes)
+    return image_html(figure)
 
 
 def _comparison_table(comparisons: Sequence[Comparison], baseline: str) -> str:
     colour = {"better": "met", "worse": "missed"}
-    rows = "".join(
-        f"<tr{' class=all' if each.condition == ALL else ''}><th>{html.escape(each.condition)}</th>"
-        f"<td>{html.escape(each.criterion)}</td>"
-        + "".join(f'<td class="number">{n}</td>' for n in (each.both, each.gained, each.lost, each.neither))
-        + f'<td class="number">{each.p:.3g}</td>'
-        f'<td class="{colour.get(each.difference, "")}">{each.difference}</td></tr>'
-        for each in comparisons
-    )
+    rows = []
+    for each in comparisons:
+        cells = [f"<td>{html.escape(text)}</td>" for text in each.row]
+        cells[-1] = f'<td class="{colour.get(each.difference, "")}">{each.difference}</td>'
+        rows.append(f"<tr{' class=all' if each.condition == ALL else ''}>{''.join(cells)}</tr>")
+    head = "".join(f"<th>{title}</th>" for title in COMPARED)
     return (
         f"<h2>Against {html.escape(baseline)}</h2><p>Rollouts with the same condition and seed are compared in pairs, "
         "by McNemar's exact test.</p>"
-        '<div class="wide"><table><thead><tr><th>condition</th><th>criterion</th><th>both pass</th><th>only here</th>'
-        "<th>only there</th><th>neither</th><th>p</th><th>difference</th></tr></thead>"
-        f"<tbody>{rows}</tbody></table></div>"
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     )

@@ -273,6 +273,10 @@ def _finite(value: Any) -> Any:
     return value if not isinstance(value, float) or isfinite(value) else repr(value)
 
 
+COMPARED = ("condition", "criterion", "both pass", "only here", "only there", "neither", "p", "difference")
+"""The titles of a table of comparisons."""
+
+
 @dataclass(frozen=True)
 class Comparison:
     """The pairs of equal rollouts of two campaigns, by whether each passes a criterion.
@@ -292,6 +296,12 @@ class Comparison:
     gained: int
     lost: int
     neither: int
+
+    @property
+    def row(self) -> list[str]:
+        """Return the comparison as texts, below the titles `COMPARED`."""
+        counts = map(str, (self.both, self.gained, self.lost, self.neither))
+        return [self.condition, self.criterion, *counts, f"{self.p:.3g}", self.difference]
 
     @property
     def p(self) -> float:

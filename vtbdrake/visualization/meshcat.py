@@ -297,11 +297,11 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    stages, still, corners = _Stages(), Still(), []
+    stages, still, corners = list[_Stage](), Still(), []
     for name, motion in motions.items():
-        new = motion.scenario not in stages
-        stage = stages[motion.scenario]
-        if new:
+        count_before = len(stages)
+        stage = _stage_of(motion.scenario, stages)
+        if len(stages) > count_before:
             path = f"{prefix}/surroundings/{len(stages)}"
             Drawing(meshcat, stage.testbed, stage.context, path, parts=Parts.ANCHORED).add_to(still, stage.context)
         states = _states(motion, stage.testbed, f"{prefix}/{name}")
@@ -337,22 +337,12 @@ class _Stage:
         plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(self.context), state)
 
 
-class _Stages:
-    """A stage per scenario: that of a terrain with many shapes takes long to build."""
-
-    def __init__(self) -> None:
-        self._stages: list[tuple[Scenario, _Stage]] = []
-
-    def __len__(self) -> int:
-        return len(self._stages)
-
-    def __contains__(self, scenario: Scenario) -> bool:
-        return any(built == scenario for built, _ in self._stages)
-
-    def __getitem__(self, scenario: Scenario) -> _Stage:
-        if scenario not in self:
-            self._stages.append((scenario, _Stage(scenario)))
-        return next(stage for built, stage in self._stages if built == scenario)
+def _stage_of(scenario: Scenario, stages: list[_Stage]) -> _Stage:
+    """Return the stage of a scenario, made if there is none yet: a terrain with many shapes takes long to build."""
+    stage = next((each for each in stages if each.testbed.scenario == scenario), None)
+    if stage is None:
+        stages.append(stage := _Stage(scenario))
+    return stage
 
 
 def _looks(
@@ -416,13 +406,13 @@ def _set_camera(meshcat: Meshcat, still: Still, camera: Camera | None, corners: 
 
 def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Camera | None) -> Still:
     """Record the motions, and return a picture of them."""
-    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), _Stages(), Still()
+    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[_Stage](), Still()
     corners: list[np.ndarray] = []
     meshcat.DeleteRecording()
     meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
     try:
         for actor in actors:
-            corners += actor.play(meshcat, stages[actor.motion.scenario], end, rate, still)
+            corners += actor.play(meshcat, _stage_of(actor.motion.scenario, stages), end, rate, still)
     finally:
         meshcat.StopRecording()
     meshcat.PublishRecording()

@@ -41,10 +41,10 @@ class Picture(Figure):
         return png_of(self)
 
 
-def png_of(figure: Figure) -> bytes:
+def png_of(figure: Figure, *, dpi: float = 100) -> bytes:
     """Return a figure as PNG."""
     buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 
@@ -57,9 +57,7 @@ def summary_html(title: str, rows: Mapping[str, object], figure: Figure | None =
 
 def image_html(figure: Figure) -> str:
     """Return the HTML element of a figure, with its pixels."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=80)
-    return f'<img src="data:image/png;base64,{b64encode(buffer.getvalue()).decode()}">'
+    return f'<img src="data:image/png;base64,{b64encode(png_of(figure, dpi=80)).decode()}">'
 
 
 def label(name: str, unit: str) -> str:
