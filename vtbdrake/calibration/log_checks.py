@@ -227,9 +227,9 @@ def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording
     for factor, text in ((pi / 180.0, "degrees"), (2.0 * pi, "turns"), (180.0 / pi, "rad that were converted twice")):
         yield f"positions that are {text}", of(by_q=factor)
     for k in range(model.nq):
-        yield f"the other sign of position {k}", of(by_q=_sign(model.nq, k))
+        yield f"the other sign of position {k}", of(by_q=1.0 - 2.0 * np.eye(model.nq)[k])
     for k in range(model.nu):
-        yield f"the other sign of torque {k}", of(by_u=_sign(model.nu, k))
+        yield f"the other sign of torque {k}", of(by_u=1.0 - 2.0 * np.eye(model.nu)[k])
     if model.nq > 1:
         yield "the other sign of all positions", of(by_q=-1.0)
     for factor, text in ((1e-3, "1000 times too large"), (1e3, "1000 times too small")):
@@ -241,12 +241,6 @@ def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording
                 order = _exchanged(model.nq, *pair)
                 yield f"torques {pair[0]} and {pair[1]} exchanged", of(u=order)
                 yield f"joints {pair[0]} and {pair[1]} exchanged", of(q=order, u=order)
-
-
-def _sign(size: int, k: int) -> Array:
-    signs = np.ones(size)
-    signs[k] = -1.0
-    return signs
 
 
 def _exchanged(size: int, i: int, j: int) -> list[int]:

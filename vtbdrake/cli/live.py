@@ -12,7 +12,6 @@ import click
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import Setting, converted, option, parse_setting, settings, timeout_option, url_option
 from vtbdrake.cli.output import emit, json_option, plain, say, show
-from vtbdrake.control.bridge import BridgeError
 from vtbdrake.failures import one_line
 
 _addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
@@ -118,5 +117,5 @@ def _failures() -> Iterator[None]:
 
     try:
         yield
-    except (BridgeError, LiveError, LiveTimeoutError) as error:
+    except (LiveError, LiveTimeoutError) as error:
         raise FailedError(one_line(error)) from error

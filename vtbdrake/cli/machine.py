@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
     config_option,
@@ -20,8 +19,6 @@ from vtbdrake.cli.options import (
     url_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show
-from vtbdrake.control.bridge import BridgeError
-from vtbdrake.failures import one_line
 from vtbdrake.machine.config import BRAKES, MachineConfig
 
 if TYPE_CHECKING:
@@ -118,17 +115,14 @@ def machine(
     simulated = Machine(scenario, config, epoch=epoch(lock_step=lock_step))
     for address, value in simulated.perturbed.items():
         say(f"{address} = {value}")
-    try:
-        loop = MachineLoop(simulated, url)
-        serve(
-            loop,
-            lock_step=lock_step,
-            cycles=inf if cycles is None else cycles,
-            priority=priority,
-            ready=lambda: show(f"ready on {url}", {"url": url, "perturbed": simulated.perturbed}),
-        )
-    except BridgeError as error:
-        raise FailedError(one_line(error)) from error
+    loop = MachineLoop(simulated, url)
+    serve(
+        loop,
+        lock_step=lock_step,
+        cycles=inf if cycles is None else cycles,
+        priority=priority,
+        ready=lambda: show(f"ready on {url}", {"url": url, "perturbed": simulated.perturbed}),
+    )
     say(loop.statistics)
     say(f"{number(simulated.time)} s simulated, {number(loop.lost)} s behind the clock")
     emit({"simulated": simulated.time, "lost": loop.lost, "statistics": loop.statistics.to_dict()})

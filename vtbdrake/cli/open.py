@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vtbdrake.cli import FailedError
 from vtbdrake.cli.completion import complete_file
 from vtbdrake.cli.options import converted, option, output, parse_scenario, parse_snapshot
 from vtbdrake.cli.output import json_option, show, write_whole
 from vtbdrake.cli.page import browser_option, page_options, serve
-from vtbdrake.failures import one_line
 
 if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
@@ -59,7 +57,6 @@ def open_(snapshot: Snapshot, scenario: Scenario | None, out: Path | None, page:
 
 
 def _write(scenario: Scenario, snapshot: Snapshot, out: Path) -> None:
-    from vtbdrake.components.rendering import RenderingError
     from vtbdrake.visualization import Scene, make_meshcat
     from vtbdrake.visualization.camera import camera_of
     from vtbdrake.visualization.drawing import Drawing
@@ -70,11 +67,7 @@ def _write(scenario: Scenario, snapshot: Snapshot, out: Path) -> None:
     meshcat = make_meshcat()
     drawing = Drawing(meshcat, testbed, context, "now")
     if out.suffix == ".png":
-        try:
-            picture = drawing.still(context, camera).png()
-        except RenderingError as error:
-            raise FailedError(one_line(error)) from error
-        write_whole(out, picture)
+        write_whole(out, drawing.still(context, camera).png())
     else:
         drawing.fit_camera(context, camera)
         Scene(meshcat, title=f"{type(scenario).__name__}, t = {snapshot.time:g} s").save(out)

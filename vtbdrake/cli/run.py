@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from vtbdrake.child_process import ProcessStartError, ending_signals, logging_in_thread
+from vtbdrake.child_process import ending_signals, logging_in_thread
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
@@ -24,7 +24,6 @@ from vtbdrake.cli.options import (
     url_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show, write_whole
-from vtbdrake.control.bridge import BridgeError
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.realtime import RealTime, RunawayError
 from vtbdrake.failures import one_line
@@ -120,7 +119,7 @@ def run(
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 show(real_time, {"real_time": real_time.grants})
                 _run(runtime, wait=wait, seconds=seconds)
-    except (BridgeError, RunawayError, ProcessStartError) as error:
+    except RunawayError as error:
         raise FailedError(one_line(error)) from error
     except RecordingError as error:
         incomplete = error
@@ -134,7 +133,7 @@ def run(
     finally:
         _report_faults(runtime.guards, begin)
     if incomplete is not None:
-        raise FailedError(one_line(incomplete)) from incomplete
+        raise incomplete
 
 
 def _report_faults(guards: Guards, begin: float) -> None:

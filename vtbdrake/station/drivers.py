@@ -229,7 +229,7 @@ class Arm(StationDriver):
             f"{self.name}_torque_measured": "joint_torque_measured",
             f"{self.name}_torque_external": "joint_torque_external",
         }
-        fields = {name: path for name, path in fields.items() if name in used}
+        fields = _of(fields, used)
         channel = f"IIWA_STATUS{self._suffix}"
         if self._has_position:
             return iiwa_status(fields, channel=channel)
@@ -245,9 +245,7 @@ class Arm(StationDriver):
 
     def command(self, used: Collection[str]) -> LcmMap:
         fields = {f"{self.name}_position": "joint_position", f"{self.name}_torque": "joint_torque"}
-        return iiwa_command(
-            {name: path for name, path in fields.items() if name in used}, channel=f"IIWA_COMMAND{self._suffix}"
-        )
+        return iiwa_command(_of(fields, used), channel=f"IIWA_COMMAND{self._suffix}")
 
     def continuity(self, period: float) -> Mapping[str, tuple[str, ArrayLike] | None]:
         starts: dict[str, tuple[str, ArrayLike] | None] = {}
@@ -267,6 +265,11 @@ class Arm(StationDriver):
         inertia = 1.0 / np.diag(np.linalg.inv(mass))
         brake = Brake(f"{self.name}_velocity_estimated", gain=inertia / _BRAKING_TIME)
         return {signal.name: Hold() if signal.unit == "rad" else brake for signal in self.act}
+
+
+def _of(fields: Mapping[str, str], used: Collection[str]) -> dict[str, str]:
+    """Return the fields of the signals that are used."""
+    return {name: path for name, path in fields.items() if name in used}
 
 
 _MODES = ("position_only", "position_and_torque", "torque_only")
@@ -363,12 +366,10 @@ class Gripper(StationDriver):
             f"{self.name}_velocity_measured": "actual_speed_mm_per_s",
             f"{self.name}_force_measured": "actual_force",
         }
-        fields = {name: path for name, path in fields.items() if name in used}
-        return wsg_status(fields, channel=f"SCHUNK_WSG_STATUS{self._suffix}")
+        return wsg_status(_of(fields, used), channel=f"SCHUNK_WSG_STATUS{self._suffix}")
 
     def command(self, used: Collection[str]) -> LcmMap:
-        fields = {f"{self.name}_position": "target_position_mm", f"{self.name}_force_limit": "force"}
-        fields = {name: path for name, path in fields.items() if name in used}
+        fields = _of({f"{self.name}_position": "target_position_mm", f"{self.name}_force_limit": "force"}, used)
         force = None if "force" in fields.values() else self._force
         return wsg_command(fields, force=force, channel=f"SCHUNK_WSG_COMMAND{self._suffix}")
 
@@ -413,5 +414,4 @@ class CameraImages:
 
     def images(self, used: Collection[str]) -> LcmMap:
         """Return the map of the messages of the real camera, as Drake's simulated one sends them."""
-        frames = {name: frame for name, frame in self._frames.items() if name in used}
-        return image_array_map(self._channel, frames, compress=self._compress)
+        return image_array_map(self._channel, _of(self._frames, used), compress=self._compress)

@@ -7,18 +7,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.manipulation import IiwaDriver
 from pydrake.multibody.parsing import ModelInstanceInfo, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, RigidBody
 
+from vtbdrake.arrays import Array
 from vtbdrake.testbed import ScenarioError
 
 _log = logging.getLogger(__name__)
 _SMALLEST_INERTIA = 1e-9  # kg m^2 or kg, that a driven joint moves
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

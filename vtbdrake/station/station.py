@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import os
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
 from math import inf
@@ -20,6 +19,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer
 
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.deployment import Deployment, Runtime
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.settings import setting
@@ -118,7 +118,7 @@ class Station(HardwareSimScenario):
         for name, value in {**({"dps": dps} if dps else {}), **values}.items():
             names = [item.name for item in fields(self)]
             if name not in names:
-                raise ScenarioError(f"{type(self).__name__} has no field {name!r}{_near(name, names)}")
+                raise ScenarioError(f"{type(self).__name__} has no field {name!r}{suggestion(name, names)}")
             setattr(self, name, value)
 
     @classmethod
@@ -251,7 +251,7 @@ class Station(HardwareSimScenario):
             if name not in offered and name not in self.commands:
                 raise ScenarioError(
                     f"the DPS has an input port {name!r}, but {self.where('model_drivers')} offers no such sensor "
-                    f"signal{_near(name, offered)}: rename it, or declare it as a command, "
+                    f"signal{suggestion(name, offered)}: rename it, or declare it as a command, "
                     f"commands={{{name!r}: StationCommand(default=[...])}}"
                 )
         return Interface(
@@ -399,11 +399,6 @@ class _Contents:
     @property
     def actuators(self) -> list[Signal]:
         return [signal for driver in self.drivers for signal in driver.act]
-
-
-def _near(name: str, names: Sequence[str]) -> str:
-    matches = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    return f"; did you mean {matches[0]}?" if matches else f"; there are: {', '.join(names) or 'none'}"
 
 
 def function_name(function: Callable[..., Any]) -> str:
