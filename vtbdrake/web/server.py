@@ -6,7 +6,7 @@ import asyncio
 import base64
 import io
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -24,7 +24,6 @@ from vtbdrake.visualization.camera import Camera
 from vtbdrake.web.host import Host, answer_commands, first_of, send, until_closed
 from vtbdrake.web.layers import LayerError
 from vtbdrake.web.session import Session, SessionError
-from vtbdrake.web.tls import Tls
 from vtbdrake.web.vr import VirtualReality
 
 _FRAME_PERIOD = 0.05  # s of wall time between two frames for a page
@@ -40,10 +39,8 @@ class Server:
         session: The session.
         folder: Where tests are saved.
         study: The file of the study in which drives are stored as trials; None: nowhere.
-        port: The port; 0 for any that is free.
-        hosts: Host names (with port) under which proxies offer it.
         vr: Lets headsets that open it lead a robot; None if none may. It is closed with the server.
-        tls: Where other devices reach it by https; None keeps it to the loopback interface.
+        **address: Port, hosts and tls, see `Host`.
 
     Attributes:
         url: The address of the page, with its token.
@@ -59,10 +56,8 @@ class Server:
         *,
         folder: Path = Path(),
         study: Path | None = None,
-        port: int = 0,
-        hosts: Collection[str] = (),
         vr: VirtualReality | None = None,
-        tls: Tls | None = None,
+        **address: Any,
     ) -> None:
         routes: list[BaseRoute] = [Route("/camera/{name}", self._camera_image)]
         if vr is not None:
@@ -75,9 +70,7 @@ class Server:
             script="view.js",
             serve=self._serve_page,
             routes=routes,
-            port=port,
-            hosts=hosts,
-            tls=tls,
+            **address,
         )
         self.url = self._host.url
 

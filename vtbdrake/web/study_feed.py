@@ -142,8 +142,8 @@ class StudyFeed:
         return {
             "numbers": [drive.number for drive in driven],
             "names": [drive.name for drive in driven],
-            "points": [[_place(p, drive.parameters[p.address]) for p in self._parameters] for drive in driven],
-            "values": [[_finite(value) for value in drive.values(self._qualities)] for drive in driven],
+            "points": [[place(p, drive.parameters[p.address]) for p in self._parameters] for drive in driven],
+            "values": [[finite(value) for value in drive.values(self._qualities)] for drive in driven],
             "kinds": [drive.kind(self._qualities) for drive in driven],
             "messages": [drive.outcome.message[:_TEXT] for drive in driven],
             "after": after,
@@ -153,12 +153,12 @@ class StudyFeed:
         columns: list[list[Any]] = [[trial.parameters[p.address] for trial in trials] for p in self._parameters]
         for k, parameter in enumerate(self._parameters):
             if isinstance(parameter, Choice):
-                columns[k] = [_place(parameter, value) for value in columns[k]]
+                columns[k] = [place(parameter, value) for value in columns[k]]
         count = len(trials[0].values) if trials else 0
         failures = {k: self._failure_of.get(t.point, "")[:_TEXT] for k, t in enumerate(trials) if t.kind == FAILED}
         return {
             "points": columns,
-            "values": [[_finite(trial.values[k]) for trial in trials] for k in range(count)],
+            "values": [[finite(trial.values[k]) for trial in trials] for k in range(count)],
             "kinds": [trial.kind for trial in trials],
             "methods": [trial.method for trial in trials],
             "batches": [trial.batch for trial in trials],
@@ -280,7 +280,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return stat.st_dev, stat.st_ino
 
 
-def _place(parameter: Dimension, value: Any) -> Any:
+def place(parameter: Dimension, value: Any) -> Any:
     """Return the value of a parameter, of a choice the number of the option; None if there is no such option."""
     if not isinstance(parameter, Choice):
         return value
@@ -288,5 +288,6 @@ def _place(parameter: Dimension, value: Any) -> Any:
     return parameter.options.index(option) if option in parameter.options else None
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """Return a number as JSON has it, which lacks those that are not finite."""
     return value if isfinite(value) else None

@@ -15,6 +15,7 @@ from vtbdrake.optimization import Study, Trial
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.bayesian import Bayesian
 from vtbdrake.optimization.solvers.solver import Evaluation, Search
+from vtbdrake.web.study_feed import place
 
 # Cells along each axis, and points to which the model is fitted at most, of which so many are the best ones.
 _CELLS, _POINTS, _BEST = 24, 160, 40
@@ -67,8 +68,8 @@ class Surrogate:
         units[:, addresses.index(y)] = np.repeat(v, len(u))
         mean = (self._signs * solver.mean(units))[:, quality].reshape(len(v), len(u))
         return {
-            "x": [_number(columns, centre) for centre in u],
-            "y": [_number(rows, centre) for centre in v],
+            "x": [place(columns, columns.from_unit(centre)) for centre in u],
+            "y": [place(rows, rows.from_unit(centre)) for centre in v],
             "mean": mean.tolist() if np.isfinite(mean).all() else None,
             "seconds": time.thread_time() - begin,
         }
@@ -96,8 +97,3 @@ def _centres(parameter: Dimension) -> np.ndarray:
     else:
         count = min(_CELLS, int(parameter.upper - parameter.lower) + 1) if parameter.integer else _CELLS
     return (np.arange(count) + 0.5) / count
-
-
-def _number(parameter: Dimension, centre: float) -> float:
-    value = parameter.from_unit(centre)
-    return float(parameter.options.index(value) if isinstance(parameter, Choice) else value)

@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +27,7 @@ from vtbdrake.optimization.records import DrivenTrial, Outcome
 from vtbdrake.optimization.solvers import known_solvers
 from vtbdrake.optimization.statement import StatementError, check_statement, restated
 from vtbdrake.optimization.study_file import StudyFile
-from vtbdrake.web.study_feed import StudyFeed
+from vtbdrake.web.study_feed import StudyFeed, finite, place
 from vtbdrake.web.study_model import Surrogate
 from vtbdrake.web.study_scene import StudyScene
 from vtbdrake.web.study_worker import PointError, PointRollout, PointSimulator
@@ -277,8 +276,8 @@ class _StudyPage:
         simulator = self._simulator()
         if driven is not None:
             return self._shown_again(str(role), self._driven(driven))
-        place = self._trial(trial).point if trial is not None else simulator.problem.point(self._point(point))
-        rollout = simulator.rollout(place, condition=as_whole("the number of a condition", condition))
+        shown = self._trial(trial).point if trial is not None else simulator.problem.point(self._point(point))
+        rollout = simulator.rollout(shown, condition=as_whole("the number of a condition", condition))
         return self._shown(str(role), rollout)
 
     def _shown(self, role: str, rollout: PointRollout) -> dict[str, Any]:
@@ -290,10 +289,10 @@ class _StudyPage:
         result = rollout.result
         return {
             "duration": float(result.times[-1]) if len(result.times) else 0.0,
-            "t_star": _finite(result.t_star),
+            "t_star": finite(result.t_star),
             "end": result.end,
             "message": result.message or message,
-            "seconds": _finite(result.wall_time),
+            "seconds": finite(result.wall_time),
         }
 
     def _shown_again(self, role: str, trial: DrivenTrial) -> dict[str, Any]:
@@ -307,15 +306,15 @@ class _StudyPage:
 
     def _try(self, *, point: Any, condition: int = 0) -> dict[str, Any]:
         simulator = self._simulator()
-        place = simulator.problem.point(self._point(point))
-        tried = simulator.attempt(place)
-        shown = self._shown("tried", simulator.rollout(place, condition=condition))
+        tried_point = simulator.problem.point(self._point(point))
+        tried = simulator.attempt(tried_point)
+        shown = self._shown("tried", simulator.rollout(tried_point, condition=condition))
         evaluation = tried.evaluation
         return {
             **shown,
-            "point": self._as_numbers(place),
-            "values": [_finite(value) for value in evaluation.values],
-            "violations": [_finite(value) for value in evaluation.violations],
+            "point": [place(p, value) for p, value in zip(self._study.parameters, tried_point, strict=True)],
+            "values": [finite(value) for value in evaluation.values],
+            "violations": [finite(value) for value in evaluation.violations],
             "kind": "failed" if evaluation.failed else "feasible" if evaluation.feasible else "broken",
             "message": "; ".join(tried.messages) or shown["message"],
         }
@@ -358,14 +357,6 @@ class _StudyPage:
         """Return a point of a page, which has the numbers of options instead of options."""
         pairs = zip(self._study.parameters, point, strict=True)
         return [p.options[int(value)] if isinstance(p, Choice) else value for p, value in pairs]
-
-    def _as_numbers(self, point: Sequence[Any]) -> list[float]:
-        pairs = zip(self._study.parameters, point, strict=True)
-        return [p.options.index(p.as_value(v)) if isinstance(p, Choice) else v for p, v in pairs]
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _numbers(outcome: Outcome) -> list[float]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.server import Server
     from vtbdrake.web.tls import Tls
+    from vtbdrake.web.vr import Robot
 
 
 class View:
@@ -84,18 +86,11 @@ def view_loop(
     """
     _check_extra()
     from vtbdrake.web.loop import LoopSession
-    from vtbdrake.web.vr import ControlledRobot, VirtualReality
+    from vtbdrake.web.vr import ControlledRobot
 
-    with ExitStack() as stack:
-        session = LoopSession(scenario, url)
-        stack.callback(session.close)
-        reality = None
-        if vr:
-            reality = VirtualReality(ControlledRobot(scenario, url, trouble=lambda: session.trouble))
-            stack.callback(reality.close)
-        opened = _served(session, port=port, hosts=hosts, vr=reality, tls=tls)
-        stack.pop_all()
-        return opened
+    session = LoopSession(scenario, url)
+    robot = partial(ControlledRobot, scenario, url, trouble=lambda: session.trouble)
+    return _served(session, robot if vr else None, port=port, hosts=hosts, tls=tls)
 
 
 def view(
@@ -137,7 +132,7 @@ def view(
         ModuleNotFoundError: The extra ``web`` is not installed.
     """
     _check_extra()
-    from vtbdrake.web.vr import SimulatedRobot, VirtualReality
+    from vtbdrake.web.vr import SimulatedRobot
 
     if study is not None and problem is None:
         problem = _problem_of(study)
@@ -151,23 +146,9 @@ def view(
         scenario = scenario or (problem.scenario if problem is not None else None)
         assert scenario is not None
         session = Session(scenario, start=start, values=values, config=config, problem=problem)
-    with ExitStack() as stack:
-        stack.callback(session.close)
-        reality = None
-        if vr:
-            reality = VirtualReality(SimulatedRobot(session))
-            stack.callback(reality.close)
-        opened = _served(
-            session,
-            folder=Path(folder),
-            study=None if study is None else Path(study),
-            port=port,
-            hosts=hosts,
-            vr=reality,
-            tls=tls,
-        )
-        stack.pop_all()
-        return opened
+    files = {"folder": Path(folder), "study": None if study is None else Path(study)}
+    robot = partial(SimulatedRobot, session)
+    return _served(session, robot if vr else None, **files, port=port, hosts=hosts, tls=tls)
 
 
 def _problem_of(study: str | os.PathLike[str]) -> Problem:
@@ -183,7 +164,17 @@ def _check_extra() -> None:
         extra_module(name, purpose="the live page", extra="web")
 
 
-def _served(session: Session, **options: Any) -> View:
+def _served(session: Session, robot: Callable[[], Robot] | None, **options: Any) -> View:
+    """Return a session with its page, where headsets lead the robot; if one cannot be made, the others are closed."""
     from vtbdrake.web.server import Server
+    from vtbdrake.web.vr import VirtualReality
 
-    return View(session, Server(session, **options))
+    with ExitStack() as stack:
+        stack.callback(session.close)
+        reality = None
+        if robot is not None:
+            reality = VirtualReality(robot())
+            stack.callback(reality.close)
+        opened = View(session, Server(session, vr=reality, **options))
+        stack.pop_all()
+        return opened

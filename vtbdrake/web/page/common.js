@@ -19,6 +19,38 @@ export function load(tag, properties) {
 
 export const number = (value) => (value === null || value === undefined ? "none" : Number(value).toPrecision(5) * 1 + "");
 
+export const button = (id, label, title, onclick) => element("button", { id, title, onclick }, label);
+
+// -- messages
+
+// What a page tells a person.
+export class Telling {
+  messages = element("div", { id: "vtb-messages", role: "status" });
+
+  constructor() {
+    document.body.append(this.messages);
+  }
+
+  told(kind) {
+    return this.messages.querySelector(`[data-kind="${kind}"]`);
+  }
+
+  // Shows a message for a while; one of a kind replaces the older one and stays until it is taken back.
+  say(text, className = "", kind = "") {
+    let shown = kind && this.told(kind);
+    if (!shown) this.messages.prepend((shown = element("p")));
+    shown.className = className;
+    if (shown.textContent !== text) shown.textContent = text;
+    if (kind) shown.dataset.kind = kind;
+    else setTimeout(() => shown.remove(), 8000);
+    return shown;
+  }
+
+  takeBack(kind) {
+    this.told(kind)?.remove();
+  }
+}
+
 // -- the connection
 
 export class Connection {

@@ -1,6 +1,6 @@
 // Drives the testbed by keyboard or gamepad: a key or a stick deflects an entry of a command u or of an actuator.
 
-import { element, number } from "./common.js";
+import { button, element, number } from "./common.js";
 
 // What moves the first, the second, ... driven entry: two keys, and an axis of the gamepad with its sign.
 const STICKS = [
@@ -21,7 +21,6 @@ export class Drive {
     this.pressed = new Set();
     this.sent = "";
     this.driving = false;
-    const button = (id, label, title, onclick) => element("button", { id, title, onclick }, label);
     this.handles = element("div", {});
     this.status = element("output", { id: "vtb-drive-status" });
     this.begin = button("vtb-drive-begin", "take over", "drive by hand from now on, in a fork", () => this.#begin());

@@ -1,6 +1,6 @@
 // What a person changes in a study: its controls, its search, and the list of changes.
 
-import { element, number } from "./common.js";
+import { button, element, number } from "./common.js";
 
 const CONTROLS = ["pause", "resume", "stop"]; // the points do not depend on these
 
@@ -8,7 +8,6 @@ export class Steering {
   constructor(page) {
     this.page = page;
     this.addresses = page.parameters.map(({ address }) => address);
-    const button = (id, label, title, onclick) => element("button", { id, title, onclick }, label);
     this.pauseButton = button("vtb-pause", "pause", "finish the batch, then ask for nothing", () => this.intervene(this.status.paused ? "resume" : "pause"));
     this.stopButton = button("vtb-stop", "stop", "end the run after its batch", () => this.intervene("stop"));
     this.runButton = button("vtb-run", "go on", `run it in a process of its own: ${page.hello.command}`, () => this.run());

@@ -1,7 +1,7 @@
 // The page of a study, beside Meshcat's viewer, whose page loads this module.
 
 import { Parallel, Scale, Scatter, color } from "./charts.js";
-import { Connection, element, load, number } from "./common.js";
+import { Connection, Telling, element, load, number } from "./common.js";
 import { Steering } from "./steering.js";
 
 const LISTED = 8; // best trials in the table
@@ -61,8 +61,9 @@ class Thrift {
   }
 }
 
-class Page {
+class Page extends Telling {
   constructor() {
+    super();
     this.trials = new Trials();
     this.time = 0;
     this.duration = 0;
@@ -132,7 +133,6 @@ class Page {
     const shown = ["landscape", ...(labels.length > 2 ? ["parallel"] : []), ...(this.qualities.length > 1 ? ["pareto"] : [])];
     this.switch = element("nav", { className: "vtb-tabs" }, ...shown.map((name) => element("button", { id: `vtb-view-${name}`, onclick: () => this.#choose(name) }, name)));
     this.facts = element("div", { id: "vtb-facts" });
-    this.messages = this.messages ?? element("div", { id: "vtb-messages", role: "status" });
     this.bestTable = element("table", { id: "vtb-best" });
     this.failures = element("table", { id: "vtb-failures" });
     this.sections = { best: this.bestTable, try: this.#buildTry(), search: this.steering.search, changes: this.steering.changes, failures: this.failures };
@@ -141,7 +141,6 @@ class Page {
     this.header = element("header", { id: "vtb-head" }, element("h1", { title: this.hello.path }, this.hello.name), this.facts, this.steering.controls);
     this.selectors = element("div", { className: "vtb-row" }, this.xAxis, this.yAxis, this.qualities.length > 1 ? this.quality : "", element("label", {}, this.model, " model"));
     document.body.append(
-      this.messages,
       this.header,
       element(
         "aside",
@@ -233,28 +232,12 @@ class Page {
     for (const button of this.tabs.children) button.classList.toggle("chosen", button.id === `vtb-tab-${name}`);
   }
 
-  // Shows a message for a while; one of a kind replaces the older one and stays until it is taken back.
-  say(text, className = "", kind = "") {
-    this.messages ??= element("div", { id: "vtb-messages", role: "status" });
-    if (!this.messages.isConnected) document.body.append(this.messages);
-    let shown = kind && this.messages.querySelector(`[data-kind="${kind}"]`);
-    if (!shown) this.messages.prepend((shown = element("p")));
-    shown.className = className;
-    if (shown.textContent !== text) shown.textContent = text;
-    if (kind) shown.dataset.kind = kind;
-    else setTimeout(() => shown.remove(), 8000);
-    return shown;
-  }
-
   // Shows a message until it is clicked.
   note(text, kind) {
     const shown = this.say(text, "", kind);
     Object.assign(shown, { title: "a click hides it", onclick: () => shown.remove() });
   }
 
-  takeBack(kind) {
-    this.messages?.querySelector(`[data-kind="${kind}"]`)?.remove();
-  }
 
   // -- what comes from the study
 
@@ -358,7 +341,7 @@ class Page {
 
   #showDeath(state) {
     if (state !== "died") return this.takeBack("died");
-    if (this.messages.querySelector('[data-kind="died"]')) return;
+    if (this.told("died")) return;
     const told = this.say("the process that ran the study has died; what it had finished is kept. ", "bad", "died");
     if (!this.hello.command) {
       told.append("Run its program again to go on.");

@@ -1,6 +1,6 @@
 // The controls of a session, beside Meshcat's viewer, whose page loads this module.
 
-import { Connection, element, load, number } from "./common.js";
+import { Connection, Telling, button, element, load, number } from "./common.js";
 import { Drive } from "./drive.js";
 import { Layers } from "./layers.js";
 import { Loop } from "./loop.js";
@@ -160,8 +160,9 @@ class Watched {
 
 // -- the page
 
-class Page {
+class Page extends Telling {
   constructor() {
+    super();
     this.watched = new Map();
     this.variables = {};
     this.frames = 0;
@@ -180,9 +181,7 @@ class Page {
   }
 
   #build() {
-    const button = (id, label, title, onclick) => element("button", { id, title, onclick }, label);
     this.title = element("h1");
-    this.messages = element("div", { id: "vtb-messages", role: "status" });
     this.search = element("input", { type: "search", placeholder: "find an address", oninput: () => this.#find() });
     this.matches = element("ul", { id: "vtb-matches" });
     this.sections = element("div");
@@ -191,7 +190,6 @@ class Page {
     this.compare = element("input", { type: "checkbox", id: "vtb-compare" });
     this.follow = element("select", { id: "vtb-follow", onchange: () => this.follow.blur() }, element("option", { value: "" }, "nothing"));
     document.body.append(
-      this.messages,
       element(
         "aside",
         { id: "vtb-panel" },
@@ -246,23 +244,6 @@ class Page {
 
   ask(command, fields) {
     return this.session.ask(command, fields).catch((error) => this.say(error.message, "bad"));
-  }
-
-  // Shows a message for a while; one of a kind replaces the older one of that kind and stays until it is taken back.
-  say(text, className = "", kind = "") {
-    let shown = kind && this.messages.querySelector(`[data-kind="${kind}"]`);
-    if (!shown) {
-      shown = element("p");
-      this.messages.prepend(shown);
-    }
-    shown.className = className;
-    if (shown.textContent !== text) shown.textContent = text;
-    if (kind) shown.dataset.kind = kind;
-    else setTimeout(() => shown.remove(), 8000);
-  }
-
-  takeBack(kind) {
-    this.messages.querySelector(`[data-kind="${kind}"]`)?.remove();
   }
 
   // -- variables
@@ -388,10 +369,9 @@ class Page {
 
   #showState({ steers, failure, warnings, preview, comparison }) {
     if (steers) this.takeBack("steering");
-    else if (!this.messages.querySelector('[data-kind="steering"]')) {
-      this.say("another page steers: this one watches ", "", "steering");
+    else if (!this.told("steering")) {
       const take = element("button", { id: "vtb-take", onclick: () => this.ask("take over") }, "steer here");
-      this.messages.querySelector('[data-kind="steering"]').append(take);
+      this.say("another page steers: this one watches ", "", "steering").append(take);
     }
     if (failure) this.say(this.loop ? failure : `the simulation has failed: ${failure}`, "bad", "failure");
     else this.takeBack("failure");
