@@ -7,6 +7,9 @@ from xml.etree import ElementTree as ET
 
 from pydrake.multibody.tree import SpatialInertia
 
+IIWA_AXES = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
+"""Which axis of its link each joint of an arm like KUKA's iiwa turns about."""
+
 
 def start_model(name: str, canonical_link: str, *, note: str) -> tuple[ET.Element, ET.Element]:
     """Return an SDF document and the model in it; ``note`` becomes a comment."""

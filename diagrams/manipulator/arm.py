@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import SpatialInertia
 
+from vtbdrake_diagrams.sdf import IIWA_AXES
+
 JOINTS = 7
 JOINT_NAMES = tuple(f"joint_{k}" for k in range(1, JOINTS + 1))
 LINK_NAMES = tuple(f"link_{k}" for k in range(1, JOINTS + 1))
@@ -39,15 +41,7 @@ class Arm:
     base_height: float = 0.1575  # [A] [P] gives 0.36 m from the floor to joint 2
     lengths: tuple[float, ...] = (0.2025, 0.2045, 0.2155, 0.1845, 0.2155, 0.081, 0.045)  # [P] in sums of two
     # Which axis of the link a joint turns about; as those of the iiwa.
-    axes: tuple[tuple[int, int, int], ...] = (
-        (0, 0, 1),
-        (0, 1, 0),
-        (0, 0, 1),
-        (0, -1, 0),
-        (0, 0, 1),
-        (0, 1, 0),
-        (0, 0, 1),
-    )
+    axes: tuple[tuple[int, int, int], ...] = IIWA_AXES
     radii: tuple[float, ...] = (0.075, 0.075, 0.07, 0.07, 0.06, 0.06, 0.04)  # [A] of the links, solid cylinders
     base_mass: float = 5.4  # [D] 29.9 kg [P] less the links
     masses: tuple[float, ...] = (5.5, 5.5, 4.0, 4.0, 3.0, 2.0, 0.5)  # [A]

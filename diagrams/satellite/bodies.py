@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import SpatialInertia
 
+from vtbdrake_diagrams.sdf import IIWA_AXES
+
 ARM_JOINTS = 7
 ARM_JOINT_NAMES = tuple(f"joint_{k}" for k in range(1, ARM_JOINTS + 1))
 LINK_NAMES = tuple(f"link_{k}" for k in range(1, ARM_JOINTS + 1))
@@ -47,15 +49,7 @@ class Servicer:
     shoulder: tuple[float, float, float] = (0.6, 0.0, -0.35)  # p_BoS_B of its foot, on the front face
     foot: float = 0.12  # from the foot to joint 2, along the first axis, is foot + lengths[0]
     lengths: tuple[float, ...] = (0.08, 0.4, 0.4, 0.35, 0.35, 0.08, 0.07)  # from each joint to the next, the last to S
-    axes: tuple[tuple[int, int, int], ...] = (
-        (0, 0, 1),
-        (0, 1, 0),
-        (0, 0, 1),
-        (0, -1, 0),
-        (0, 0, 1),
-        (0, 1, 0),
-        (0, 0, 1),
-    )
+    axes: tuple[tuple[int, int, int], ...] = IIWA_AXES
     masses: tuple[float, ...] = (6.0, 6.5, 6.0, 5.5, 5.0, 3.0, 2.0)
     radii: tuple[float, ...] = (0.08, 0.07, 0.065, 0.065, 0.06, 0.06, 0.055)
     lower: NDArray[np.float64] = field(default_factory=lambda: -_angles(175, 125, 175, 150, 175, 125, 175))

@@ -24,7 +24,7 @@ from vtbdrake.cli.output import json_option, show
 from vtbdrake.machine.config import MachineConfig
 
 if TYPE_CHECKING:
-    from vtbdrake.calibration import Calibration, SelfTest
+    from vtbdrake.calibration import SelfTest
     from vtbdrake.optimization import Parameter
     from vtbdrake.recording import Log
     from vtbdrake.testbed import Scenario
@@ -132,7 +132,9 @@ def calibrate(
         show(tested, _tested(tested))
         return
     result = fit(scenario, [_read(path, position, torque, **table) for path in logs], parameters, **model)
-    show(result, _fitted(result))
+    names = ("fit", "holdout", "correlation", "reasons", "combinations", "remarks")
+    numbers = {"parameters": [*result.parameters.values()]}
+    show(result, numbers | {name: getattr(result, name) for name in names})
     if save is not None:
         result.scenario.save(save)
     if not result.accepted:
@@ -165,29 +167,6 @@ def _read(
         time=time,
         units=settings(units),
     )
-
-
-def _fitted(result: Calibration) -> dict[str, Any]:
-    numbers = [
-        {
-            "address": each.address,
-            "start": each.start,
-            "value": each.value,
-            "deviation": each.deviation,
-            "interval": [each.lower, each.upper],
-            "verdict": each.verdict,
-        }
-        for each in result.parameters.values()
-    ]
-    return {
-        "parameters": numbers,
-        "fit": result.fit,
-        "holdout": result.holdout,
-        "correlation": result.correlation,
-        "reasons": result.reasons,
-        "combinations": result.combinations,
-        "remarks": result.remarks,
-    }
 
 
 def _tested(result: SelfTest) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
 from math import floor
 from typing import Any, Self
@@ -11,7 +11,6 @@ from vtbdrake.control.bridge import Bridge, reported_signals
 from vtbdrake.control.clock import Clock, SimulatedClock
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.control.stepping import Cycle
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.machine.config import MachineConfig
@@ -128,7 +127,6 @@ class LockStep(AbstractContextManager["LockStep"]):
         target: The testbed or DPS alone to run; by default a new DPS alone.
         config: The configuration of the machine.
         values: Variables of the target to set before the first cycle, by address.
-        watchers: Called with every `Cycle`.
 
     Attributes:
         machine: The machine; `Machine.begin` injects faults.
@@ -149,7 +147,6 @@ class LockStep(AbstractContextManager["LockStep"]):
         target: DpsAlone | VirtualTestbed | None = None,
         config: MachineConfig | None = None,
         values: Mapping[str, Any] | None = None,
-        watchers: tuple[Callable[[Cycle], None], ...] = (),
     ) -> None:
         self.machine = Machine(scenario, config)
         self.clock = SimulatedClock()
@@ -159,9 +156,7 @@ class LockStep(AbstractContextManager["LockStep"]):
         target = target or DpsAlone(scenario)
         context = target.default_context()
         target.write(context, values or {})
-        self.runtime: Runtime = self.deployment.runtime(
-            target, self.bridge, context=context, clock=self.clock, watchers=watchers
-        )
+        self.runtime: Runtime = self.deployment.runtime(target, self.bridge, context=context, clock=self.clock)
 
     def __enter__(self) -> Self:
         return self
