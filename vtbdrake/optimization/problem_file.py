@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
@@ -166,26 +167,78 @@ class Running:
 
 
 @dataclass
-class ProblemFile:
-    """A problem as its file states it, and how it is solved."""
+class StatedRollouts(ABC):
+    """What a file states about rollouts: that of a problem, or of a campaign.
+
+    Attributes:
+        noun, example, error: Class attributes: a word for what the file states and some of its keys, in messages, and
+            the class of its errors.
+    """
+
+    noun: ClassVar[str]
+    example: ClassVar[str]
+    error: ClassVar[type[ValueError]]
 
     scenario: str = setting("", "The scenario, package.module:Class or package.module:Class@FILE.yaml.")
+    horizon: float = setting(10.0, "The horizon t_m: the longest duration of a rollout.", unit="s", gt=0.0)
+    sample_period: float = setting(0.05, "The period of the samples of all functions.", unit="s", gt=0.0)
+    values: dict[str, Any] = setting(
+        default_factory=dict, doc="What is set in all rollouts: variables by address, and fields scenario.<field>."
+    )
+    conditions: dict[str, dict[str, Any]] = setting(
+        default_factory=dict, doc="By the name of each condition, what is set under it, as in values."
+    )
+    path: Path = field(default=Path("stated.yaml"), init=False, repr=False)  # the file
+    lines: Lines = field(default_factory=Lines, init=False, repr=False, compare=False)
+
+    @property
+    @abstractmethod
+    def problem(self) -> Problem:
+        """Return the problem.
+
+        Raises:
+            ValueError: The scenario, an address, a value or a function does not exist or does not fit.
+        """
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file.
+
+        The modules that the file names are imported, which runs their code.
+
+        Raises:
+            ValueError: The file cannot be read, or something in it cannot be used; with the line.
+        """
+        path = Path(path)
+        stated, lines = read_settings(cls, path, noun=cls.noun, example=cls.example, error=cls.error)
+        stated.path, stated.lines = path, lines
+        try:
+            stated.problem  # noqa: B018 - it checks scenario, addresses and functions
+        except (ValueError, OSError) as error:
+            raise cls.error(lines.message(error)) from error
+        return stated
+
+    @classmethod
+    def schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema of the file."""
+        resolve_types(cls)
+        return schema(cls)
+
+
+@dataclass
+class ProblemFile(StatedRollouts):
+    """A problem as its file states it, and how it is solved."""
+
+    noun, example, error = "problem", "scenario, parameters and qualities", ProblemFileError
+
     parameters: dict[str, Varied] = setting(
         default_factory=dict, doc="What is varied: variables by address, and fields scenario.<field>."
     )
     qualities: list[StatedQuality] = setting(
         default_factory=list, doc="The quality, or several, which have a Pareto front."
     )
-    horizon: float = setting(10.0, "The horizon t_m.", unit="s", gt=0.0)
     threshold: float | None = setting(
         None, "The threshold f_m: a rollout ends when f exceeds it, or when a cost falls below it."
-    )
-    sample_period: float = setting(0.05, "The period of the samples of f.", unit="s", gt=0.0)
-    values: dict[str, Any] = setting(
-        default_factory=dict, doc="What is set in all rollouts: variables by address, and fields scenario.<field>."
-    )
-    conditions: dict[str, dict[str, Any]] = setting(
-        default_factory=dict, doc="By the name of each condition, what is set under it, as in values."
     )
     risk: str = setting(
         "worst",
@@ -196,41 +249,9 @@ class ProblemFile:
     solver: Solving = field(default_factory=Solving)
     budget: Budget = field(default_factory=Budget)
     running: Running = field(default_factory=Running)
-    path: Path = field(default=Path("problem.yaml"), init=False, repr=False)  # the file
-    lines: Lines = field(default_factory=Lines, init=False, repr=False, compare=False)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> ProblemFile:
-        """Read the file of a problem.
-
-        The modules that the file names are imported, which runs their code.
-
-        Raises:
-            ProblemFileError: The file cannot be read, or something in it cannot be used; with the line.
-        """
-        path = Path(path)
-        example = "scenario, parameters and qualities"
-        stated, lines = read_settings(cls, path, noun="problem", example=example, error=ProblemFileError)
-        stated.path, stated.lines = path, lines
-        try:
-            stated.problem  # noqa: B018 - it checks scenario, addresses and functions
-        except (ValueError, OSError) as error:
-            raise ProblemFileError(lines.message(error)) from error
-        return stated
-
-    @staticmethod
-    def schema() -> dict[str, Any]:
-        """Return the JSON Schema of the file."""
-        resolve_types(ProblemFile)
-        return schema(ProblemFile)
 
     @cached_property
     def problem(self) -> Problem:
-        """Return the problem.
-
-        Raises:
-            ValueError: The scenario, an address, a value or a function does not exist or does not fit.
-        """
         if not self.scenario:
             raise ValueError("a problem has a scenario: package.module:Class")
         fields, common = split(self.values)

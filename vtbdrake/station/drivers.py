@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,19 +31,6 @@ _MARGIN = np.radians(5.0)  # by which joints run into their stops
 _FINGER_MARGIN = 0.02  # m
 _BRAKING_TIME = 0.1  # s, in which the brake of an arm takes the speed of a joint that moves alone
 _LOOSE = 10.0  # how far, by effort limits, external torques and forces are plausible
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """How quickly the commands of a station may change where its models give no limit.
-
-    Attributes:
-        speed_time: The time in s in which a commanded position may reach its largest speed.
-        effort_time: The time in s in which a commanded torque may reach its largest value.
-    """
-
-    speed_time: float
-    effort_time: float
 
 
 class StationDriver(ABC):
@@ -107,6 +93,9 @@ class Arm(StationDriver):
     and ``_torque_added`` (in torque-only mode): the commanded torque on top of the gravity compensation. The actuator
     signals ``_position`` and ``_torque``, as the mode has them. In ``position_and_torque``, the torque may be left out.
 
+    Where its model has no limit, a commanded position may reach its largest speed within ``speed_time``, a torque its
+    largest value within ``effort_time``, in s.
+
     After a fault, a position is held; torques brake the joints, and vanish without a measured velocity: the cabinet
     carries the weight.
     """
@@ -119,7 +108,8 @@ class Arm(StationDriver):
         models: Mapping[str, ModelInstanceInfo],
         *,
         bus: DrakeLcmParams,
-        motion: Motion,
+        speed_time: float,
+        effort_time: float,
         where: str,
     ) -> None:
         if driver.control_mode not in _MODES:
@@ -138,7 +128,7 @@ class Arm(StationDriver):
         self._size = len(joints)
         home = plant.GetDefaultPositions(models[name].model_instance)
         self.sense = self._sensors()
-        self.act = self._commands(np.clip(home, limits.lower, limits.upper), motion)
+        self.act = self._commands(np.clip(home, limits.lower, limits.upper), speed_time, effort_time)
         self.optional = frozenset({f"{name}_torque"} if self._has_position else ())
         extra = ("position_commanded",) if self._has_position else ("torque_added", "velocity_estimated")
         self.needed = frozenset(f"{name}_{needed}" for needed in ("position_measured", *extra))
@@ -167,12 +157,10 @@ class Arm(StationDriver):
             sensors.append(torque("torque_added", 4.0))
         return sensors
 
-    def _commands(self, home: np.ndarray, motion: Motion) -> list[Signal]:
+    def _commands(self, home: np.ndarray, speed_time: float, effort_time: float) -> list[Signal]:
         limits, commands = self.limits, []
         if self._has_position:
-            acceleration = np.where(
-                np.isfinite(limits.acceleration), limits.acceleration, limits.speed / motion.speed_time
-            )
+            acceleration = np.where(np.isfinite(limits.acceleration), limits.acceleration, limits.speed / speed_time)
             commands.append(
                 Signal(
                     f"{self.name}_position",
@@ -187,7 +175,7 @@ class Arm(StationDriver):
             )
         if self._has_torque:
             # On top of a position controller, nothing measures it: no limited rate could start anywhere.
-            rate = limits.effort / motion.effort_time if self._torque_alone else np.inf
+            rate = limits.effort / effort_time if self._torque_alone else np.inf
             commands.append(
                 Signal(
                     f"{self.name}_torque",

@@ -23,7 +23,7 @@ from vtbdrake.argument_checks import suggestion
 from vtbdrake.deployment import Deployment, Runtime
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.settings import setting
-from vtbdrake.station.drivers import AGE, Arm, CameraImages, Gripper, Motion, StationDriver
+from vtbdrake.station.drivers import AGE, Arm, CameraImages, Gripper, StationDriver
 from vtbdrake.station.models import JointLimits
 from vtbdrake.testbed import HardwareSimScenario, Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.scenario_file import file_and_key, is_imported, read_fields
@@ -365,7 +365,7 @@ class Station(HardwareSimScenario):
         models = self._process_directives(plant)
         self._check_drivers(models)
         by_name = {model.model_name: model for model in models}
-        motion = Motion(speed_time=self.speed_time, effort_time=self.effort_time)
+        times = {"speed_time": self.speed_time, "effort_time": self.effort_time}
         drivers: list[StationDriver] = []
         for name, driver in self.model_drivers.items():
             where = self.where(f"model_drivers.{name}")
@@ -373,7 +373,7 @@ class Station(HardwareSimScenario):
                 continue
             bus = self._bus(driver, where)
             if isinstance(driver, IiwaDriver):
-                drivers.append(Arm(name, driver, plant, by_name, bus=bus, motion=motion, where=where))
+                drivers.append(Arm(name, driver, plant, by_name, bus=bus, where=where, **times))
             else:
                 drivers.append(Gripper(name, driver, plant, by_name, bus=bus, where=where))
         cameras = {

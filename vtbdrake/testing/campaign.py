@@ -14,16 +14,15 @@ import numpy as np
 from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.optimization import Motion, Problem, Study
 from vtbdrake.optimization.problem import PLANT_STATE
-from vtbdrake.optimization.problem_file import StatedConstraint
+from vtbdrake.optimization.problem_file import StatedConstraint, StatedRollouts
 from vtbdrake.optimization.sweep import borrowed
 from vtbdrake.rollout import Constraint, Executor, Quality, RolloutResult
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.rollout.named_function import largest, named_function
 from vtbdrake.rollout.testbeds import split
-from vtbdrake.settings import schema, setting
+from vtbdrake.settings import setting
 from vtbdrake.testbed import load_scenario
-from vtbdrake.testbed.scenario_file import resolve_types
-from vtbdrake.testbed.settings_file import read_settings, scenario_beside
+from vtbdrake.testbed.settings_file import scenario_beside
 from vtbdrake.testing.campaign_results import ALL, CampaignResult, CampaignRollout, RolloutName
 
 ATTRIBUTE = "campaign"
@@ -112,51 +111,17 @@ class Stop:
 
 
 @dataclass
-class Campaign:
+class Campaign(StatedRollouts):
     """A campaign as its file states it: every condition is simulated with every seed, and judged by every criterion."""
 
-    scenario: str = setting("", "The scenario, package.module:Class or package.module:Class@FILE.yaml.")
-    horizon: float = setting(10.0, "The longest duration of a rollout.", unit="s", gt=0.0)
-    sample_period: float = setting(0.05, "The period at which criteria are sampled.", unit="s", gt=0.0)
-    values: dict[str, Any] = setting(
-        default_factory=dict, doc="What is set in all rollouts: variables by address, and fields scenario.<field>."
-    )
-    conditions: dict[str, dict[str, Any]] = setting(
-        default_factory=dict, doc="By the name of each condition, what is set under it, as in values."
-    )
+    noun, example, error = "campaign", "scenario, conditions and criteria", CampaignError
+
     seeds: Seeds = field(default_factory=Seeds)
     criteria: dict[str, Criterion] = setting(default_factory=dict, doc="The criteria by their names.")
     stop: Stop | None = setting(None, "When a rollout ends before the horizon.")
     record: list[str] = setting(
         default_factory=list, doc="Further addresses in the log of a rollout that is run again."
     )
-    path: Path = field(default=Path("campaign.yaml"), init=False, repr=False)  # the file
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Campaign:
-        """Read the file of a campaign.
-
-        A campaign imports the modules that its file names, which runs their code.
-
-        Raises:
-            CampaignError: The file cannot be read, or something in it cannot be used.
-        """
-        path = Path(path)
-        example = "scenario, conditions and criteria"
-        campaign, lines = read_settings(cls, path, noun="campaign", example=example, error=CampaignError)
-        campaign.path = path
-        try:
-            campaign._check()
-            campaign.problem  # noqa: B018 - it checks scenario, addresses and functions
-        except ValueError as error:
-            raise CampaignError(lines.message(error)) from error
-        return campaign
-
-    @staticmethod
-    def schema() -> dict[str, Any]:
-        """Return the JSON Schema of the file."""
-        resolve_types(Campaign)
-        return schema(Campaign)
 
     # -- what it states
 
@@ -172,6 +137,7 @@ class Campaign:
         Raises:
             ValueError: The scenario, an address, a value or a function does not exist or does not fit.
         """
+        self._check()
         common, _ = split(self.values)
         scenario = load_scenario(scenario_beside(self.path, self.scenario)).with_fields(common)
         stop = self.stop
