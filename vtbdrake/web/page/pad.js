@@ -193,7 +193,8 @@ class Handle extends Draggable {
     const { left, top, width, height } = viewer.renderer.domElement.getBoundingClientRect();
     const [x, y, z] = this.at;
     const point = this.#point(x, z, -y).project(viewer.camera);
-    this.root.hidden = !(Math.abs(point.x) <= 1 && Math.abs(point.y) <= 1 && Math.abs(point.z) <= 1);
+    const isSeen = Math.abs(point.x) <= 1 && Math.abs(point.y) <= 1 && Math.abs(point.z) <= 1;
+    this.root.hidden = !isSeen || !this.at.every(Number.isFinite); // What is not known is nowhere.
     this.root.style.transform = `translate(${left + 0.5 * (1 + point.x) * width}px, ${top + 0.5 * (1 - point.y) * height}px)`;
   }
 }
