@@ -22,7 +22,7 @@ from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
 from vtbdrake_diagrams.manipulator.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
 
 SECONDS = 20.0
-"""Of the recording: MuJoCo's time grows with it, and so does the smaller part of ours."""
+"""Of the recording."""
 WINDOW = 200
 """Steps of a rollout of MuJoCo's: longer ones run away from the recording."""
 RECORD = {POSITION: "dps.env.joint_position", TORQUE: "dps.joint_torque"}
