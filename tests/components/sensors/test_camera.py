@@ -394,6 +394,19 @@ def test_impossible_cameras_are_refused(wrong: dict, match: str) -> None:
         Scene(**wrong)
 
 
+def test_parameters_end_where_a_camera_does() -> None:
+    camera = Scene(errors=ErrorModel(latency=1, max_latency=4)).camera
+    bounds = {element.name: element.bounds for element in camera.variables if element.name != "pose"}
+    lower, upper = bounds.pop("intrinsics")
+    # The optical axis meets the image; a focal length is a pixel at least.
+    np.testing.assert_array_equal(lower, [1.0, 1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(upper, [np.inf, np.inf, 160.0, 120.0])
+    assert bounds.pop("latency") == (0.0, 4.0)
+    assert bounds.pop("dropout") == (0.0, 1.0)
+    assert bounds.pop("seed") == (0.0, 2.0**53)
+    assert bounds == dict.fromkeys(("exposure", "gain", "lamp", "noise", "photon_noise"), (0.0, np.inf))
+
+
 def test_plant_without_geometry_is_refused() -> None:
     plant = MultibodyPlant(0.0)
     plant.Finalize()

@@ -269,6 +269,23 @@ def test_signal_without_time_joins_newest_sample() -> None:
     np.testing.assert_array_equal(residuals(HalfTimeless), residuals(Line))
 
 
+class LateVelocity(Line):
+    """A bridge on which the velocity is as old as a period when it arrives."""
+
+    def poll(self, timeout: float = 0.0) -> int:
+        count = super().poll(timeout)
+        self.sensed["velocity"].sent -= PERIOD
+        return count
+
+
+def test_belief_is_as_new_as_the_newest_sample() -> None:
+    driver = loop(DpsAlone(SCENARIO), LateVelocity(SCENARIO, machine(SCENARIO)), PERIOD)
+    monitor = ResidualMonitor(driver, "twin", config=CONFIG, worker=False)
+    driver.run(cycles=300)
+    assert len(monitor.history) > 15
+    assert np.abs(monitor.arrays()["sense.position"]).max() < 1e-12
+
+
 @pytest.mark.parametrize("worker", [True, False])
 def test_world_with_other_signals_is_rejected(worker: bool) -> None:
     together = Together(SCENARIO, machine(SCENARIO))

@@ -125,6 +125,19 @@ def test_a_model_finds_the_optimum_under_a_constraint_with_few_evaluations():
     assert -best.values[0] == pytest.approx(CONSTRAINED.lowest, abs=2e-2)
 
 
+def test_a_model_expects_what_it_was_told():
+    solver = make_solver("bayesian", SPHERE.space, objectives=2, budget=40, seed=0)
+    log = drive(solver, lambda p: (SPHERE.cost(p), 1e3 * p[0]), fails=lambda p: p[1] > 3.0)
+    points, usable = np.array([e.point for e in log]), np.array([e.usable for e in log])
+    true = np.column_stack([[-SPHERE.cost(p) for p in points], -1e3 * points[:, 0]])
+    assert 20 < usable.sum() < len(log)
+    expected = solver.mean((points + 3.0) / 7.0)
+    ranges = np.ptp(true, axis=0)
+    np.testing.assert_allclose(expected[usable] / ranges, true[usable] / ranges, atol=0.005)
+    # A rollout that failed counts as the worst one.
+    assert (expected[~usable] < np.median(true[usable], axis=0)).all()
+
+
 def test_a_model_remembers_only_so_many_points():
     solver, best = solve("bayesian", SPHERE, budget=80, memory=15)
     np.testing.assert_allclose(best.point, SPHERE.best, atol=1e-2)

@@ -100,11 +100,11 @@ class Bayesian(Solver):
             return list(dict.fromkeys(point for point in drawn if point not in self._evaluations))[: self._batch]
         units, X, targets = self._fit(remembered)
         counted = np.array([evaluation.counts for evaluation in remembered])
-        centres = units[self._best_first(remembered, targets)[: 4 * BEST]]
+        best = self._best_first(remembered, targets)
+        centres = units[best[: BEST if self.search.objectives == 1 else 4 * BEST]]
         points: list[Point] = []
         while len(points) < self._batch:
-            near = centres[: self._best_count(len(centres))]
-            u = self._maximize(self._acquisition(X, targets, counted), near, exclude={*self._evaluations, *points})
+            u = self._maximize(self._acquisition(X, targets, counted), centres, exclude={*self._evaluations, *points})
             if u is None:
                 break
             points.append(self.search.point(u))
@@ -142,9 +142,6 @@ class Bayesian(Solver):
                 order = np.argsort(targets[usable, k], kind="stable")
                 columns.append(np.interp(model.predict(places)[0], targets[usable, k][order], values[order]))
         return np.column_stack(columns)
-
-    def _best_count(self, available: int) -> int:
-        return min(BEST if self.search.objectives == 1 else 4 * BEST, available)
 
     def _remembered(self) -> list[Evaluation]:
         """Return the points that the model is fitted to: all, or the best and the latest, half each."""
