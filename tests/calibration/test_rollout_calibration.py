@@ -188,6 +188,16 @@ def test_what_does_not_fit_is_refused(change: dict[str, object], error: type[Exc
         )
 
 
+@pytest.mark.parametrize("change", [{"starts": 2}, {"record": {VELOCITY: np.zeros((33, 6))}}])
+def test_windows_of_two_kinds_are_refused(change: dict[str, object]) -> None:
+    windows = sliding(0.25)
+    first = windows[0]
+    starts, record = list(first.starts) * int(change.get("starts", 1)), change.get("record", first.record)
+    windows[0] = Window(first.times, starts, record, first.source)
+    with pytest.raises(CalibrationError, match="record the same addresses, and have as many starts"):
+        calibrate_by_rollouts(CubeTossScenario(), windows, [FRICTION], distance, executor="serial")
+
+
 ANGLE, RATE, DAMPING = (f"sim.sys.cart_pole.pole_pin.{name}" for name in ("position", "velocity", "damping"))
 
 

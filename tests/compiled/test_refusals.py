@@ -188,13 +188,15 @@ def test_a_system_may_have_its_equations() -> None:
 def test_a_value_fixed_at_an_input_is_compiled_in() -> None:
     diagram = alone(ZeroOrderHold(0.1, 1))
     hold = diagram.GetSubsystemByName("part0")
-    contexts = [diagram.CreateDefaultContext() for _ in range(2)]
-    for value, context in enumerate(contexts):
-        hold.get_input_port().FixValue(hold.GetMyContextFromRoot(context), [3.0 + value])
+    contexts = [diagram.CreateDefaultContext() for _ in range(4)]
+    for value, context in zip((3.0, 3.0, 4.0), contexts, strict=False):
+        hold.get_input_port().FixValue(hold.GetMyContextFromRoot(context), [value])
     rollouts = compiled(diagram, ("part0.y",), context=contexts[0])
-    assert rollouts().outputs["part0.y"][0, -1, 0] == 3.0
-    with pytest.raises(UnsupportedTestbedError, match="the value fixed at the input port u of part0 differs"):
-        rollouts(context=contexts[1])
+    for context in contexts[:2]:
+        assert rollouts(context=context).outputs["part0.y"][0, -1, 0] == 3.0
+    for context in contexts[2:]:  # another value, and none
+        with pytest.raises(UnsupportedTestbedError, match="the value fixed at the input port u of part0 differs"):
+            rollouts(context=context)
 
 
 class Started(Squares):

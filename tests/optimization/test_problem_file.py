@@ -136,6 +136,19 @@ def test_the_schema_accepts_what_can_be_loaded(tmp_path: Path) -> None:
             ProblemFile.load(written(tmp_path, "\n".join(kept) + f"\n{line}\n"))
 
 
+def test_the_least_settings_are_accepted(tmp_path: Path) -> None:
+    text = FULL.replace("seed: 3", "seed: 0, parallel: 1").replace("rollouts: 8", "rollouts: 1, seconds: 0.001")
+    text = text.replace("racing: false", "workers: 1, time_limit: 0.001")
+    stated = ProblemFile.load(written(tmp_path, text))
+    assert (stated.solver.seed, stated.solver.parallel) == (0, 1)
+    assert (stated.budget.rollouts, stated.budget.seconds) == (1, 0.001)
+    assert (stated.running.workers, stated.running.time_limit) == (1, 0.001)
+    for least in ("parallel: 1", "rollouts: 1", "seconds: 0.001", "workers: 1", "time_limit: 0.001"):
+        name = least.partition(":")[0]
+        with pytest.raises(ProblemFileError, match=f"{name} must be .*not 0"):
+            ProblemFile.load(written(tmp_path, text.replace(least, f"{name}: 0")))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "message"),
     [

@@ -430,6 +430,30 @@ def test_an_intervention_that_makes_no_sense_is_refused_and_leaves_no_row(kind, 
     assert study.interventions == ()
 
 
+def test_a_range_may_be_all_that_the_testbed_allows():
+    study = pendulum_problem(parameters=[Parameter("u.angle", -1.0, 1.0)]).study(solver="cmaes")
+    study.intervene("range", address="u.angle", lower=-np.pi, upper=np.pi)
+    assert (study.search.ranges[0].lower, study.search.ranges[0].upper) == (-np.pi, np.pi)
+    for end in ("lower", "upper"):
+        with pytest.raises(ValueError, match="exceeds its bounds"):
+            study.intervene("range", address="u.angle", **{end: 3.2 if end == "upper" else -3.2})
+
+
+def test_a_study_that_was_begun_with_derivatives_is_narrowed():
+    study = pendulum_problem().study(solver="SNOPT", options={"gradient": "autodiff"})
+    study.intervene("range", address=THETA, lower=0.0)
+    assert study.search.ranges[0] == Parameter(THETA, 0.0, 1.5)
+
+
+def test_a_design_is_cut_to_the_rest_of_the_budget():
+    study = pendulum_problem().study(solver="grid", options={"points": [5, 4]})
+    narrow = (11, "range", {"address": THETA, "lower": 0.1})
+    executor = StatedExecutor(lambda values: (values[THETA], ()))
+    study.run(rollouts=20, callbacks=[steering(narrow)], executor=executor, progress=False)
+    assert len(study) == 20 and study.reason == "budget"
+    assert all(trial.parameters[THETA] >= 0.1 for trial in study.trials if trial.batch >= 1)
+
+
 @pytest.mark.parametrize(
     ("solver", "options", "kind", "payload", "message"),
     [

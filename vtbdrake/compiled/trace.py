@@ -27,8 +27,6 @@ def traced(f: Callable[..., Any], arguments: Sequence[Any]) -> casadi.Function |
     """
     if isinstance(f, casadi.Function):
         return f
-    if not all(isinstance(a, float | np.ndarray) for a in arguments):
-        return None
     symbols = [casadi.SX.sym(f"a{k}", int(np.size(a))) for k, a in enumerate(arguments)]
     try:
         with warnings.catch_warnings():  # CasADi announces another behaviour of numpy's functions.

@@ -140,6 +140,39 @@ def test_edges_that_are_not_seen_change_what_is_claimed_as_the_outline_says():
     assert (covered < 1.2).all() and (covered > 0.2).all()
 
 
+@pytest.mark.parametrize("roughness", [0.0, 0.02])
+def test_edges_and_the_prior_tell_as_much_as_their_variances(roughness):
+    """Ranges that are known to half a metre tell next to nothing."""
+    distance, left = 6.0, np.array([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+    places = EYE[:2] + distance * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    points, _ = Scene(places, np.full(4, 0.3)).scan(EYE)
+    detector = replace(EXACT, range_noise=0.5, roughness=roughness, diameter_spread=10.0)
+    trunks = detect_trunks(points, detector, p_HoLo_H=EYE)
+    # The axis is in the middle of two edges, each uniform within a step of the rays, and rough.
+    deviation = np.hypot(distance * EXACT.azimuth_step / 12.0**0.5, roughness) / 2.0**0.5
+    _, order = pairs(trunks.positions, places, within=0.1)
+    across = np.einsum("ki,kij,kj->k", left[order], trunks.covariances, left[order]) ** 0.5
+    np.testing.assert_allclose(across, deviation, rtol=0.08)
+    np.testing.assert_allclose(trunks.diameter_deviations, 2.0 * deviation, rtol=0.08)
+    # A prior that is as sharp as the edges counts as much as they do.
+    for k, diameter in enumerate(trunks.diameters):
+        prior = replace(detector, diameter_spread=2.0 * deviation, typical_diameter=diameter + deviation)
+        both = detect_trunks(points, prior, p_HoLo_H=EYE)
+        assert both.diameters[k] == pytest.approx(diameter + 0.5 * deviation, abs=0.1 * deviation)
+        assert both.diameter_deviations[k] == pytest.approx(2.0**0.5 * deviation, rel=0.08)
+
+
+def test_without_measurements_the_lean_is_that_of_the_prior():
+    # Along the ray, only ranges tell it. Its variance is the curvature of that of the position over the height.
+    points, _ = Scene(EYE[None, :2] + [[6.0, 0.0]], np.array([0.3])).scan(EYE)
+    detector = replace(EXACT, range_noise=0.5, lean=0.01)
+    variances = [
+        detect_trunks(points, replace(detector, reference_height=height), p_HoLo_H=EYE).covariances[0, 0, 0]
+        for height in (1.0, 3.0, 5.0)
+    ]
+    assert (np.diff(variances, n=2)[0] / 8.0) ** 0.5 == pytest.approx(0.01, rel=0.05)
+
+
 def test_leaning_trunks_are_found_at_breast_height():
     leans = np.array([[0.08, 0.0], [0.0, 0.08], [-0.06, 0.06], [0.0, -0.1]])
     places = EYE[:2] + 5.0 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
