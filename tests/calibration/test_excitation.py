@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import ARM, DRIVES, PendulumScenario
+from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario
 from vtbdrake.calibration import CalibrationError, Excitation, Noise, calibrate, excitation
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter
@@ -109,6 +109,19 @@ def test_what_cannot_be_designed_is_refused(change: dict[str, object], message: 
     arguments = {"spline": SCENARIO.spline, **change}
     with pytest.raises(CalibrationError, match=message):
         excitation(SCENARIO, PARAMETERS[:1], starts=int(str(arguments.pop("starts", 1))), **arguments)
+
+
+@pytest.mark.one_python
+def test_a_delay_and_a_lag_of_a_drive_are_told_alike() -> None:
+    """A torque that comes later, by a small time, is the same torque whatever delays it."""
+    parameters = [Parameter(f"{DRIVES}.delay", 0.0, 4.0), Parameter(f"{DRIVES}.time_constant", 0.0, 0.02)]
+    noise = Noise(np.full(1, 1e-4), np.full(1, 0.05), 0.05)
+    told = excitation(
+        PendulumScenario(), parameters, spline=Spline("bspline", 9, 4.0), noise=noise, rate=3.0, lower=-1.0, upper=1.0,
+        starts=1, iterations=2,
+    ).information  # fmt: skip
+    delay, lag = told.alone
+    assert 0.0 < lag < 0.02 and PERIOD * delay == pytest.approx(lag)
 
 
 @pytest.mark.one_python

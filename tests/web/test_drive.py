@@ -110,7 +110,9 @@ def test_drive_ends_where_the_rollout_of_the_problem_does() -> None:
         assert ended.drive["ended"] == "threshold" and ended.drive["value"] > 0.15
         with pytest.raises(SessionError, match=r"the driven rollout has ended \(threshold\): keep it, or drop it"):
             session.advance(1)
-        assert session.end_drive().result.t_star == ended.drive["t_star"]
+        driven = session.end_drive()
+        assert driven.result.t_star == ended.drive["t_star"]
+        assert driven.summary()["seconds"] == driven.result.t_star
         session.advance(1)
 
 
@@ -149,8 +151,15 @@ def test_course_that_nobody_drives_goes_on_beside_it(session: Session) -> None:
         plain.advance(20)
         undriven = read(plain, ANGLE)
     session.end_drive(keep=False)
+    assert frame(session, lambda shown: shown.drive is None).comparison is None
     session.advance(20)
     assert read(session, ANGLE) == undriven
+    session.drive([COMMAND], compare=True)
+    session.deflect({COMMAND: 1.0})
+    session.advance(20)
+    session.end_drive()
+    shown = frame(session, lambda shown: shown.drive is None)
+    assert dict(shown.comparison["differences"])[COMMAND] == 21 * STEP  # It is compared on.
 
 
 def test_bad_drives_are_refused(session: Session) -> None:

@@ -50,12 +50,14 @@ class Reader:
         self.hello: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
         self.trials: list[tuple[Any, ...]] = []
+        self.reasons: dict[int, str] = {}
 
     def read(self) -> dict[str, Any]:
         message: dict[str, Any] = json.loads(self.socket.recv(PATIENCE))
         if message["type"] == "trials":
             rows = zip(*message["points"], *message["values"], message["kinds"], strict=True)
             self.trials[message["first"] :] = rows
+            self.reasons |= {message["first"] + int(k): reason for k, reason in message["reasons"].items()}
         elif message["type"] in ("hello", "status"):
             setattr(self, message["type"], message)
         return message
@@ -115,7 +117,8 @@ def test_shown_and_tried_points_are_those_of_the_problem(opened: StudyView) -> N
             with pytest.raises(StudyError, match=message):
                 reader.ask("try", point=point)
         for fields, message in (
-            ({"trial": 99}, "no trial 99"),
+            ({"trial": 16}, "no trial 16"),
+            ({"trial": -1}, "no trial -1"),
             ({"point": [1.0, 0.0], "condition": 1}, "no condition"),
         ):
             with pytest.raises(StudyError, match=message):
@@ -153,6 +156,7 @@ def test_options_and_several_qualities_and_failures_reach_the_page(tmp_path: Pat
         ((message, count, first),) = reader.status["failures"][:1]
         failed = [k for k, trial in enumerate(study.trials) if trial.failed]
         assert "late" in message and first == min(failed) and 0 < count <= len(failed) < 20
+        assert sorted(reader.reasons) == failed and all("late" in reason for reason in reader.reasons.values())
         tried = reader.ask("try", point=[-1.4, 0])
         assert tried["kind"] == "failed" and "late" in tried["message"]
         reader.ask("give", point=[0.5, 1])

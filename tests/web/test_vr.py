@@ -253,6 +253,9 @@ def test_request_after_the_end_is_refused() -> None:
 def test_robot_in_trouble_is_released_and_not_armed() -> None:
     robot = Toy()
     reality = VirtualReality(robot)
+    first = reality.status
+    becomes(lambda: reality.status is not first)
+    assert not robot.sent  # It is not commanded before a hand leads.
     take(reality, robot)
     robot.reason = "the fallbacks command: position is stale"
     becomes(lambda: not reality.status.armed and robot.sent[-1]["hand"][0] == 0.0)
