@@ -62,6 +62,19 @@ def test_equals_rollouts_in_drake(name: str) -> None:
     assert batch.valid.all()
 
 
+def test_noise_is_that_of_the_time_at_which_a_rollout_begins() -> None:
+    testbed, sensor = SCENARIOS["errors"].build(), "sim.sense.joint_position.joint_encoders"
+    options = {"horizon": 0.1, "sample_period": 0.02, "outputs": (sensor,), "compile": False}
+    rollouts = testbed.compiled(**options)
+    # Rollouts from 2.5 ms and from 0 s have the same second instant, 5 ms.
+    for t0 in (0.0025, 0.0, 0.005):
+        context = testbed.default_context()
+        context.SetTime(t0)
+        measured, fresh = (each(context=context).outputs[sensor] for each in (rollouts, testbed.compiled(**options)))
+        assert measured.any()
+        np.testing.assert_array_equal(measured, fresh)
+
+
 def test_begins_in_any_context() -> None:
     scenario = SCENARIOS["errors"]
     testbed = scenario.build()

@@ -158,6 +158,15 @@ def test_other_branch_goes_on_with_its_own_changes() -> None:
         assert first[MASS] == 22 * STEP  # The first state with it that was kept.
 
 
+def test_slow_motion_stands_nearly_still(session: Session) -> None:
+    session.advance(1)
+    session.set_speed(1e-6)  # A step takes two hours.
+    session.play()
+    first = frame(session, lambda shown: shown.playing)
+    last = frame(session, lambda shown: shown.number > first.number + 2)
+    assert (last.time, last.playing, last.speed) == (STEP, True, 1e-6)
+
+
 def test_failed_simulation_stands_still_until_it_is_reset(session: Session) -> None:
     session.advance(10)
     session.write({"sim.sys.cart_pole.pole_pin.velocity": 1e200})
