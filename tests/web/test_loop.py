@@ -44,7 +44,8 @@ def test_poses_values_and_switches_are_those_of_the_loop(hub: Hub) -> None:
         assert all(0.0 <= age < PATIENCE for age in shown.loop["ages"].values())
         assert (shown.failure, shown.warnings, shown.loop["reasons"]) == ("", (), [])
         assert 0.0 < shown.time <= runtime.time
-        frame(session, lambda now: now.time > shown.time and now.rate > 0.0)
+        now = frame(session, lambda now: now.time > shown.time + 1.5 and now.rate > 0.0)
+        assert 0.5 * now.rate <= now.time  # It is measured over half a second at least.
         with connect(session.meshcat_url.replace("http", "ws"), max_size=None) as meshcat:
             place = None
             while place is None or abs(place - CART) > 1e-6:  # first the default pose, then that of the loop

@@ -60,6 +60,9 @@ class Reader:
             self.reasons |= {message["first"] + int(k): reason for k, reason in message["reasons"].items()}
         elif message["type"] in ("hello", "status"):
             setattr(self, message["type"], message)
+            if message.get("left") is not None:
+                left = max(0, message["budget"] - message["rollouts"])
+                assert message["left"] * message["rate"] == pytest.approx(left)
         return message
 
     def until(self, state: str, trials: int) -> Reader:
