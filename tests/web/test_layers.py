@@ -83,16 +83,16 @@ def test_arrows_of_a_resting_cube_carry_its_weight(meshcat: Meshcat, model: str)
     scenario = CubeTossScenario(plant_config=config)
     height = 0.5 * scenario.edge
     testbed, context = started(scenario, 1.0, **{CUBE: [0.0, 0.0, height, 0.0, 0.0, 0.0]})
-    layers = Layers(meshcat, testbed, 1.0)
+    layers = Layers(meshcat, testbed, 2.0)
     layers.show(["forces"])
     layers.draw(context)
-    assert layers.notes["forces"] == "3.63 N reach 0.5 m to both sides of a contact"
+    assert layers.notes["forces"] == "3.63 N reach 1 m to both sides of a contact"
     scales = {
         path: message["value"][2]
         for path, message in drawn(meshcat, "set_property", "forces").items()
         if path.endswith("cylinder") and "moment" not in path and message["property"] == "scale"
     }
-    assert scales and sum(scales.values()) == pytest.approx(0.5, rel=0.02)  # 0.37 kg at 9.81 m/s^2
+    assert scales and sum(scales.values()) == pytest.approx(1.0, rel=0.02)  # 0.37 kg at 9.81 m/s^2
     layers.show([])
     assert not drawn(meshcat, "set_object", "forces")
 
