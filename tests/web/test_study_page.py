@@ -12,13 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection
 
 from tests.folders import open_folder, that_cannot_be_written
 from tests.optimization.studies import pendulum_problem
-from tests.web.studies import ANGLE, HORIZON, RATE, cart_pole_problem, drive_cart, run_elsewhere
+from tests.web.studies import ANGLE, HORIZON, PLACE, RATE, cart_pole_problem, drive_cart, run_elsewhere
 from tests.web.test_server import PATIENCE, ask, base, cookie, page
 from vtbdrake.optimization import Choice, Parameter, Study, StudyError
 from vtbdrake.rollout import Quality
@@ -126,6 +127,29 @@ def test_shown_and_tried_points_are_those_of_the_problem(opened: StudyView) -> N
         ):
             with pytest.raises(StudyError, match=message):
                 reader.ask("show", role="pointed", **fields)
+
+
+def test_trial_is_drawn_between_its_samples_where_drake_has_it(opened: StudyView) -> None:
+    time = 0.53
+    with page(opened) as socket:
+        reader = Reader(socket).until("ended", 16)
+        reader.ask("show", role="pointed", trial=3)
+        reader.ask("time", time=time)
+        drawn = None
+        with page(opened, "") as meshcat:
+            while drawn is None:
+                message = msgpack.unpackb(meshcat.recv(PATIENCE))
+                if message["type"] == "set_transform" and message["path"].endswith("study/pointed/cart_pole/pole"):
+                    drawn = message["matrix"]
+        reader.ask("hide", role="pointed")
+    testbed = cart_pole_problem().testbed
+    context = testbed.default_context()
+    testbed.write(context, dict(zip((ANGLE, RATE), reader.trials[3][:2], strict=True)))
+    testbed.simulator(context).AdvanceTo(time)
+    angle, speed = testbed.read(context, ANGLE), testbed.read(context, RATE)
+    assert abs(speed) > 1.0
+    np.testing.assert_allclose(np.array(drawn)[[0, 2]], [np.cos(angle), np.sin(angle)], atol=0.01)
+    assert drawn[12] == pytest.approx(testbed.read(context, PLACE), abs=1e-3)
 
 
 def test_model_is_near_the_quality_between_the_trials(tmp_path: Path) -> None:

@@ -47,11 +47,7 @@ class _Actor:
         plant = self.testbed.plant
         assert plant is not None
         # Between the samples on a line; before and after them as at the ends.
-        after = int(np.clip(np.searchsorted(times, time), 0, len(times) - 1))
-        before = max(after - 1, 0)
-        step = times[after] - times[before]
-        share = float(np.clip((time - times[before]) / step, 0.0, 1.0)) if step > 0.0 else 1.0
-        state = (1.0 - share) * states[before] + share * states[after]
+        state = [np.interp(time, times, values) for values in states.T]
         plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(self.context), state)
         self.drawing.pose(self.context)
 
