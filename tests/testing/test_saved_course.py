@@ -13,8 +13,11 @@ import pytest
 
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, RolloutTask
-from vtbdrake.rollout.course import Course
-from vtbdrake.testing.saved_course import SavedCourseError, save_course
+from vtbdrake.rollout.course import Course, DrivenRollout, task_without_problem
+from vtbdrake.state import Snapshot
+from vtbdrake.testbed.scenario_file import scenario_text
+from vtbdrake.testing.saved_course import SavedCourseError, drive_again, save_course
+from vtbdrake_diagrams.cube_toss import CubeTossScenario
 
 pytestmark = pytest.mark.one_python
 
@@ -48,6 +51,7 @@ class Swinging(PendulumScenario):
         builder.sim_actuator("torque", plant.get_actuation_input_port())
 '''
 ANGLE, MASS = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.arm_com.mass"
+POSITION, VELOCITY = "sim.sys.cube.position", "sim.sys.cube.velocity"
 STEP = 0.03125
 
 
@@ -94,6 +98,30 @@ def test_saved_tests_pass_and_notice_a_changed_model(model: Any, tmp_path: Path)
     changed = run(tmp_path)
     assert changed.returncode == 1 and "2 failed" in changed.stdout, changed.stdout
     assert changed.stdout.count("comparison failed") == 2, changed.stdout
+
+
+def test_friction_of_a_geometry_is_that_of_today_too(tmp_path: Path) -> None:
+    def start(scenario: CubeTossScenario) -> Snapshot:
+        testbed = scenario.build()
+        context = testbed.default_context()
+        height = 0.5 * scenario.edge
+        testbed.write(
+            context, {POSITION: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, height], VELOCITY: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]}
+        )
+        return testbed.snapshot(context)
+
+    def place(driven: DrivenRollout) -> float:
+        return float(driven.read([POSITION])[POSITION][4])
+
+    once, today = CubeTossScenario(friction=0.1), CubeTossScenario(friction=0.4)
+    # As if the friction stood in the code of the scenario.
+    saved = start(once)
+    Snapshot(saved.time, saved.values, saved.groups, today.record()).save(tmp_path / "start.vtb")
+    driven = drive_again(
+        today.name(), scenario_text(today), start=tmp_path / "start.vtb", step=STEP, parameters={}, writes=(), steps=8
+    )
+    expected, other = (place(Course(start(s), STEP, (), 8).driven(task_without_problem(s))) for s in (today, once))
+    assert place(driven) == expected and other - expected > 0.05
 
 
 def test_expected_quality_is_that_of_the_course(model: Any, tmp_path: Path) -> None:
