@@ -18,8 +18,8 @@ from tests.verification.mjcf import mjcf
 from vtbdrake.arrays import Array
 from vtbdrake.calibration import calibrate
 from vtbdrake.rollout import RolloutRunner, RolloutTask
-from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
-from vtbdrake_diagrams.manipulator.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
+from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
 
 SECONDS = 20.0
 """Of the recording."""

@@ -16,7 +16,7 @@ from benchmarks.measure import HIGHER, Benchmark
 from vtbdrake.rollout import Quality, RolloutResult, RolloutTask
 from vtbdrake.rollout.cluster import DaskExecutor
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import MASS
+from vtbdrake_diagrams.space_climber.studies.payload import MASS
 
 PROCESSES = 2
 DURATION = 0.5

@@ -21,7 +21,7 @@ from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.arm import Arm
-from vtbdrake_diagrams.manipulator.excited import ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.excited import ExcitedArmScenario
 
 STATE = "plant.state"
 # Rounding grows in the motion that is compared.

@@ -20,7 +20,7 @@ from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
 from vtbdrake.rollout.start import Start
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.crater import (
+from vtbdrake_diagrams.space_climber.studies.crater import (
     HEADING,
     HORIZON,
     STANDING,

@@ -21,8 +21,8 @@ from vtbdrake.rollout import Constraint, Quality
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.decision import reasoning
 from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner, swing_up
-from vtbdrake_diagrams.manipulator.pick_up import LARGEST_ERROR, Load
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
+from vtbdrake_diagrams.manipulator.studies.pick_up import LARGEST_ERROR, Load
 
 METHODS = ("CEM", "predictive-sampling", "MPPI", "CMA-ES", "random")
 # A cost is close to the best of all methods if it is larger by at most this share of what random candidates reach.

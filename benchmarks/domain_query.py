@@ -9,7 +9,7 @@ from benchmarks.measure import LOWER, Benchmark, ratio, seconds
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.validity_domain import DomainWatch, ValidityDomain
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.validity import FEATURES
+from vtbdrake_diagrams.manipulator.studies.validity import FEATURES
 
 WINDOWS, QUERIES = 500, 2000
 

@@ -14,7 +14,7 @@ import vtbdrake as vtb
 from benchmarks.measure import HIGHER, Benchmark, spread
 from vtbdrake.testbed.integrator import apply_simulator_config
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import MASS, PITCH
+from vtbdrake_diagrams.space_climber.studies.payload import MASS, PITCH
 
 PERIOD, STROKE, RAMP_TIME = (f"dps.impl.gait.{name}" for name in ("period", "stroke", "ramp_time"))
 X, ROLL = "sim.sys.climber.base.x", "sim.sys.climber.base.roll"

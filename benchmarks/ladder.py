@@ -32,7 +32,7 @@ from vtbdrake_diagrams.satellite.dps import PERIOD
 from vtbdrake_diagrams.satellite.plant import add_servicer, add_target
 from vtbdrake_diagrams.satellite.start import Release, random_start
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import payload_problem
+from vtbdrake_diagrams.space_climber.studies.payload import payload_problem
 
 # Prepares what is measured: a function that simulates.
 Rung = Callable[[], Callable[[], object]]

@@ -25,7 +25,7 @@ from vtbdrake.rollout import (
 )
 from vtbdrake.rollout.cluster import DaskExecutor
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import MASS, PITCH, SAMPLE_PERIOD
+from vtbdrake_diagrams.space_climber.studies.payload import MASS, PITCH, SAMPLE_PERIOD
 
 CORES = 2
 HORIZON = 5.0

@@ -13,7 +13,14 @@ from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, seconds, s
 from benchmarks.plain_climber import build_plain_climber
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import HORIZON, MASS, PITCH, SAMPLE_PERIOD, payload_problem, tipped_over
+from vtbdrake_diagrams.space_climber.studies.payload import (
+    HORIZON,
+    MASS,
+    PITCH,
+    SAMPLE_PERIOD,
+    payload_problem,
+    tipped_over,
+)
 
 DISTANCE = "sim.sys.climber.base.x"
 REFERENCE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.1, accuracy=1e-6)

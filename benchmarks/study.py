@@ -21,7 +21,7 @@ from vtbdrake.optimization.solvers import make_solver
 from vtbdrake.optimization.solvers.solver import Evaluation, Point
 from vtbdrake.rollout import Executor, ProcessExecutor, Quality, RolloutRunner, RolloutTask, ThreadExecutor
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.payload import PHASE
+from vtbdrake_diagrams.space_climber.studies.payload import PHASE
 
 ANGLE, RATE = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
 X = "sim.sys.climber.base.x"

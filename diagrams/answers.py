@@ -23,10 +23,10 @@ APPLICATIONS: Registry = {
     "O1": "vtbdrake_diagrams.satellite.studies.mount:mount",
     "O2": "vtbdrake_diagrams.satellite.studies.scan_frequency:frequency",
     "O3": "vtbdrake_diagrams.satellite.studies.lighting:lighting",
-    "O4": "vtbdrake_diagrams.space_climber.answers:payload",
-    "R1": "vtbdrake_diagrams.space_climber.answers:heading",
+    "O4": "vtbdrake_diagrams.space_climber.studies.answers:payload",
+    "R1": "vtbdrake_diagrams.space_climber.studies.answers:heading",
     "R2": "vtbdrake_diagrams.satellite.studies.trajectory:answer",
-    "C1": "vtbdrake_diagrams.manipulator.answers:control",
+    "C1": "vtbdrake_diagrams.manipulator.studies.answers:control",
     "C2": "vtbdrake_diagrams.forest.studies.answers:localization",
 }
 

@@ -27,7 +27,15 @@ from vtbdrake.testbed import DpsAlone
 from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.safety import CARRY
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.trials import DURATIONS, FREE, LawAlongX, Track, rms, run_trial, trial_scenario
+from vtbdrake_diagrams.manipulator.studies.trials import (
+    DURATIONS,
+    FREE,
+    LawAlongX,
+    Track,
+    rms,
+    run_trial,
+    trial_scenario,
+)
 
 LAWS = ("cartesian_impedance", "admittance")
 

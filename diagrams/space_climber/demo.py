@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from vtbdrake.visualization import make_meshcat, show_motions
-from vtbdrake_diagrams.space_climber.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
+from vtbdrake_diagrams.space_climber.studies.payload import HORIZON, MASS, PAPER, PHASES, payload_problem, statics
 
 OUT = Path("out")
 

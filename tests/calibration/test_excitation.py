@@ -12,7 +12,7 @@ from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, Series
 from vtbdrake.spline import Spline
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
-from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 
 PAYLOAD, DISTURBANCE = "sim.sys.arm.tool.mass", 0.05
 NOISE = Noise(np.full(JOINTS, 1e-5), np.full(JOINTS, DISTURBANCE), 0.05)

@@ -24,7 +24,7 @@ from vtbdrake.recording.replay import replay
 from vtbdrake.state import Quantity
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.pick_up import STIFFNESS, Load, arm_loop, pick_up, reasoner, watched
+from vtbdrake_diagrams.manipulator.studies.pick_up import STIFFNESS, Load, arm_loop, pick_up, reasoner, watched
 
 pytestmark = pytest.mark.one_python
 

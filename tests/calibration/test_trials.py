@@ -12,7 +12,7 @@ from vtbdrake.calibration import CalibrationError, Inertia, JointModel, JointRec
 from vtbdrake.machine import MachineConfig
 from vtbdrake.optimization import Parameter
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
-from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 
 SCENARIO = ExcitedArmScenario(knots=11, duration=1.0)
 POSITION, TORQUE, DELAY = "joint_position", "joint_torque", "sim.act.drives.delay"

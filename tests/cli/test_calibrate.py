@@ -70,7 +70,7 @@ def test_self_test_prints_errors_and_coverage() -> None:
     knots = np.tile(Arm().home, (11, 1))
     knots[3:-3] += 0.15 * np.array([[1.0], [-1.0], [0.5], [1.0], [-1.0]])
     program = run(
-        *("calibrate", "vtbdrake_diagrams.manipulator.excited:ExcitedArmScenario", "--self-test", "--json"),
+        *("calibrate", "vtbdrake_diagrams.manipulator.studies.excited:ExcitedArmScenario", "--self-test", "--json"),
         *("--field", "knots=11", "--field", "duration=1.0", "--set", f"u.plan={[0.001, *knots.ravel().tolist()]}"),
         *("--position", "joint_position", "--torque", "joint_torque", "--vary", "sim.sys.arm.tool.mass=0.2:1.5"),
         *("--trials", 2, "--seconds", 1.5, "--disturbance", 0.02, "--seed", 3),

@@ -14,7 +14,7 @@ from vtbdrake.rollout import RolloutTask, SerialExecutor
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.excited import ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.excited import ExcitedArmScenario
 
 MASS, RATE = "sim.sys.arm.tool.mass", "sim.sys.pendulum.elbow.velocity"
 DISCRETE = MultibodyPlantConfig(time_step=0.002, discrete_contact_approximation="sap")

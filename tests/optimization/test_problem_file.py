@@ -10,7 +10,7 @@ import jsonschema
 import pytest
 import yaml
 
-import vtbdrake_diagrams.space_climber
+import vtbdrake_diagrams.space_climber.studies
 from tests.cli.program import ANGLE, DAMPING, RATE, error_of, run
 from tests.testbeds import PendulumScenario
 from vtbdrake import Choice, Constraint, CVaR, Parameter, Problem, Quality, Study
@@ -19,7 +19,7 @@ from vtbdrake.optimization.identity import describe
 from vtbdrake.rollout.named_function import largest, magnitude
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
-GAIT = Path(vtbdrake_diagrams.space_climber.__path__[0]) / "gait.yaml"
+GAIT = Path(vtbdrake_diagrams.space_climber.studies.__path__[0]) / "gait.yaml"
 FULL = f"""
 scenario: tests.testbeds:PendulumScenario
 parameters:

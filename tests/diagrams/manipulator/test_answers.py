@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vtbdrake_diagrams.manipulator.answers import COMPARED, Trials
-from vtbdrake_diagrams.manipulator.trials import FREE, Track
+from vtbdrake_diagrams.manipulator.studies.answers import COMPARED, Trials
+from vtbdrake_diagrams.manipulator.studies.trials import FREE, Track
 
 pytestmark = pytest.mark.one_python
 

@@ -10,7 +10,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.motions import Motion
-from vtbdrake_diagrams.manipulator.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
+from vtbdrake_diagrams.manipulator.studies.trials import DURATIONS, LawAlongX, Track, run_trial, trial_scenario
 
 SCENARIO = trial_scenario("admittance")
 

@@ -11,8 +11,9 @@ from click.testing import CliRunner
 
 from vtbdrake.optimization import Problem
 from vtbdrake.rollout import RolloutRunner
-from vtbdrake_diagrams.space_climber import CraterScenario, crater
-from vtbdrake_diagrams.space_climber.crater import (
+from vtbdrake_diagrams.space_climber import CraterScenario
+from vtbdrake_diagrams.space_climber.studies import crater
+from vtbdrake_diagrams.space_climber.studies.crater import (
     CAUTION,
     COUNTERFACTUALS,
     FRICTION_RANGE,

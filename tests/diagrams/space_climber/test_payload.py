@@ -8,7 +8,7 @@ from scipy.optimize import linprog
 from vtbdrake.testbed import ScenarioError, load_scenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
-from vtbdrake_diagrams.space_climber.payload import (
+from vtbdrake_diagrams.space_climber.studies.payload import (
     MASS,
     locked_problem,
     payload_problem,

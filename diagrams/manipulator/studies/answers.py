@@ -18,7 +18,15 @@ from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake_diagrams.answers import Answer
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
-from vtbdrake_diagrams.manipulator.trials import DURATIONS, PROGRAM, Track, Trial, rms, run_trial, trial_scenario
+from vtbdrake_diagrams.manipulator.studies.trials import (
+    DURATIONS,
+    PROGRAM,
+    Track,
+    Trial,
+    rms,
+    run_trial,
+    trial_scenario,
+)
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
 

@@ -1,6 +1,6 @@
 """Count how often the arm is said to leave the validity domain of its model: in the same motions, and in others.
 
-``python -m vtbdrake_diagrams.manipulator.validity`` prints the table of docs/calibration.md.
+``python -m vtbdrake_diagrams.manipulator.studies.validity`` prints the table of docs/calibration.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The arm picks up an unknown load: an alarm, a calibration beside the loop, and decisions with the new model.
 
-``python -m vtbdrake_diagrams.manipulator.pick_up`` prints the table of docs/calibration.md.
+``python -m vtbdrake_diagrams.manipulator.studies.pick_up`` prints the table of docs/calibration.md.
 """
 
 from __future__ import annotations

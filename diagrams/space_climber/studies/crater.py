@@ -8,8 +8,8 @@ Friction decides which slope is too steep. The robot knows a range of it, and re
 that only headings count as passable which are so for all of the range. Among boulders, a decimetre can make the
 difference; so each heading can be tried from several samples of the belief, of which the worst counts.
 
-``python -m vtbdrake_diagrams.space_climber.crater`` draws h over a fine grid of headings (Figure 6), and compares a
-continuous search with it.
+``python -m vtbdrake_diagrams.space_climber.studies.crater`` draws h over a fine grid of headings (Figure 6), and
+compares a continuous search with it.
 """
 
 from __future__ import annotations
@@ -311,6 +311,6 @@ def main(seed: int, step: float, candidates: int, horizon: float, figure: str) -
 
 if __name__ == "__main__":
     # Under its own name, so that worker processes find its functions.
-    from vtbdrake_diagrams.space_climber.crater import main as program
+    from vtbdrake_diagrams.space_climber.studies.crater import main as program
 
-    program(prog_name="python -m vtbdrake_diagrams.space_climber.crater")
+    program(prog_name="python -m vtbdrake_diagrams.space_climber.studies.crater")

@@ -1,7 +1,7 @@
 """Self-test of the arm's calibration: payload, friction, reflected inertia and delay of machines, hidden from it.
 
-``python -m vtbdrake_diagrams.manipulator.self_test`` prints it. The motion is that of `excitation`; the encoders have a
-resolution, and torques that no log contains act on the joints.
+``python -m vtbdrake_diagrams.manipulator.studies.self_test`` prints it. The motion is that of `excitation`; the
+encoders have a resolution, and torques that no log contains act on the joints.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vtbdrake.machine import MachineConfig
 from vtbdrake.optimization import Parameter
 from vtbdrake.state.variables import text_table
 from vtbdrake_diagrams.manipulator.arm import JOINTS
-from vtbdrake_diagrams.manipulator.excited import PLAN, ExcitedArmScenario
+from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 
 POSITION, TORQUE = "joint_position", "joint_torque"
 PAYLOAD, DELAY = "sim.sys.arm.tool.mass", "sim.act.drives.delay"

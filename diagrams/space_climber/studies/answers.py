@@ -8,8 +8,8 @@ import numpy as np
 
 from vtbdrake.optimization import Boundary
 from vtbdrake_diagrams.answers import Answer
-from vtbdrake_diagrams.space_climber import crater
-from vtbdrake_diagrams.space_climber.payload import (
+from vtbdrake_diagrams.space_climber.studies import crater
+from vtbdrake_diagrams.space_climber.studies.payload import (
     EARTH,
     ENVIRONMENTS,
     MOON,
