@@ -1,4 +1,4 @@
-"""The type of arrays of floats, and immutable values that hold arrays."""
+"""The types of arrays of floats and of indices, and immutable values that hold arrays."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 _Class = TypeVar("_Class", bound=type)
 

@@ -21,19 +21,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse import eye as sparse_eye
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, rotations, transform, wrap
 from vtbdrake.settings import check_settings, setting
-
-Indices = NDArray[np.int64]
 
 # The gates of the association in m, one for each round: as long as the poses are uncertain, they are wide.
 _GATES = (2.5, 2.0, 1.5, 1.5, 1.2, 1.2)
@@ -157,7 +155,7 @@ def survey(
     noise = np.array([drift.covariance(m, t) for m, t in zip(motions, np.diff(times), strict=True)])
     motion_whitening = np.linalg.inv(np.linalg.cholesky(noise + np.diag(_LEAST_MOTION**2)))
     poses = _laid_onto(times, reckoned, fixes)
-    n, marks, pairs = len(times), np.zeros((0, 2)), np.zeros((0, 3), dtype=np.int64)
+    n, marks, pairs = len(times), np.zeros((0, 2)), np.zeros((0, 3), dtype=np.intp)
     detections = np.concatenate([scan.positions for scan in scans])
     first = np.cumsum([0, *(len(scan) for scan in scans)])
     spread = np.concatenate([scan.covariances for scan in scans]) + _AXIS**2 * np.eye(2)
@@ -219,7 +217,7 @@ def _associated(poses: Array, scans: Sequence[Landmarks], gate: float, fewest: i
             pairs.append((i, int(j), nearest))
     is_tree = counts[:size] >= fewest
     number = np.cumsum(is_tree) - 1
-    rows = np.array([(i, j, number[k]) for i, j, k in pairs if is_tree[k]], dtype=np.int64).reshape(-1, 3)
+    rows = np.array([(i, j, number[k]) for i, j, k in pairs if is_tree[k]], dtype=np.intp).reshape(-1, 3)
     return places[:size][is_tree], rows
 
 

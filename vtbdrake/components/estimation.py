@@ -10,13 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 
-Indices = NDArray[np.intp]
 Numbers = TypeVar("Numbers", float, Array)
 
 

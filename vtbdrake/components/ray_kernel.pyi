@@ -1,11 +1,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Indices = NDArray[np.intp]
+from vtbdrake.arrays import Array, Indices
 
-def to_world(directions_L: Doubles, times: Doubles, motion_WL: Doubles) -> tuple[Doubles, Doubles]:
+Singles = NDArray[np.float32]
+
+def to_world(directions_L: Array, times: Array, motion_WL: Array) -> tuple[Array, Array]:
     """Return the origins (m) and directions in W of rays from the origin of L, shapes (n, 3).
 
     Args:
@@ -15,12 +15,12 @@ def to_world(directions_L: Doubles, times: Doubles, motion_WL: Doubles) -> tuple
     """
 
 def to_body(
-    origins_W: Doubles,
-    directions_W: Doubles,
-    times: Doubles,
-    motion_WB: Doubles,
-    bounds_B: Doubles,
-    nearest: Doubles,
+    origins_W: Array,
+    directions_W: Array,
+    times: Array,
+    motion_WB: Array,
+    bounds_B: Array,
+    nearest: Array,
 ) -> tuple[Singles, Singles, Singles, Indices]:
     """Return origins, directions, largest distances and indices of the rays that may hit the geometry of B, in B.
 
@@ -41,8 +41,8 @@ def keep_nearest(
     rays: Indices,
     body: int,
     *,
-    nearest: Doubles,
-    cosines: Doubles,
+    nearest: Array,
+    cosines: Array,
     bodies: NDArray[np.int32],
 ) -> None:
     """Write the hits of ``body`` that are nearer than ``nearest`` to the last three arrays.

@@ -18,12 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import transform
-
-Indices = NDArray[np.int64]
 
 # Hypotheses that are tried in the association of a scan.
 _HYPOTHESES = 40
@@ -56,7 +54,7 @@ class MatchedPairs(NamedTuple):
     @classmethod
     def none(cls) -> MatchedPairs:
         """Return no matches."""
-        return cls(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+        return cls(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0))
 
     def select(self, mask: NDArray[np.bool_]) -> MatchedPairs:
         """Return the matches for which a mask (k,) is true."""
@@ -123,7 +121,7 @@ class Association:
         gate = chi_square_quantile(self.gate, 2)
         around = self._tree.query_ball_point(places, np.sqrt(gate * (spread + self.variances.max())))
         rows = np.repeat(np.arange(len(places)), [len(neighbours) for neighbours in around])
-        near = np.concatenate([*around, []]).astype(np.int64)
+        near = np.concatenate([*around, []]).astype(np.intp)
         squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
         return self.usable[np.unique(near[squares <= gate * (spread[rows] + self.variances[near])])]
 

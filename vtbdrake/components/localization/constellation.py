@@ -40,15 +40,12 @@ from dataclasses import dataclass
 from math import inf, log, pi
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.arrays import Array, Indices, immutable
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
 from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
-
-Indices = NDArray[np.intp]
 
 # Standard deviation in m that is added to those of diameters: assumed, for bark.
 _DIAMETER_FLOOR = 0.01

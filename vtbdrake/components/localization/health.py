@@ -26,15 +26,12 @@ pose is multiplied by the ratio of T to the quantile (the ratio of Birge, Physic
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.track_state import TrackState
-
-Indices = NDArray[np.int64]
 
 # A scan fails if it matches a smaller share of its detections, or of the landmarks that should be seen again.
 _LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.localization.ground import fit_ground
 from vtbdrake.components.localization.planar import wrap
 from vtbdrake.settings import check_settings, setting
-
-Indices = NDArray[np.intp]
 
 # An edge of a cluster is hidden if more than this share of its points are in rows that end at something nearer.
 _HIDDEN = 0.25

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array, immutable
-
-Indices = NDArray[np.int64]
+from vtbdrake.arrays import Array, Indices, immutable
 
 BIAS, ODOMETRY, RATE = 3, 4, 5
 """The places of b, e and g in x."""
@@ -50,7 +48,7 @@ class TrackState:
     @classmethod
     def none(cls) -> TrackState:
         """Return the state in which nothing is tracked."""
-        return cls(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool))
+        return cls(np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool))
 
     def with_arrays(self, **arrays: Any) -> TrackState:
         """Return the state with other arrays, which are not copied and are read-only from now on."""

@@ -43,10 +43,10 @@ from dataclasses import dataclass, field, replace
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization import health
 from vtbdrake.components.localization.association import Association, ExpectedDetections, MatchedPairs
@@ -54,8 +54,6 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState
 from vtbdrake.settings import check_settings, setting
-
-Indices = NDArray[np.int64]
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
 _OBSERVED = 4
@@ -79,7 +77,7 @@ class Matches:
     is_fused: bool = False
 
 
-_NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.int64))
+_NO_MATCHES = Matches(np.zeros((0, 2), dtype=np.intp))
 
 
 @dataclass(frozen=True, eq=False)

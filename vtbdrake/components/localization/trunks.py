@@ -27,13 +27,11 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations, wrap
 from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
 from vtbdrake.settings import setting
-
-Indices = NDArray[np.intp]
 
 # The number of layers of the slice, one bit each.
 _LAYERS = 8

@@ -12,12 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.arrays import Array, Indices
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.objects import STATUSES, Quantity, Relation, WorldObject
 from vtbdrake.state.declarations import Codec
-
-Rows = NDArray[np.intp]
 
 # What is nearer to the outline of a polygon than this, in m, lies on it.
 _ON_OUTLINE = 1e-9
@@ -175,7 +173,7 @@ class WorldModel:
         left = [world_object for world_object in self if world_object.identity not in gone]
         return WorldModel((_cut(world_object, gone) for world_object in left), created=self.created)
 
-    def _near(self, point: ArrayLike, distance: float) -> Rows:
+    def _near(self, point: ArrayLike, distance: float) -> Indices:
         """Return the objects within a distance of a point, by row."""
         size = np.size(point)
         if size not in (2, 3) or not distance >= 0.0:
