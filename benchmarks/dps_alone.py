@@ -57,7 +57,7 @@ def _measure(url: str, snapshot: Path, *, repeats: int, lock: bool) -> tuple[np.
     options = ["--url", url, "--snapshot", str(snapshot), "--priority", "0", "--no-live"]
     commands = (
         [sys.executable, "-m", "vtbdrake.cli", "run", SCENARIO, *options, *([] if lock else ["--no-lock-memory"])],
-        [sys.executable, "-m", "benchmarks.whole_testbed", SCENARIO, url, str(snapshot), *(["lock"] if lock else [])],
+        [sys.executable, "-m", "benchmarks.whole_testbed", SCENARIO, url, str(snapshot), *(["--lock"] if lock else [])],
     )
     rows: tuple[list[tuple[float, float]], ...] = ([], [])
     for i in range(repeats + 1):

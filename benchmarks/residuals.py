@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
+
+import click
 
 from benchmarks.loop_rig import PERIOD
 from benchmarks.measure import LOWER, Benchmark, seconds
@@ -125,6 +126,13 @@ def arm_loop(*, seed: int, mass: float | None = None) -> Iterator[Runtime]:
             bridge.close()
 
 
+@click.command()
+@click.argument("duration", default=10.0)
+def main(duration: float) -> None:
+    """Print the benchmark with DURATION seconds of nominal operation."""
+    for row in payload_alarm(duration):
+        click.echo(f"{row.name}: {row.value:g} {row.unit}, against {row.against}\n    {row.note}")
+
+
 if __name__ == "__main__":
-    for row in payload_alarm(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0):
-        print(f"{row.name}: {row.value:g} {row.unit}, against {row.against}\n    {row.note}")
+    main()

@@ -5,16 +5,15 @@ With ``--page FILE`` it also writes the page of the documentation; other argumen
 
 from __future__ import annotations
 
-import argparse
 import ast
 import inspect
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 
 FOLDER = Path(__file__).resolve().parent
@@ -139,26 +138,26 @@ def _lines_of_page(case: Case) -> Iterator[str]:
         yield f"| {variant or '-'} | {quantity} | {error:.1e} | {tolerance:.1e} | {unit} |"
 
 
-def main(arguments: list[str]) -> int:
-    """Run the cases, print the table, and return pytest's exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.verification", description=__doc__)
-    parser.add_argument("--page", type=Path, help="also write this page of the documentation")
-    options, rest = parser.parse_known_args(arguments)
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.option("--page", type=click.Path(path_type=Path), help="Also write this page of the documentation.")
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def main(page: Path | None, arguments: tuple[str, ...]) -> None:
+    """Run the cases, print what each has verified, and exit as pytest does, whose ARGUMENTS are the others."""
     table: Any = Table()
     begin = time.perf_counter()
-    code = pytest.main([*(str(FOLDER / f"{module}.py") for module in MODULES), "-q", *rest], plugins=[table])
-    print("\n".join(table.lines()))
-    print(
+    code = pytest.main([*(str(FOLDER / f"{module}.py") for module in MODULES), "-q", *arguments], plugins=[table])
+    click.echo("\n".join(table.lines()))
+    click.echo(
         f"\n{sum(len(c.rows) for g in table.groups.values() for c in g.values())} comparisons in "
         f"{time.perf_counter() - begin:.0f} s"
     )
-    if options.page and code == pytest.ExitCode.OK:
+    if page and code == pytest.ExitCode.OK:
         missing = [c.title for g in table.groups.values() for c in g.values() if "Reference:" in c.text and not c.rows]
         if missing:
-            parser.error(f"the page describes all cases, but these were not run: {'; '.join(missing)}")
-        options.page.write_text(table.page(), "utf-8")
-    return int(code)
+            raise click.UsageError(f"the page describes all cases, but these were not run: {'; '.join(missing)}")
+        page.write_text(table.page(), "utf-8")
+    raise SystemExit(int(code))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(prog_name="python -m tests.verification")
