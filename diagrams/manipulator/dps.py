@@ -16,7 +16,7 @@ from vtbdrake.testbed.hand import HAND_SIZE
 from vtbdrake_diagrams.manipulator import leading
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function
-from vtbdrake_diagrams.manipulator.laws import LAWS, Declared
+from vtbdrake_diagrams.manipulator.laws import LAWS, Declared, Instant
 from vtbdrake_diagrams.manipulator.motions import Motion, parameters, reference
 
 # Name -> (initial value, unit). Other systems need the first one.
@@ -208,7 +208,7 @@ def _make_impl(
     x = _symbols(state)
     hand = casadi.SX.sym("hand", HAND_SIZE) if led_by_hand else None
     r = reference(command, q, x, p, period=period, hand=hand, model=model)
-    torque, remembered = control_law.torque(model, q, v, wrench, r, x, p, period)
+    torque, remembered = control_law.torque(Instant(model, q, v, wrench, r, x, p, period))
     reach = period * p["torque_rate"]
     torque = clamp(torque, x["torque"] - reach, x["torque"] + reach)
     following = {"torque": torque, **r.state, **remembered}

@@ -58,18 +58,41 @@ _NULL_SPACE: Declared = {
 
 
 @dataclass(frozen=True)
+class Instant:
+    """The arguments of a `Law` at one instant.
+
+    Attributes:
+        model: The arm that the controller assumes.
+        q, v: The measured joint positions and velocities.
+        wrench: The wrench of the environment on the tip.
+        reference: The reference of the motion.
+        state: What the law remembers, and the joint ``reference`` of the last instant.
+        parameters: The gains of the law and of the motion.
+        period: The sample period in s.
+    """
+
+    model: ArmDynamics
+    q: Expression
+    v: Expression
+    wrench: Expression
+    reference: Reference
+    state: dict[str, Expression]
+    parameters: dict[str, Expression]
+    period: float
+
+
+@dataclass(frozen=True)
 class Law:
     """A control law.
 
     Attributes:
         parameters: Value, unit and bounds of its gains.
         state: Initial value and unit of what it remembers beside the motion.
-        torque: (ArmDynamics, q, v, wrench, Reference, state, parameters, period) -> torque, next state. The state has
-            the joint ``reference`` of the last instant.
+        torque: Returns the torque and the next state.
     """
 
     parameters: Declared
-    torque: Callable[..., tuple[Expression, dict[str, Expression]]]
+    torque: Callable[[Instant], tuple[Expression, dict[str, Expression]]]
     state: dict[str, tuple[object, str]] = field(default_factory=dict)
 
 
@@ -101,19 +124,10 @@ def _linear(value: Expression) -> Expression:
     return casadi.vertcat(casadi.SX.zeros(3), value)
 
 
-def _joint_impedance(
-    model: ArmDynamics,
-    q: Expression,
-    v: Expression,
-    wrench: Expression,
-    r: Reference,
-    state: dict[str, Expression],
-    p: dict[str, Expression],
-    period: float,
-) -> tuple[Expression, dict[str, Expression]]:
+def _joint_impedance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
     # Cartesian motions become joint motions by closed-loop inverse kinematics, from where the reference is. Without the
     # pull to the home pose, an arm with a joint to spare ends each circle in another posture, in the end at its stops.
-    last = state["reference"]
+    model, r, p, last = now.model, now.reference, now.parameters, now.state["reference"]
     start, tip = model.tip(r.q), model.tip(last)
     least = _Projection(tip.J)
     error = _pose_error(tip.R, tip.p, start.R, start.p + r.dp)
@@ -123,15 +137,14 @@ def _joint_impedance(
     q_r = casadi.if_else(r.in_joints, r.q, last)
     v_r = casadi.if_else(r.in_joints, r.v, v_c)
     a_r = casadi.if_else(r.in_joints, r.a, a_c)
-    tau = p["stiffness"] * (q_r - q) + p["damping"] * (v_r - v) + model.inverse_dynamics(q, v, a_r)
-    following = casadi.if_else(r.in_joints, r.q, last + period * v_c)
+    tau = p["stiffness"] * (q_r - now.q) + p["damping"] * (v_r - now.v) + model.inverse_dynamics(now.q, now.v, a_r)
+    following = casadi.if_else(r.in_joints, r.q, last + now.period * v_c)
     return tau, {"reference": following}
 
 
-def _cartesian(
-    model: ArmDynamics, q: Expression, v: Expression, r: Reference
-) -> tuple[FrameMotion, _Projection, Expression, Expression, Expression, Expression]:
+def _cartesian(now: Instant) -> tuple[FrameMotion, _Projection, Expression, Expression, Expression, Expression]:
     """Return the tip, its projection and bias, and e, V_r - J v and A_r for the reference."""
+    model, q, v, r = now.model, now.q, now.v, now.reference
     tip, goal = model.tip(q), model.tip(r.q)
     error = _pose_error(tip.R, tip.p, goal.R, goal.p + r.dp)
     V_r = goal.J @ r.v + _linear(r.dv)
@@ -139,48 +152,33 @@ def _cartesian(
     return tip, _Projection(tip.J), model.tip_bias(q, v), error, V_r - tip.J @ v, A_r
 
 
-def _posture(q: Expression, v: Expression, r: Reference, p: dict[str, Expression]) -> Expression:
-    return p["posture_stiffness"] * (r.q - q) + p["posture_damping"] * (r.v - v)
+def _posture(now: Instant) -> Expression:
+    r, p = now.reference, now.parameters
+    return p["posture_stiffness"] * (r.q - now.q) + p["posture_damping"] * (r.v - now.v)
 
 
-def _cartesian_impedance(
-    model: ArmDynamics,
-    q: Expression,
-    v: Expression,
-    wrench: Expression,
-    r: Reference,
-    state: dict[str, Expression],
-    p: dict[str, Expression],
-    period: float,
-) -> tuple[Expression, dict[str, Expression]]:
-    tip, least, bias, error, speed_error, A_r = _cartesian(model, q, v, r)
-    tau = tip.J.T @ (p["stiffness"] * error + p["damping"] * speed_error) + least.null(_posture(q, v, r, p))
-    tau += model.inverse_dynamics(q, v, least.inverse(A_r - bias))
-    return tau, {"reference": r.q}
+def _cartesian_impedance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
+    p = now.parameters
+    tip, least, bias, error, speed_error, A_r = _cartesian(now)
+    tau = tip.J.T @ (p["stiffness"] * error + p["damping"] * speed_error) + least.null(_posture(now))
+    tau += now.model.inverse_dynamics(now.q, now.v, least.inverse(A_r - bias))
+    return tau, {"reference": now.reference.q}
 
 
-def _admittance(
-    model: ArmDynamics,
-    q: Expression,
-    v: Expression,
-    wrench: Expression,
-    r: Reference,
-    state: dict[str, Expression],
-    p: dict[str, Expression],
-    period: float,
-) -> tuple[Expression, dict[str, Expression]]:
+def _admittance(now: Instant) -> tuple[Expression, dict[str, Expression]]:
     # The implicit midpoint rule, entry by entry: exact in statics, and of second order.
-    x, rate = state["offset"], state["offset_rate"]
-    M, D, K, h = p["inertia"], p["damping"], p["stiffness"], period
+    r, p, wrench, h = now.reference, now.parameters, now.wrench, now.period
+    x, rate = now.state["offset"], now.state["offset_rate"]
+    M, D, K = p["inertia"], p["damping"], p["stiffness"]
     next_rate = ((M - h / 2 * D - h**2 / 4 * K) * rate + h * (wrench - K * x)) / (M + h / 2 * D + h**2 / 4 * K)
     next_rate = (1 - r.following) * next_rate
     next_x = (1 - r.following) * (x + h / 2 * (rate + next_rate))
     yielding = (next_rate - rate) / h
 
-    tip, least, bias, error, speed_error, A_r = _cartesian(model, q, v, r)
+    tip, least, bias, error, speed_error, A_r = _cartesian(now)
     pull = p["tracking_stiffness"] * (error + x) + p["tracking_damping"] * (speed_error + rate)
-    a = least.inverse(A_r + yielding + (1 - r.following) * pull - bias) + least.null(_posture(q, v, r, p))
-    tau = model.inverse_dynamics(q, v, a) - (1 - r.following) * tip.J.T @ wrench
+    a = least.inverse(A_r + yielding + (1 - r.following) * pull - bias) + least.null(_posture(now))
+    tau = now.model.inverse_dynamics(now.q, now.v, a) - (1 - r.following) * tip.J.T @ wrench
     return tau, {"reference": r.q, "offset": next_x, "offset_rate": next_rate}
 
 
