@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vtbdrake.compiled import UnsupportedTestbedError
+from vtbdrake.compiled.trace import traced
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.reasoning import Budget, SearchConfig
@@ -91,6 +92,16 @@ def test_fields_of_the_scenario_are_compiled_for_themselves() -> None:
     task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
     rollouts = [{**point, "scenario.period": period} for point, period in zip(points(4), 2 * [0.02, 0.05], strict=True)]
     assert_same(outcomes(task, rollouts, CompiledExecutor(compile=False)), outcomes(task, rollouts, SerialExecutor()))
+
+
+def test_no_points_have_no_results() -> None:
+    with CompiledExecutor(compile=False) as executor:
+        assert list(executor.run(RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state")), [])) == []
+
+
+def test_a_function_of_what_is_no_number_is_not_compiled() -> None:
+    for argument in ("word", object(), [np.zeros(2), np.zeros(3)]):
+        assert traced(lambda value: 1.0, [argument]) is None
 
 
 def test_begins_at_starts() -> None:

@@ -27,8 +27,8 @@ def traced(f: Callable[..., Any], arguments: Sequence[Any]) -> casadi.Function |
     """
     if isinstance(f, casadi.Function):
         return f
-    symbols = [casadi.SX.sym(f"a{k}", int(np.size(a))) for k, a in enumerate(arguments)]
     try:
+        symbols = [casadi.SX.sym(f"a{k}", int(np.size(a))) for k, a in enumerate(arguments)]
         with warnings.catch_warnings():  # CasADi announces another behaviour of numpy's functions.
             warnings.simplefilter("ignore")
             value = f(*(_symbolic(s, a) for s, a in zip(symbols, arguments, strict=True)))

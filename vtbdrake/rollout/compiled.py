@@ -314,7 +314,7 @@ class _CompiledTask:
 
 def _by_fields(points: Sequence[Parameters]) -> list[list[int]]:
     """Return the numbers of the points, in groups with the same values of the scenario's fields."""
-    if not any(address.startswith(FIELD) for address in frozenset().union(*points)):
+    if points and not any(address.startswith(FIELD) for address in frozenset().union(*points)):
         return [list(range(len(points)))]
     groups: dict[Hashable, list[int]] = {}
     for i, point in enumerate(points):
