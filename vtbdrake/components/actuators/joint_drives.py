@@ -106,7 +106,8 @@ class JointDrives(AddressedSystem):
         entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in by_joint.items()}
         self.max_delay = max(int(delay), int(max_delay))
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
-        self.period, self._n = float(period), n  # sample period T in seconds
+        self.period: float = float(period)  # sample period T in seconds
+        self._n = n
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))

@@ -176,7 +176,7 @@ class Camera(AddressedSystem):
             raise ValueError("Camera: the plant has no geometry; register it with a SceneGraph")
         info = info or CameraInfo(320, 240, np.pi / 4)
         self._width, self._height = info.width(), info.height()
-        self.period = float(period)  # time between two images in seconds
+        self.period: float = float(period)  # time between two images in seconds
         self._stream = random_stream(self, stream)
         self._clipping_near, self._clipping_far = float(clipping_near), float(clipping_far)
         self._depth_range = float(depth_range[0]), float(depth_range[1])

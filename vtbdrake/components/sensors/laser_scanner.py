@@ -211,7 +211,7 @@ class LaserScanner(AddressedSystem):
             if getattr(errors, name):
                 raise ValueError(f"LaserScanner: scans have no {name}; leave it out of the errors")
         self._caster, self._body = caster, int(frame.body().index())
-        self.slice_period = float(slice_period)  # length of a slice in seconds
+        self.slice_period: float = float(slice_period)  # length of a slice in seconds
         self._stream = random_stream(self, stream)
         self._poses_port = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self._velocities_port = self.DeclareAbstractInputPort("body_spatial_velocities", Value[list[SpatialVelocity]]())

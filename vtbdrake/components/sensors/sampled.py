@@ -59,7 +59,7 @@ class SampledSensor(AddressedSystem):
         noise = noise or {}
         if not period > 0:
             raise ValueError(f"{type(self).__name__}: period is {period} s, but must be positive.")
-        self.period = float(period)  # time between two samples in seconds
+        self.period: float = float(period)  # time between two samples in seconds
         y0 = np.asarray(default, dtype=float)
         reading = self.declare_discrete_state(**{signal: Quantity(y0, unit)})
         self._output = int(reading.index)

@@ -59,7 +59,7 @@ class WorldModel:
                 if relation.other not in self._objects:
                     statement = f"{world_object.identity} {relation.kind} {relation.other!r}"
                     raise ValueError(f"{statement}, which is not an object of the model")
-        self.created = created
+        self.created: int = created
         self._index: _Index | None = None
 
     def __len__(self) -> int:
