@@ -11,16 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.spatial
+from pydrake.systems.framework import Context, System
 
 import vtbdrake as vtb
-from tests.monitoring.residuals.line import Together
-from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
+from tests.monitoring.residuals.line import Line, Together, loop
+from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
 from tests.reasoning.scenarios import MassScenario
 from vtbdrake.calibration import ValidityDomain, ValidityDomainError
 from vtbdrake.monitoring import DomainMonitor
 from vtbdrake.recording import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.rollout import RolloutRunner, RolloutTask
+from vtbdrake.testbed import DpsAlone
 from vtbdrake.validity_domain import DomainWatch
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 
@@ -208,6 +210,47 @@ def test_rollout_and_loop_say_that_they_leave_the_domain(caplog: pytest.LogCaptu
         assert (again is None) == (monitor.departure is None)
         if again is not None and monitor.departure is not None:
             assert again.feature == monitor.departure.feature
+
+
+class Faulty(Rhythm):
+    """Fails for half a second from 2 s on: it raises, or commands NaN."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__(PERIOD)
+        self._fault = fault
+
+    def _update(self, context: Context, discrete: Any) -> None:
+        super()._update(context, discrete)
+        if 1.95 < context.get_time() < 2.45:
+            if self._fault == "raises":
+                raise RuntimeError("a lost thread")
+            self._command.mutable(discrete).torque = np.nan
+
+
+@dataclass
+class FaultyPendulum(DrivenPendulum):
+    fault: str = "raises"
+
+    def make_dps(self) -> System:
+        return Faulty(self.fault)
+
+
+# The cycle that first fails is that at 2.0 s, cycle 30; a DPS that raises stays where it was.
+@pytest.mark.parametrize(("fault", "windows"), [("raises", 10), ("commands NaN", 25)])
+def test_monitor_reads_once_per_window_unless_the_dps_is_idle_or_raises(fault: str, windows: int) -> None:
+    times, generator = PERIOD * np.arange(150), np.random.default_rng(11)
+    records = ({"dps.seen": generator.normal(size=(150, 2)), "dps.torque": generator.normal(size=150)} for _ in "abc")
+    domain = ValidityDomain.of([Motion(times, record) for record in records], FEATURES, window=2.0 * PERIOD)
+    scenario = FaultyPendulum(fault=fault)
+    runtime = loop(DpsAlone(scenario), Line(scenario, machine(scenario)), PERIOD, begin=False)
+    with DomainMonitor(runtime, domain) as monitor:
+        for cycle in range(60):
+            if cycle == 10:
+                assert monitor.windows == 0
+                runtime.start_dps()
+            runtime.clock.wait_until(runtime.clock.now() + PERIOD)
+            runtime.cycle()
+    assert monitor.windows == windows
 
 
 def test_decision_says_that_its_plan_leaves_the_domain() -> None:

@@ -112,6 +112,15 @@ class Watcher(AddressedSystem):
         self.DeclareStateOutputPort("wsg_position", opening.index)
 
 
+@pytest.mark.one_python
+def test_loop_is_paced_by_what_every_dps_gets() -> None:
+    # Its DPS reads images alone: of the arm and of the gripper, it has only what take-over and fallbacks need.
+    scenario = vtb.Station(f"{FILE}#Torque", dps=Watcher)
+    deployment, sensed = vtb.Deployment.of(scenario), {signal.name for signal in scenario.interface().sense}
+    assert deployment.pace == "iiwa_position_measured" and deployment.pace in sensed
+    assert set(deployment.guards["max_delay"]) == {deployment.pace, "wsg_position_measured"} < sensed
+
+
 def test_images_come_from_drakes_camera_as_from_the_simulated_one() -> None:
     scenario = vtb.Station(f"{FILE}#Torque", dps=Watcher)
     deployment = vtb.Deployment.of(scenario).in_lock_step("iiwa_position_measured")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydrake.systems.primitives import ConstantVectorSource
@@ -12,19 +15,47 @@ from vtbdrake.control.fallback import gravity_compensation
 from vtbdrake_diagrams.station import FILE, ArmStation, JointControl
 
 
-def test_gravity_of_the_arm_is_that_of_drakes_driver() -> None:
+def gravity(file: Path) -> np.ndarray:
+    """Return the torques (10, 7) with which Drake's driver carries the arm, compared with those of its model."""
     urls = {"iiwa": "memq://null", "wsg": "memq://wsg"}
-    sim = hardware_sim_loop.build(FILE, "Torque", urls=urls, sources={"torque": ConstantVectorSource(np.zeros(7))})
+    sim = hardware_sim_loop.build(file, "Torque", urls=urls, sources={"torque": ConstantVectorSource(np.zeros(7))})
     context = sim.simulator.get_mutable_context()
     plant_context = sim.plant.GetMyMutableContextFromRoot(context)
     driver = sim.simulator.get_system().GetSubsystemByName("iiwa")
     arm, commanded = sim.plant.GetModelInstanceByName("iiwa"), driver.GetOutputPort("torque_commanded")
-    weight = gravity_compensation(ArmStation().arm_model("iiwa"))
+    weight = gravity_compensation(ArmStation(f"{file}#Torque").arm_model("iiwa"))
+    expected = []
     for q in np.random.default_rng(5).uniform(-1.5, 1.5, (10, 7)):
         sim.plant.SetPositions(plant_context, arm, q)
-        expected = commanded.Eval(driver.GetMyContextFromRoot(context))
-        np.testing.assert_allclose(weight(q), expected, atol=1e-9)
-    assert np.abs(expected).max() > 5.0
+        expected.append(commanded.Eval(driver.GetMyContextFromRoot(context)))
+        np.testing.assert_allclose(weight(q), expected[-1], atol=1e-9)
+    return np.array(expected)
+
+
+def test_gravity_of_the_arm_is_that_of_drakes_driver(tmp_path: Path) -> None:
+    alone = gravity(FILE)
+    assert np.abs(alone).max() > 5.0
+    # A block that is welded to the forearm, and one to the base.
+    welded = "".join(
+        f"""
+  - add_model: {{ name: {name}, file: package://vtbdrake_station/models/block.sdf }}
+  - add_weld: {{ parent: "iiwa::{link}", child: "{name}::block", X_PC: {{ translation: [0.1, 0.2, 0] }} }}"""
+        for name, link in (("tool", "iiwa_link_4"), ("box", "iiwa_link_0"))
+    )
+    text = FILE.read_text()
+    shutil.copytree(FILE.parent, tmp_path, dirs_exist_ok=True)
+    end = text.index("  cameras: &cameras")
+    (tmp_path / FILE.name).write_text(text[:end].rstrip() + welded + "\n" + text[end:])
+    more = np.abs(gravity(tmp_path / FILE.name) - alone)
+    assert more[:, :4].max() > 0.1 and more[:, 4:].max() < 1e-9
+
+
+def test_measured_values_are_plausible_as_fast_and_strong_as_a_gripper_is() -> None:
+    sense = {signal.name: signal for signal in ArmStation().signals().values()}
+    velocity, force = sense["wsg_velocity_measured"], sense["wsg_force_measured"]
+    assert (velocity.lower, velocity.upper) == (-10.0, 10.0)
+    # A force has no sign; ten times that of both fingers is impossible.
+    assert (force.lower, force.upper) == (0.0, 10.0 * 160.0)
 
 
 def test_commands_have_the_limits_of_the_models_file() -> None:
