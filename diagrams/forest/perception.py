@@ -85,8 +85,8 @@ class ScanLandmarks:
         if len(scan.times) and time + scan.times.min() < np.ravel(history)[-POSE]:
             return Landmarks.empty()
         points_H = deskewed(scan, history, self.X_BL, time=time)
-        _, roll, pitch, *_ = carrier_pose_at(history, time)
-        p_HoLo_H = body_rotation(roll, pitch) @ self.X_BL.translation()
+        pose = carrier_pose_at(history, time)
+        p_HoLo_H = body_rotation(pose.roll, pose.pitch) @ self.X_BL.translation()
         return self.detect(points_H, self.settings, p_HoLo_H=p_HoLo_H)
 
 
@@ -122,7 +122,9 @@ class Localizer:
         with _blas().limit(limits=1, user_api="blas"):
             samples = [inputs[name] for name in self.signals]
             landmarks = self.detect(*samples, history, taken) if sees else Landmarks.empty()
-            answer, memory = self.unit.step(memory, landmarks, X_OH=carrier_pose_at(history, taken)[3:], time=taken)
+            pose = carrier_pose_at(history, taken)
+            X_OH = [pose.x, pose.y, pose.heading]
+            answer, memory = self.unit.step(memory, landmarks, X_OH=X_OH, time=taken)
         outputs = {
             "pose": answer.pose,
             "covariance": answer.covariance.ravel(),

@@ -107,8 +107,8 @@ class StereoLandmarks:
             history: The port ``history`` of the `DeadReckoning`.
             time: The time of the images by the clock of the DPS, in s.
         """
-        _, roll, pitch, *_ = carrier_pose_at(history, time)
-        X_HB = RigidTransform(RotationMatrix(body_rotation(roll, pitch)), np.zeros(3))
+        pose = carrier_pose_at(history, time)
+        X_HB = RigidTransform(RotationMatrix(body_rotation(pose.roll, pose.pitch)), np.zeros(3))
         disparity = self.matcher.disparity(left, right)
         return detect_stereo_trunks(disparity, self.camera, self.detector, X_HC=X_HB @ self.X_BC)
 

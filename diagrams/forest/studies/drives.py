@@ -238,8 +238,10 @@ def recorded_drive(scenario: CarrierScenario, *, length: float) -> Drive:
         # By then the sample has arrived, and its time lies within the history.
         simulator.AdvanceTo(due + 2.0 * PERIOD)
         taken, past = float(time(context)), history(context)
-        _, *tilt, x_O, y_O, heading = carrier_pose_at(past, taken)
-        rows.append((taken, np.array([x, y, yaw]), np.array([x_O, y_O, heading]), tilt - np.array([roll, pitch])))
+        reckoned_pose = carrier_pose_at(past, taken)
+        X_OH = np.array([reckoned_pose.x, reckoned_pose.y, reckoned_pose.heading])
+        tilt = np.array([reckoned_pose.roll - roll, reckoned_pose.pitch - pitch])
+        rows.append((taken, np.array([x, y, yaw]), X_OH, tilt))
         inputs = [sample(context) for sample in samples]
         landmarks.append(detect(*inputs, past, taken) if taken >= SETTLED else Landmarks.empty())
         if len(rows) > 1:

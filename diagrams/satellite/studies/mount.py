@@ -34,6 +34,7 @@ import vtbdrake as vtb
 from vtbdrake.arrays import Array
 from vtbdrake.optimization import Sweep
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutResult, RolloutRunner
+from vtbdrake.state import NamedVector, Quantity
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake.visualization.study_plots import BEST
@@ -43,6 +44,14 @@ from vtbdrake_diagrams.satellite.scenario import SatelliteScenario
 from vtbdrake_diagrams.satellite.start import random_start
 
 POSE = "sim.sense.docking_camera.pose"
+_ENTRIES = NamedVector(
+    x=Quantity(unit="m"),
+    y=Quantity(unit="m"),
+    z=Quantity(unit="m"),
+    roll=Quantity(unit="rad"),
+    pitch=Quantity(unit="rad"),
+    yaw=Quantity(unit="rad"),
+)
 IMAGE = "sim.sense.docking_camera.color_image"
 COUNT = "dps.env.markers.count"
 
@@ -73,7 +82,7 @@ def pose(y: float, z: float, *, tilt: float = 0.0, pan: float = 0.0) -> Array:
         tilt: How far it looks down, in rad.
         pan: How far it looks to the left, in rad.
     """
-    return np.array([_X, y, z, -np.pi / 2 - tilt, 0.0, -np.pi / 2 + pan])
+    return _ENTRIES.array(x=_X, y=y, z=z, roll=-np.pi / 2 - tilt, yaw=-np.pi / 2 + pan)
 
 
 def aimed(y: float, z: float) -> Array:
@@ -98,18 +107,25 @@ _REACTION = 0.33
 
 def _turned_up(value: Array) -> Array:
     higher = np.array(value)
-    higher[3] = min(higher[3] + _REACTION, -np.pi / 2 + _TURN)
+    entries = _ENTRIES.view(higher)
+    entries.roll = min(entries.roll + _REACTION, -np.pi / 2 + _TURN)
     return higher
 
 
 AFTERWARDS: dict[str, Array] = {f"{name}, turned up": _turned_up(value) for name, value in BY_HAND.items()}
 """The same, turned up by as much as the base turns down: thought of after the first answer, which showed why."""
 
+
+def _address(name: str) -> str:
+    """Return the address of an entry of the pose."""
+    return f"{POSE}[{_ENTRIES.slice_of(name).start}]"
+
+
 PARAMETERS = (
-    vtb.Parameter(f"{POSE}[1]", -_REACH, _REACH),
-    vtb.Parameter(f"{POSE}[2]", -_REACH, _REACH),
-    vtb.Parameter(f"{POSE}[3]", -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
-    vtb.Parameter(f"{POSE}[5]", -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
+    vtb.Parameter(_address("y"), -_REACH, _REACH),
+    vtb.Parameter(_address("z"), -_REACH, _REACH),
+    vtb.Parameter(_address("roll"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
+    vtb.Parameter(_address("yaw"), -np.pi / 2 - _TURN, -np.pi / 2 + _TURN),
 )
 
 
@@ -121,7 +137,8 @@ def markers_seen(count: float) -> float:
 def distance_from_foot(value: Array) -> float:
     """Return how far a camera with this pose is from the axis of the arm's foot, in m."""
     _, y, z = Servicer().shoulder
-    return float(np.hypot(value[1] - y, value[2] - z))
+    camera = _ENTRIES.view(value)
+    return float(np.hypot(camera.y - y, camera.z - z))
 
 
 def scenario() -> SatelliteScenario:
@@ -172,8 +189,8 @@ def mount_problem(
 
 def entries(value: ArrayLike) -> tuple[float, ...]:
     """Return the values of `PARAMETERS` in a pose, shape (6,)."""
-    y, z, roll, yaw = np.asarray(value)[[1, 2, 3, 5]].tolist()
-    return y, z, roll, yaw
+    camera = _ENTRIES.view(np.asarray(value))
+    return camera.y, camera.z, camera.roll, camera.yaw
 
 
 def mean_count(rollout: RolloutResult) -> float:
@@ -259,10 +276,9 @@ def find_mount(*, seeds: Sequence[int], candidates: int, grid: int, executor: Ex
     problem = mount_problem(seeds=seeds)
     with problem.study() as study:
         study.run(rollouts=candidates * len(seeds), racing=False, executor=executor, progress=False)
-        best_pose = pose(0.0, 0.0)
-        best_pose[[1, 2, 3, 5]] = study.best.point
-    poses = {"found": best_pose, **BY_HAND, **AFTERWARDS}
-    turns = {PARAMETERS[2].address: float(best_pose[3]), PARAMETERS[3].address: float(best_pose[5])}
+        y, z, roll, yaw = study.best.point
+    poses = {"found": _ENTRIES.array(x=_X, y=y, z=z, roll=roll, yaw=yaw), **BY_HAND, **AFTERWARDS}
+    turns = {_address("roll"): float(roll), _address("yaw"): float(yaw)}
     around = mount_problem(PARAMETERS[:2], seeds=seeds, fixed=turns)
     landscape = around.sweep(grid, executor=executor, progress=False)
     every = problem.sweep(values=[entries(value) for value in poses.values()], executor=executor, progress=False)
@@ -338,8 +354,10 @@ def _draw_landscape(
     figure = axes.figure
     figure.colorbar(draw_mesh(axes, y, z, values), ax=axes, pad=0.02)
     for k, placement in enumerate(answer.by_hand):
-        axes.plot(*placement.pose[1:3], "o", color=f"C{k}", mec="white")
-    mark_best(axes, *answer.best.pose[1:3])
+        y_placed, z_placed, *_ = entries(placement.pose)
+        axes.plot(y_placed, z_placed, "o", color=f"C{k}", mec="white")
+    y_best, z_best, *_ = entries(answer.best.pose)
+    mark_best(axes, y_best, z_best)
     axes.add_patch(Circle(Servicer().shoulder[1:], _FOOT, fill=False, color="white", ls=":"))
     axes.set(xlabel="y in B [m]", ylabel="z in B [m]", title=title)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import atan2, ceil, copysign, cos, hypot, inf, sin, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +34,30 @@ MOTION = NamedVector(
     turn_rate=Quantity(unit="rad/s"),
 )
 """The port ``motion``."""
-POSE = 6
-"""Size of an entry of the port ``history``: [time (s), roll, pitch (rad), x, y (m), heading (rad)]."""
+
+
+class CarrierPose(NamedTuple):
+    """The pose of the carrier at one time, an entry of the port ``history``: x, y and heading are those of H in O.
+
+    Attributes:
+        time: The time in s.
+        roll: Roll in rad.
+        pitch: Pitch in rad.
+        x: Position in m.
+        y: Position in m.
+        heading: Heading in rad.
+    """
+
+    time: float
+    roll: float = 0.0
+    pitch: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    heading: float = 0.0
+
+
+POSE = len(CarrierPose._fields)
+"""Size of an entry of the port ``history``."""
 HISTORY_LENGTH = 1.0
 """The time for which poses are remembered, in s."""
 
@@ -133,7 +156,7 @@ class DeadReckoning(AddressedSystem):
     period ago. ``odometry`` is the speed v (m/s) by the wheels at its end: along x_B, of the point A that does not move
     sideways, the middle of an axle that is not steered, at x = ``axle`` in B. The estimates therefore hold for that
     time, the first entry of ``motion``, which is laid out as `MOTION` says. ``history`` has the poses of the last
-    `HISTORY_LENGTH`, newest first, each laid out as `POSE` says; before the start, the carrier stood still. x, y and
+    `HISTORY_LENGTH`, newest first, each a `CarrierPose`; before the start, the carrier stood still. x, y and
     heading are those of H in O; the heading is continuous, not wrapped.
 
     *Levelling.* The reaction g to gravity, expressed in B, points up. It is rotated by the gyros, and corrected towards
@@ -183,13 +206,10 @@ class DeadReckoning(AddressedSystem):
         self._period = period
         self._imu = self.DeclareVectorInputPort("imu", 6)
         self._odometry = self.DeclareVectorInputPort("odometry", 1)
-        length = history_size(period) // POSE
-        past = np.zeros((length, POSE))
-        past[:, 0] = -period * np.arange(1, length + 1)
         variance = _BIAS_DEVIATION**2
         count = Quantity(bounds=(0.0, inf))
         self._motion = self.declare_discrete_state(**{**MOTION.quantities, "time": Quantity(-period, "s")})
-        self._history = self.declare_discrete_state(history=Quantity(past, "s, rad, m"))
+        self._history = self.declare_discrete_state(history=Quantity(history_at_start(period), "s, rad, m"))
         self._levelling = self.declare_discrete_state(
             gravity=Quantity(np.zeros(3), "m/s^2"),
             velocity=Quantity(np.zeros(2), "m/s"),
@@ -338,8 +358,14 @@ def history_size(period: float) -> int:
     return POSE * max(ceil(HISTORY_LENGTH / period - 1e-6), 2)
 
 
-def carrier_pose_at(history: ArrayLike, time: float) -> Array:
-    """Return [time (s), roll, pitch (rad), x, y (m), heading (rad)] of the carrier at a time in s, (6,).
+def history_at_start(period: float) -> Array:
+    """Return the history of a carrier that stood still before the start, by this period in s, shape (n, `POSE`)."""
+    count = history_size(period) // POSE
+    return np.array([CarrierPose(time=-period * k) for k in range(1, count + 1)])
+
+
+def carrier_pose_at(history: ArrayLike, time: float) -> CarrierPose:
+    """Return the pose of the carrier at a time in s.
 
     It is interpolated between the poses of a `DeadReckoning`; outside its history, it is the newest or the oldest one.
 
@@ -347,8 +373,14 @@ def carrier_pose_at(history: ArrayLike, time: float) -> Array:
         history: The port ``history`` of a `DeadReckoning`, newest first.
         time: The time by the clock of the DPS, in s.
     """
-    past = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
-    return np.array([time, *(np.interp(time, past[:, 0], past[:, k]) for k in range(1, POSE))])
+    past = _poses(history)
+    return CarrierPose(time, *(float(np.interp(time, past["time"], past[name])) for name in CarrierPose._fields[1:]))
+
+
+def _poses(history: ArrayLike) -> np.ndarray:
+    """Return the poses of a history, oldest first, (n,), with the fields of `CarrierPose`."""
+    fields = [(name, float) for name in CarrierPose._fields]
+    return np.ravel(np.asarray(history, dtype=float)).view(fields)[::-1]
 
 
 def body_rotation(roll: float, pitch: float, heading: float = 0.0) -> Array:
@@ -378,21 +410,21 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     Raises:
         ValueError: The history has fewer than two poses.
     """
-    knots = np.reshape(np.asarray(history, dtype=float), (-1, POSE))[::-1]
+    knots = _poses(history)
     if len(knots) < 2:
         raise ValueError(f"deskewing needs a history of at least 2 poses, not {len(knots)}: see `history_size`")
     fired = time + scan.times
     first, last = (fired.min(), fired.max()) if len(fired) else (time, time)
     # Only the knots around the scan, at least two.
-    low = min(max(int(np.searchsorted(knots[:, 0], first, side="right")) - 1, 0), len(knots) - 2)
-    knots = knots[low : max(int(np.searchsorted(knots[:, 0], last)) + 1, low + 2)]
-    _, _, _, x, y, heading = carrier_pose_at(history, time).tolist()
-    R_OH = rotation(heading)
-    turns = np.array([body_rotation(roll, pitch, turned - heading) for _, roll, pitch, _, _, turned in knots.tolist()])
+    low = min(max(int(np.searchsorted(knots["time"], first, side="right")) - 1, 0), len(knots) - 2)
+    knots = knots[low : max(int(np.searchsorted(knots["time"], last)) + 1, low + 2)]
+    now = carrier_pose_at(history, time)
+    poses = [CarrierPose(*knot) for knot in knots.tolist()]
+    turns = np.array([body_rotation(pose.roll, pose.pitch, pose.heading - now.heading) for pose in poses])
     moves = np.zeros((len(knots), 3))
-    moves[:, :2] = (knots[:, 3:5] - [x, y]) @ R_OH
+    moves[:, :2] = np.array([(pose.x - now.x, pose.y - now.y) for pose in poses]) @ rotation(now.heading)
     # The segment between two knots in which each ray was fired, and its share of it; beyond the knots, at the nearest.
-    place = np.interp(fired, knots[:, 0], np.arange(len(knots)))
+    place = np.interp(fired, knots["time"], np.arange(len(knots)))
     segments = np.minimum(place.astype(int), len(knots) - 2)
     share = (place - segments)[:, np.newaxis]
     order = np.argsort(segments, kind="stable")

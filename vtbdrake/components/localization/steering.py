@@ -12,7 +12,7 @@ from math import inf
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.components.localization.dead_reckoning import MOTION, POSE, history_size
+from vtbdrake.components.localization.dead_reckoning import MOTION, POSE, history_at_start
 from vtbdrake.components.localization.planar import Numbers, chord, compose
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
@@ -72,7 +72,8 @@ class SteeringReckoning(AddressedSystem):
 
     ``odometry`` is [speed (m/s), steering angle (rad)], sampled one period ago, see `SteeringConfig`. The outputs are
     those of a `DeadReckoning`, with roll and pitch 0: ``motion`` is laid out as `MOTION`, ``history`` as rows of
-    `POSE`, newest first. Between two samples, the carrier moves on an arc with the mean of their speeds and turn rates.
+    `CarrierPose`, newest first. Between two samples, the carrier moves on an arc with the mean of their speeds and turn
+    rates.
 
     A sample with a speed of 1,000 m/s or more, with an angle beyond 1.4 rad, or with a number that is not finite, is
     left out and counted in ``ignored``: speed and turn rate keep their values.
@@ -94,11 +95,8 @@ class SteeringReckoning(AddressedSystem):
         config = config or SteeringConfig()
         self._period = period
         self._odometry = self.DeclareVectorInputPort("odometry", 2)
-        length = history_size(period) // POSE
-        past = np.zeros((length, POSE))
-        past[:, 0] = -period * np.arange(1, length + 1)
         self._motion = self.declare_discrete_state(**{**MOTION.quantities, "time": Quantity(-period, "s")})
-        self._history = self.declare_discrete_state(history=Quantity(past, "s, rad, m"))
+        self._history = self.declare_discrete_state(history=Quantity(history_at_start(period), "s, rad, m"))
         count = Quantity(bounds=(0.0, inf))
         self._counts = self.declare_discrete_state(samples=count, ignored=count)
         for port, group in (("motion", self._motion), ("history", self._history)):
