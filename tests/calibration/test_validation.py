@@ -12,7 +12,7 @@ import scipy.stats
 from playwright.sync_api import Browser
 
 from tests.chromium import needs_chromium, screenshot
-from vtbdrake.calibration import Comparison, Tolerance, compare
+from vtbdrake.calibration import Comparison, ToleranceConfig, compare
 from vtbdrake.calibration.validation import Verdict, delay, sprague_geers, whiteness
 from vtbdrake.recording import Log, LogError, Series
 
@@ -76,15 +76,17 @@ def test_simulation_is_taken_at_the_times_of_the_recording() -> None:
 def test_band_of_several_simulations_covers_what_it_says() -> None:
     generator = np.random.default_rng(5)
     simulations = [of(generator.normal(size=TIMES.size)) for _ in range(400)]
-    result = compare(of(generator.normal(size=TIMES.size)), simulations, tolerances={"q": Tolerance(coverage=0.9)})
+    result = compare(
+        of(generator.normal(size=TIMES.size)), simulations, tolerances={"q": ToleranceConfig(coverage=0.9)}
+    )
     # A binomial share of 2001 samples, with three standard deviations; the band's own quantiles err, too.
     assert result.signals["q"].coverage == pytest.approx(0.95, abs=0.02) and result.verdict == Verdict.WITHIN
-    narrow = compare(of(3.0 + TIMES), simulations, tolerances={"q": Tolerance(coverage=0.9)})
+    narrow = compare(of(3.0 + TIMES), simulations, tolerances={"q": ToleranceConfig(coverage=0.9)})
     assert narrow.verdict == Verdict.BEYOND and "coverage 0" in narrow.signals["q"].beyond[0]
 
 
 def test_verdict_names_what_is_exceeded() -> None:
-    tolerance = Tolerance(rmse=0.2, largest=0.3, delay=0.01, magnitude=0.5, phase=0.5)
+    tolerance = ToleranceConfig(rmse=0.2, largest=0.3, delay=0.01, magnitude=0.5, phase=0.5)
 
     def judged(simulated: np.ndarray) -> Comparison:
         return compare(Log("run.csv", of(np.sin(TIMES)), {}), of(simulated), tolerances={"q": tolerance})
@@ -104,7 +106,7 @@ def test_page_holds_verdict_numbers_and_plot(tmp_path: Path, browser: Browser) -
     result = compare(
         recorded,
         of(np.stack([np.sin(TIMES - 0.1), TIMES], axis=1)),
-        tolerances={"q": Tolerance(rmse=1e-3)},
+        tolerances={"q": ToleranceConfig(rmse=1e-3)},
     )
     result.save_html(tmp_path / "page.html")
     page = browser.new_page(viewport={"width": 1280, "height": 800})
@@ -130,7 +132,7 @@ def test_page_holds_verdict_numbers_and_plot(tmp_path: Path, browser: Browser) -
         (of(TIMES), [], {}, "no simulation"),
         (of(TIMES), of(np.stack([TIMES, TIMES], 1)), {}, "1 entries in the recording, 2 in the simulation"),
         (of(TIMES), of(TIMES, TIMES + 20.0), {}, "recorded from 0 to 10 s and simulated from 20 to 30 s"),
-        (of(TIMES), of(TIMES), {"w": Tolerance()}, "a tolerance for 'w'"),
+        (of(TIMES), of(TIMES), {"w": ToleranceConfig()}, "a tolerance for 'w'"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(reference, simulation, tolerances, message) -> None:
@@ -139,5 +141,5 @@ def test_what_cannot_be_compared_is_refused(reference, simulation, tolerances, m
 
 
 def test_impossible_tolerance_is_refused() -> None:
-    with pytest.raises(ValueError, match="Tolerance.rmse must be a number of at least 0, not -1.0"):
-        Tolerance(rmse=-1.0)
+    with pytest.raises(ValueError, match="ToleranceConfig.rmse must be a number of at least 0, not -1.0"):
+        ToleranceConfig(rmse=-1.0)

@@ -30,7 +30,7 @@ from vtbdrake.calibration.trials import machine_log as machine_log
 from vtbdrake.calibration.trials import self_test as self_test
 from vtbdrake.calibration.validation import Comparison as Comparison
 from vtbdrake.calibration.validation import SignalComparison as SignalComparison
-from vtbdrake.calibration.validation import Tolerance as Tolerance
+from vtbdrake.calibration.validation import ToleranceConfig as ToleranceConfig
 from vtbdrake.calibration.validation import compare as compare
 from vtbdrake.validity_domain import Departure as Departure
 from vtbdrake.validity_domain import ValidityDomain as ValidityDomain

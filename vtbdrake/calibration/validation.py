@@ -56,7 +56,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tolerance:
+class ToleranceConfig:
     """The differences between a recording and its simulation that are acceptable; infinite: any."""
 
     rmse: float = setting(inf, "Root mean square of the differences, in the signal's unit.", ge=0, finite=False)
@@ -160,7 +160,7 @@ def compare(
     reference: Log | Mapping[str, Series],
     simulation: Log | Mapping[str, Series] | Sequence[Log | Mapping[str, Series]],
     *,
-    tolerances: Mapping[str, Tolerance] | None = None,
+    tolerances: Mapping[str, ToleranceConfig] | None = None,
 ) -> Comparison:
     """Compare a simulation, or several, with a recording.
 
@@ -231,7 +231,7 @@ def _common(name: str, reference: Series, simulations: Sequence[Series]) -> tupl
 
 
 def _result(
-    name: str, curve: tuple[Array, Array, Array, Array, Array], banded: bool, tolerance: Tolerance | None
+    name: str, curve: tuple[Array, Array, Array, Array, Array], banded: bool, tolerance: ToleranceConfig | None
 ) -> SignalComparison:
     times, r, s, lower, upper = curve
     residuals = s - r
@@ -255,7 +255,7 @@ def _result(
     return SignalComparison(name=name, samples=len(times), **numbers, beyond=beyond, verdict=verdict)
 
 
-def _beyond(numbers: Mapping[str, float], tolerance: Tolerance) -> tuple[str, ...]:
+def _beyond(numbers: Mapping[str, float], tolerance: ToleranceConfig) -> tuple[str, ...]:
     """Return the tolerances that are exceeded; what cannot be computed exceeds its tolerance."""
     reasons = []
     for field in ("rmse", "largest", "delay", "magnitude", "phase"):

@@ -108,7 +108,7 @@ _MODES = {3: "STEREO_SGBM_MODE_SGBM_3WAY", 5: "STEREO_SGBM_MODE_SGBM", 8: "STERE
 
 @dataclass(frozen=True)
 class StereoMatcher:
-    """Settings of semi-global matching."""
+    """Semi-global matching of the images of a rectified stereo camera."""
 
     largest_disparity: int = setting(
         64, "Largest disparity, a multiple of 16; nearer surfaces get none, or a wrong one.", unit="pixels", ge=16
