@@ -243,6 +243,41 @@ def test_auto_has_a_plan_for_every_budget(size, budget, methods, short_model):
     assert [method for _, method in solver.changes][: len(methods)] == methods
 
 
+@pytest.mark.parametrize(
+    ("space", "budget", "changes"),
+    [
+        (box(2, -3.0, 4.0), 60, [(0, "bayesian"), (40, "LN_BOBYQA around the best")]),
+        # A third of 44 is less than BOBYQA's first model and some steps.
+        (box(2, -3.0, 4.0), 44, [(0, "bayesian")]),
+        # One continuous parameter needs fewer points.
+        ((COUNT, X), 44, [(0, "bayesian"), (30, "COBYQA around the best")]),
+    ],
+)
+def test_auto_ends_a_small_budget_with_a_local_search(space, budget, changes, short_model):
+    solver = make_solver("auto", space, budget=budget, seed=5)
+    # A valley along both, at whose end the local search still makes progress.
+    log = drive(solver, lambda p: 100.0 * (p[1] - 0.2 * p[0] ** 2) ** 2 + (p[0] - 1.0) ** 2)
+    assert len(log) == budget
+    assert [*solver.changes][:2] == changes
+    if len(changes) == 2:
+        before, after = (max(e.values[0] for e in part) for part in (log[: changes[1][0]], log[changes[1][0] :]))
+        assert after > before
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize("seed", [21, 22])
+def test_auto_finds_a_minimum_exactly_in_a_hundred_evaluations(seed):
+    """Zakharov's function: a narrow valley that is steep at its ends, where a Gaussian process is not exact."""
+    weights = 0.5 * np.arange(1, 4)
+
+    def cost(p):
+        x = np.array(p)
+        return float(x @ x + (weights @ x) ** 2 + (weights @ x) ** 4)
+
+    solver = make_solver("auto", box(3, -5.0, 8.0), seed=seed, budget=100)
+    assert -max(e.values[0] for e in drive(solver, cost)) < 1e-3
+
+
 @pytest.mark.one_python
 @pytest.mark.parametrize("function", [SPHERE, ROSENBROCK, ACKLEY])
 @pytest.mark.parametrize("budget", [90, 180])

@@ -29,6 +29,9 @@ PATIENCE = 5
 MODEL_SIZE = 20
 # Points of the model: per parameter and one more, and in all; with wide batches at least so many of these.
 MODEL_POINTS, MODEL_LIMIT, MODEL_BATCHES = 25, 120, 4
+# CMA-ES needs so many generations. Of a budget without them, one part in so many goes to a local search, if that is at
+# least so many points per continuous parameter and one more: the 2 n + 1 of BOBYQA's first model, and some steps.
+GENERATIONS, LOCAL_PART, LOCAL_POINTS = 10, 3, 5
 # Half widths of the boxes of local searches, as parts of the ranges: after the model, and last.
 LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
 # The same for searches in other basins, which end with this tolerance; so many in a row may find nothing better.
@@ -44,8 +47,9 @@ class Auto(Solver):
     * else, with up to 20 parameters: Bayesian optimization for 25 (n + 1) points, 120 at most; a local search from its
       best point, for at most a third of the remaining budget, and another one while it ends at the border of its box;
       local searches from the best points outside of the basins that were searched, until three in a row have found
-      nothing better; then CMA-ES from the best point. If the budget left for CMA-ES is less than ten generations,
-      Bayesian optimization gets all of it;
+      nothing better; then CMA-ES from the best point. A budget that leaves less than ten generations for CMA-ES goes to
+      Bayesian optimization for two thirds, and for one to a local search from its best point; all of it goes to
+      Bayesian optimization if the third is less than 5 (k + 1) points for k continuous parameters;
     * with more parameters: a Sobol design of 2 (n + 1) points, and CMA-ES from its best point.
 
     Bayesian optimization asks for 4 points at a time; for fewer if the budget is less than 100 evaluations. If more
@@ -133,14 +137,16 @@ class Auto(Solver):
         if search.start is not None:
             self._begin("start", Listed(replace(search, start=None, budget=None), name="start", points=[search.start]))
             yield
-        self._begin_model()
+        reserve = self._local_reserve()
+        self._begin_model(reserve)
         yield
         model_best = self._best
         if model_best is not None and self._has_local:
-            yield from self._descent(model_best.point)
+            yield from self._descent(model_best.point, share=1.0 if reserve else 1.0 / 3.0)
             yield from self._other_basins()
         fruitless, start = 0, 0
-        while fruitless < PATIENCE and self._left_but_polish() > 0:
+        least = self._generations if reserve else 0
+        while fruitless < PATIENCE and self._left_but_polish() > least:
             before = self._best
             self._begin_global(start)
             yield
@@ -158,10 +164,14 @@ class Auto(Solver):
             yield
         self._spent()
 
-    def _descent(self, start: Point) -> Iterator[None]:
-        """Search locally from a point; go on in another box while the best point lies at the border of its own."""
+    def _descent(self, start: Point, *, share: float) -> Iterator[None]:
+        """Search locally from a point; go on in another box while the best point lies at the border of its own.
+
+        A search gets a ``share`` of what is left, all of it without a reserve for the last search if that is 1.
+        """
         while self._left_but_polish() > 0:
-            self._begin_local(start, radius=LOCAL_RADIUS, limit=self._left_but_polish() / 3.0)
+            limit = math.inf if share == 1.0 else share * self._left_but_polish()
+            self._begin_local(start, radius=LOCAL_RADIUS, limit=limit)
             yield
             end = self._stage_best
             if end is None:
@@ -193,21 +203,42 @@ class Auto(Solver):
                 return evaluation.point
         return None
 
-    def _begin_model(self) -> None:
-        """Begin the Gaussian process, or for many parameters a design."""
+    def _begin_model(self, reserve: int = 0) -> None:
+        """Begin the Gaussian process, or for many parameters a design; leave ``reserve`` points of a small budget."""
         search, size, left = self.search, self.search.size, math.inf if self._left is None else self._left
         if size > MODEL_SIZE:
             points = int(min(search.batch(2 * (size + 1)), max(1, left // 2)))
             self._begin("sobol", Sobol(replace(search, start=None, budget=None), name="sobol", points=points))
             return
-        points = max(min(MODEL_POINTS * (size + 1), MODEL_LIMIT), MODEL_BATCHES * search.batch(1))
-        if left < points + 10 * search.batch(default_population(size)):
-            points = int(left)
+        points = int(left) - reserve if self._is_small else self._model_points
         model = Bayesian(replace(search, start=None, budget=max(1, points)), name=MODEL, batch=self._batch)
         # These evaluations are charged already.
         model.tell([replace(evaluation, effort=0.0) for evaluation in (*self._before, self._best) if evaluation])
         # With racing, the budget may allow many more points: the number of points is limited, too.
         self._begin(MODEL, model, limit=points)
+
+    @property
+    def _model_points(self) -> int:
+        """Return the number of points of the model in a large budget."""
+        return max(min(MODEL_POINTS * (self.search.size + 1), MODEL_LIMIT), MODEL_BATCHES * self.search.batch(1))
+
+    @property
+    def _is_small(self) -> bool:
+        """Return whether the budget left is too small for the model and CMA-ES."""
+        return self._left is not None and self._left < self._model_points + self._generations
+
+    @property
+    def _generations(self) -> int:
+        """Return the number of evaluations that CMA-ES needs at least."""
+        return GENERATIONS * self.search.batch(default_population(self.search.size))
+
+    def _local_reserve(self) -> int:
+        """Return the number of evaluations that the model leaves to a local search in a small budget."""
+        if not (self._has_local and self._is_small):
+            return 0
+        assert self._left is not None
+        points = self._left // LOCAL_PART
+        return points if points >= LOCAL_POINTS * (len(self._continuous) + 1) else 0
 
     def _begin_global(self, start: int) -> None:
         """Begin a global search, counted from 0: CMA-ES twice, differential evolution, and so on."""
