@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from time import process_time
-from typing import Any, Self
+from typing import Any
 
 from vtbdrake.argument_checks import as_number
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.calibration import Calibration, calibrate
+from vtbdrake.closing import Closing
 from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
@@ -43,7 +44,7 @@ class Refit:
     took: float
 
 
-class ModelRefit:
+class ModelRefit(Closing):
     """Calibrates the mental model of a DPS again, after each alarm of a residual monitor, and offers the result.
 
     It watches the loop from its construction until `close`. When an alarm has begun, it waits until the monitor has the
@@ -183,12 +184,6 @@ class ModelRefit:
         """End the worker process; a calibration under way is lost."""
         self._runtime.unwatch(self)
         self._worker.kill()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _serve(

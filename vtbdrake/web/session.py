@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from vtbdrake.argument_checks import as_number
+from vtbdrake.closing import Closing
 from vtbdrake.failures import FAILURES, one_line
 from vtbdrake.rollout.course import task_without_problem
 from vtbdrake.settings import check_settings, setting
@@ -199,7 +200,7 @@ class _Pace:
             self.simulated, self.wall = simulated, wall
 
 
-class Session:
+class Session(Closing):
     """Simulates a testbed in a thread of its own, where it can be watched and steered.
 
     Everything that touches the testbed or its Meshcat happens in that thread. Other threads send commands; each method
@@ -265,12 +266,6 @@ class Session:
         self._thread = threading.Thread(target=self._run, args=(ready,), name="vtbdrake session", daemon=True)
         self._thread.start()
         ready.result()
-
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the simulation and its Meshcat."""

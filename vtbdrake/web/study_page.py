@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vtbdrake.argument_checks import as_whole
+from vtbdrake.closing import Closing
 from vtbdrake.failures import one_line
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization import Choice, Problem, Study, StudyError
@@ -40,7 +41,7 @@ _PATIENCE = 1.0  # s, for a change
 _LISTED = 200  # interventions
 
 
-class StudyView:
+class StudyView(Closing):
     """A study with its page, while it runs here, in another process, or not at all.
 
     Attributes:
@@ -90,12 +91,6 @@ class StudyView:
         if any(trial.counts for trial in self.study.trials):
             static["image/png"] = base64.b64encode(png_of(self.study.plot_history())).decode()
         return page_bundle(self.url, static, height=800)
-
-    def __enter__(self) -> StudyView:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the page; the study goes on."""

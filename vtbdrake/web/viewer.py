@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.closing import Closing
 from vtbdrake.lazy import extra_module
 from vtbdrake.web.log_session import LogSession
 from vtbdrake.web.session import Session, SessionConfig
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from vtbdrake.web.vr import Robot
 
 
-class View:
+class View(Closing):
     """A testbed that runs in the background, and its page, where it is watched and steered.
 
     Attributes:
@@ -46,12 +47,6 @@ class View:
         # The address has the token of this run, and is not for those who read a stored notebook.
         text = f"<View of {self.session.scenario.name()}>"
         return page_bundle(self.url, picture_bundle(text, self.session.still()))
-
-    def __enter__(self) -> View:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the page and the testbed."""
