@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario, recorded
 from tests.real import recordings
-from vtbdrake.calibration import Calibration, CalibrationError, Inertia, JointModel, JointRecording, calibrate
+from vtbdrake.calibration import (
+    Calibration,
+    CalibrationError,
+    Inertia,
+    JointModel,
+    JointRecording,
+    calibrate,
+    information,
+)
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.calibration.filtering import Noise, Segments
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, Series
+from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.double_pendulum import reality
 
 MOMENT, FIRST = f"{ARM}.link.inertia[1]", f"{ARM}.link.center_of_mass[2]"
@@ -51,6 +61,25 @@ def test_intervals_contain_the_truth(disturbance: float) -> None:
     assert sum(inside) >= 33, f"{sum(inside)} of {len(inside)}"
     # Without a disturbance the position noise alone limits; its deviation is a tenth of the typical torque otherwise.
     assert np.median(errors) < (0.01 if disturbance == 0.0 else 0.1)
+
+
+def test_blas_computes_in_one_thread_until_the_result() -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    class Watched(PendulumScenario):
+        def build(self) -> VirtualTestbed:
+            during.append(threads())
+            return super().build()
+
+    during: list[set[int]] = []
+    log = recorded(TRUTH, 1, seconds=2.0)
+    noise = Noise(np.array([2e-4]), np.array([0.1]), 0.05)
+    with threadpool_limits(2, user_api="blas"):
+        for fit in (calibrate, information):
+            fit(Watched(), log, PARAMETERS, position="position", torque="torque", noise=noise)
+            assert threads() == {2}
+    assert during and all(numbers == {1} for numbers in during)
 
 
 def test_noise_is_found() -> None:

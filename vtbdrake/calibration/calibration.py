@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
@@ -177,19 +178,20 @@ def calibrate(
     """
     if not 0.0 < holdout < 0.9:
         raise CalibrationError(f"the share that is kept back is above 0 and below 0.9, not {holdout}")
-    prepared = _Prepared(
-        scenario,
-        logs,
-        parameters,
-        inertias=inertias,
-        position=position,
-        torque=torque,
-        measured_torque=measured_torque,
-        period=period,
-        segment=segment,
-        noise=noise,
-    )
-    return prepared.fitted(scenario, holdout)
+    with _one_thread():
+        prepared = _Prepared(
+            scenario,
+            logs,
+            parameters,
+            inertias=inertias,
+            position=position,
+            torque=torque,
+            measured_torque=measured_torque,
+            period=period,
+            segment=segment,
+            noise=noise,
+        )
+        return prepared.fitted(scenario, holdout)
 
 
 def information(
@@ -206,9 +208,22 @@ def information(
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
-    prepared = _Prepared(scenario, logs, parameters, **options)
-    z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
-    return prepared.information(noise, z)
+    with _one_thread():
+        prepared = _Prepared(scenario, logs, parameters, **options)
+        z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
+        return prepared.information(noise, z)
+
+
+def _one_thread() -> AbstractContextManager[object]:
+    """Return a context in which BLAS computes in this thread alone.
+
+    The filter's matrices are small, and those of the fit slim: what other threads do is mostly to wait for work, in a
+    loop that takes processor time. And the last digits do not depend on the number of threads.
+    """
+    from threadpoolctl import threadpool_limits
+
+    limits: AbstractContextManager[object] = threadpool_limits(1, user_api="blas")
+    return limits
 
 
 class _Prepared:
