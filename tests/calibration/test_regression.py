@@ -131,6 +131,13 @@ def test_intervals_cover_hidden_parameters(double: TorqueRegressor) -> None:
     assert 0.88 <= np.mean(covered) <= 0.995
 
 
+def test_condition_is_that_of_the_weighted_equations(double: TorqueRegressor) -> None:
+    base, each = base_parameters(double), equations(double, recorded(double, 3), cutoff=30.0, band=8.0)
+    fit = regress(double, each)
+    weighted = (each.Y[:, :, list(base.columns)] / fit.residual[:, np.newaxis]).reshape(-1, len(base.columns))
+    assert fit.condition == pytest.approx(np.linalg.cond(weighted / np.linalg.norm(weighted, axis=0)), rel=1e-2)
+
+
 def test_gain_of_a_current_is_found_beside_a_known_one(double: TorqueRegressor) -> None:
     log = recorded(double, 3)
     currents = JointRecording(log.source, log.times, log.q, log.u / [1.0, 1.3])

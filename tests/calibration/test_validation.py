@@ -45,6 +45,13 @@ def test_delay_is_found_to_a_fraction_of_a_sample(late: float) -> None:
     assert np.isnan(delay(TIMES, curve(TIMES), np.ones(TIMES.size)))
 
 
+def test_first_and_last_sample_count_for_the_delay() -> None:
+    first = (TIMES[0] == TIMES).astype(float)
+    last = (TIMES[-1] == TIMES).astype(float)
+    assert delay(TIMES, first, np.roll(first, 3)) == pytest.approx(3.0 * TIMES[1], abs=1e-5)
+    assert delay(TIMES, np.roll(last, -3), last) == pytest.approx(3.0 * TIMES[1], abs=1e-5)
+
+
 def test_white_residuals_are_rejected_as_often_as_the_level_says() -> None:
     generator = np.random.default_rng(7)
     p_values = [whiteness(generator.normal(size=500)) for _ in range(400)]

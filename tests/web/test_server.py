@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import random
+import socket as socketlib
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from socket import SHUT_RDWR
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from vtbdrake.web import View, view
-from vtbdrake.web.host import PortError
+from vtbdrake.web.host import Host, PortError
 from vtbdrake.web.relay import Newest, relay
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
@@ -49,12 +49,12 @@ def ask(url: str, headers: dict[str, str] | None = None) -> tuple[int, str, Any]
         return error.code, error.read().decode(), error.headers
 
 
-def base(running: View) -> str:
+def base(running: View | Host) -> str:
     parts = urlsplit(running.url)
     return f"{parts.scheme}://{parts.netloc}/"
 
 
-def cookie(running: View) -> dict[str, str]:
+def cookie(running: View | Host) -> dict[str, str]:
     status, _, headers = ask(running.url)
     assert status == 303 and headers["location"] == "./"
     name, attributes = headers["set-cookie"].split(";", 1)
@@ -133,6 +133,28 @@ def test_page_watches_and_steers(running: View) -> None:
         assert command(socket, "reset") == ""
 
 
+def test_speed_without_a_limit_has_a_word_that_json_knows(running: View) -> None:
+    with page(running) as socket:
+        for speed, shown in ((float("inf"), "unlimited"), (2.5, 2.5), (1.0, 1.0)):
+            running.session.set_speed(speed)
+            while (told := receive(socket, "frame")["speed"]) != shown:
+                assert told in (1.0, "unlimited", 2.5)  # those before
+
+
+def test_meshcat_that_has_ended_is_told_to_the_browser() -> None:
+    async def nothing(_: Any) -> None: ...
+
+    with socketlib.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # which does not listen
+        host = Host(f"http://127.0.0.1:{closed.getsockname()[1]}", script="view.js", serve=nothing)
+        try:
+            for path in ("", "favicon.ico"):
+                status, text, _ = ask(base(host) + path, cookie(host))
+                assert status == 502 and "Meshcat does not answer: " in text
+        finally:
+            host.close()
+
+
 def test_one_page_steers_and_the_others_watch(running: View) -> None:
     with page(running) as first:
         receive(first, "frame")
@@ -195,7 +217,7 @@ def test_paused_view_ends_in_silence_after_its_browser(is_killed: bool, capfd: p
         receive(session, "frame")
         if is_killed:
             for socket in (scene, session):
-                socket.socket.shutdown(SHUT_RDWR)
+                socket.socket.shutdown(socketlib.SHUT_RDWR)
         opened.close()
     assert capfd.readouterr().err == ""
 

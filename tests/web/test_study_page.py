@@ -130,18 +130,24 @@ def test_shown_and_tried_points_are_those_of_the_problem(opened: StudyView) -> N
 
 
 def test_trial_is_drawn_between_its_samples_where_drake_has_it(opened: StudyView) -> None:
-    time = 0.53
+    time, looks = 0.53, {}
     with page(opened) as socket:
         reader = Reader(socket).until("ended", 16)
+        reader.ask("show", role="best", trial=3)
         reader.ask("show", role="pointed", trial=3)
         reader.ask("time", time=time)
         drawn = None
         with page(opened, "") as meshcat:
-            while drawn is None:
+            while drawn is None or len(looks) < 2:
                 message = msgpack.unpackb(meshcat.recv(PATIENCE))
                 if message["type"] == "set_transform" and message["path"].endswith("study/pointed/cart_pole/pole"):
                     drawn = message["matrix"]
+                if message["type"] == "set_object" and "/cart_pole/rod" in message["path"]:
+                    (material,) = message["object"]["materials"]
+                    looks[message["path"].split("/")[3]] = material["opacity"]
         reader.ask("hide", role="pointed")
+    # The best is as it is, others are ghosts.
+    assert looks["best"] == 1.0 > looks["pointed"] > 0.2
     testbed = cart_pole_problem().testbed
     context = testbed.default_context()
     testbed.write(context, dict(zip((ANGLE, RATE), reader.trials[3][:2], strict=True)))
@@ -199,6 +205,20 @@ def test_study_in_memory_is_watched_while_it_runs() -> None:
         reader.until("ended", 30)
         run.join()
         assert reader.trials == rows(study)
+
+
+def test_study_is_not_resumed_twice(finished: Path) -> None:
+    with view_study(finished) as view:
+        view.resume()
+        assert view.runner is not None
+        try:
+            # The first process has not even come to the study's file.
+            with pytest.raises(StudyError, match="the study is running"):
+                view.resume()
+        finally:
+            view.runner.kill()
+            view.runner.wait()
+        assert "has ended" in view.runner_failure
 
 
 @pytest.mark.slow
