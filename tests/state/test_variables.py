@@ -272,6 +272,24 @@ def test_declared_variables_reach_their_entries_only():
         variables["filter.gain"].set(context, [5.0, 11.0])
 
 
+@pytest.mark.parametrize(
+    ("unit", "units"),
+    [("rad, m", ["rad", "m"]), ("m", ["m", "m"]), ("m, m, rad", ["m, m, rad"] * 2), ("(rad, m)/s", ["(rad, m)/s"] * 2)],
+)
+def test_an_entry_has_the_unit_and_the_bounds_of_its_place(unit, units):
+    builder = DiagramBuilder()
+    reference = builder.AddNamedSystem("arm", Filter())
+    bounds = (np.array([-2.5, 0.0]), np.array([2.5, 0.6]))
+    reference.variables = (Element("goal", PARAMETER, 0, (2,), start=1, unit=unit, bounds=bounds),)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    variables = collect(diagram)
+    assert [variables[f"arm.goal[{k}]"].unit for k in range(2)] == units
+    with pytest.raises(VariableError) as refused:
+        variables.write(context, {"arm.goal": [0.5, 0.7]})
+    assert str(refused.value) == f"arm.goal[1] must lie in [0, 0.6] {units[1]}, but the value given is 0.7"
+
+
 def test_a_declaration_beyond_the_group_is_refused():
     builder = DiagramBuilder()
     builder.AddNamedSystem("filter", Filter(size=3))

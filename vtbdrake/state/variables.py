@@ -96,9 +96,11 @@ class Variable:
         if not np.isfinite(array).all():
             raise VariableError(f"{self.address} must be finite, but the value given is {value!r}")
         lower, upper = (np.asarray(bound, dtype=float) for bound in self.bounds)
-        if (array < lower).any() or (array > upper).any():
-            allowed = with_unit(self.bounds_text(), self.unit)
-            raise VariableError(f"{self.address} must lie in {allowed}, but the value given is {value!r}")
+        outside = np.flatnonzero((array < lower) | (array > upper))
+        if outside.size:
+            variable, number = (_entry(self, outside[0]), array.flat[outside[0]]) if self.shape else (self, array)
+            allowed = with_unit(variable.bounds_text(), variable.unit)
+            raise VariableError(f"{variable.address} must lie in {allowed}, but the value given is {float(number)}")
         if self.refuse is not None:
             self.refuse(array)
         return array
@@ -307,10 +309,13 @@ def _entry(variable: Variable, index: int) -> Variable:
     def bound(which: int) -> float:
         return float(np.broadcast_to(np.asarray(variable.bounds[which], dtype=float), variable.shape).flat[index])
 
+    units = variable.unit.split(", ")  # one for each entry, such as "rad, m"; else one for all
+    separate = len(units) == size and "(" not in variable.unit
     return replace(
         variable,
         address=f"{variable.address}[{index}]",
         shape=(),
+        unit=units[index] if separate else variable.unit,
         read=read,
         write=None if variable.derived else write,
         bounds=(bound(0), bound(1)),
