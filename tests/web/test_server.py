@@ -137,8 +137,8 @@ def test_speed_without_a_limit_has_a_word_that_json_knows(running: View) -> None
     with page(running) as socket:
         for speed, shown in ((float("inf"), "unlimited"), (2.5, 2.5), (1.0, 1.0)):
             running.session.set_speed(speed)
-            while (told := receive(socket, "frame")["speed"]) != shown:
-                assert told in (1.0, "unlimited", 2.5)  # those before
+            # The first frames may be older than the command.
+            assert shown in (receive(socket, "frame")["speed"] for _ in range(20))
 
 
 def test_meshcat_that_has_ended_is_told_to_the_browser() -> None:

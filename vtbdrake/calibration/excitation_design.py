@@ -172,9 +172,7 @@ class _Design:
         self._x = casadi.MX.sym("x", free * model.nq)
         ends = casadi.repmat(casadi.MX(casadi.DM(rest)).T, _RESTING, 1)
         w = casadi.vertcat(ends, casadi.reshape(self._x, free, model.nq), ends)
-        # The third derivative jumps from piece to piece: at the end, it is that before.
-        inside = np.minimum(times, spline.duration * (1.0 - 1e-12))
-        derivatives = ((casadi.sparsify(spline.matrix(inside, order)) @ w).T for order in range(4))
+        derivatives = ((casadi.sparsify(spline.matrix(times, order)) @ w).T for order in range(4))
         torques, parts = _sample(model, noise).map(len(times))(*derivatives)
         weights = np.full(len(times), times[1])
         weights[[0, -1]] *= 0.5
