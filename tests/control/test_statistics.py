@@ -199,7 +199,8 @@ def test_table_shows_microseconds_and_misses() -> None:
     lines = [line.split() for line in str(statistics).splitlines()]
     assert lines[0] == ["us", "mean", "p50", "p99", "p99.9", "max", "warnings", "errors"]
     assert lines[3] == ["cycle", "1200", "1200", "1200", "1200", "1200", "0", ">", "500", "1", ">", "1000"]
-    assert str(statistics).endswith("1 cycles of 1000 us, 1 deadlines missed (1 in a row at most): error")
+    summary = "1 cycles of 1000 us, 1 deadlines missed (1 in a row at most): error (1 x cycle > 1000 us)"
+    assert str(statistics).endswith(summary)
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, nan])

@@ -180,6 +180,8 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
         box = page.locator(handle).bounding_box()
         assert box is not None
         np.testing.assert_allclose([box["x"] + 9, box["y"] + 9], place, atol=1.0)
+        knob = "document.querySelector('.vtb-pad .vtb-knob').style.left"
+        knob_at_start = page.evaluate(knob)
         for cancelled in (True, False):
             page.mouse.move(*place)
             page.mouse.down()
@@ -187,6 +189,7 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
             page.wait_for_selector("[data-kind=preview]")
             settle(page)
             assert share(picture(page), GREEN) > 0.0005
+            assert page.evaluate(knob) != knob_at_start  # The pad shows the draft, too.
             if cancelled:
                 page.keyboard.press("Escape")
                 page.wait_for_selector("[data-kind=preview]", state="detached")

@@ -229,6 +229,10 @@ class LoopStatistics:
             return "error"
         return "warning" if any(t.warnings for t in thresholds) else "ok"
 
+    def _cause(self) -> str:
+        errors = [f"{t.errors} x {name} > {1e6 * t.error:.0f} us" for name, t in self.thresholds.items() if t.errors]
+        return f" ({', '.join(errors)})" if errors else ""
+
     def to_dict(self) -> dict[str, Any]:
         """Return the statistics as plain data, fit for JSON."""
         return {
@@ -261,7 +265,7 @@ class LoopStatistics:
             cells += [f"{count} > {1e6 * limit:.0f}" for count, limit in counts]
             lines.append(form.format(name, *cells))
         summary = f"{self.cycles} cycles of {1e6 * self.period:.0f} us, {self.misses} deadlines missed"
-        lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level}")
+        lines.append(f"{summary} ({self.longest_run} in a row at most): {self.level}{self._cause()}")
         if self.off_pace:
             lines.append(
                 f"ALARM: in {self.off_pace} cycles the messages that begin them came at another pace than the period"

@@ -61,9 +61,9 @@ class Draggable {
     return this.held && this.watched.draft !== "cancelled";
   }
 
-  // Shows the present values, unless they are being dragged.
-  show() {
-    if (!this.#isDragged && this.watched.draft !== "open") this.place();
+  // Shows the values of the variable, present or drafted elsewhere, unless it is being dragged itself.
+  show(values) {
+    if (!this.#isDragged) this.place(values);
   }
 
   remove() {
@@ -100,8 +100,8 @@ class Pad extends Draggable {
     this.knob.style.top = `${100 * (1 - y)}%`;
   }
 
-  place() {
-    const { values, entries } = this.watched;
+  place(values) {
+    const { entries } = this.watched;
     this.put(
       ...[0, 1].map((index) => {
         const { min, max } = entries[index].slider;
@@ -130,9 +130,9 @@ class Dial extends Pad {
     this.put(0.5 + 0.42 * Math.cos(angle), 0.5 + 0.42 * Math.sin(angle));
   }
 
-  place() {
+  place([angle]) {
     this.drafted = null;
-    this.#turn(this.watched.values[0]);
+    this.#turn(angle);
   }
 }
 
@@ -147,8 +147,7 @@ class Handle extends Draggable {
     this.#follow();
   }
 
-  place() {
-    const [x, y, z] = this.watched.values;
+  place([x, y, z]) {
     this.at = [x, y, this.isSpatial ? z : 0];
   }
 

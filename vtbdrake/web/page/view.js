@@ -76,8 +76,12 @@ class Watched {
 
   // Returns the value of the variable with other entries, by index.
   #with(changes) {
-    const values = this.values.map((old, index) => changes[index] ?? old);
+    const values = this.#changed(changes);
     return this.variable.shape.length ? this.page.shaped(values, this.variable.shape) : values[0];
+  }
+
+  #changed(changes) {
+    return this.values.map((old, index) => changes[index] ?? old);
   }
 
   // A drag is a draft: a fork of now runs ahead with it.
@@ -89,6 +93,7 @@ class Watched {
       this.entries[index].text.value = number(value);
       this.entries[index].slider.value = value;
     }
+    for (const part of this.draggables) part.show(this.#changed(changes));
     this.page.preview(this, { [this.address]: this.#with(changes) });
   }
 
@@ -121,7 +126,7 @@ class Watched {
       }
       entry.slider.value = now;
     });
-    for (const part of this.draggables) part.show();
+    if (this.draft !== "open") for (const part of this.draggables) part.show(this.values);
     this.#extend(time);
   }
 
@@ -183,6 +188,7 @@ class Page extends Telling {
   #build() {
     this.title = element("h1");
     this.search = element("input", { type: "search", placeholder: "find an address", oninput: () => this.#find() });
+    this.search.addEventListener("keydown", (event) => event.key === "Enter" && this.matches.children.length === 1 && this.matches.firstChild.click());
     this.matches = element("ul", { id: "vtb-matches" });
     this.sections = element("div");
     this.switches = element("div", { id: "vtb-switches" });
