@@ -106,7 +106,7 @@ def test_loop_without_staleness_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_loop_that_forgets_its_faults_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vtbdrake.control.guards.Guards._latch", lambda self, faults: None)
+    monkeypatch.setattr("vtbdrake.control.guards.Guards._latch", lambda self, faults, **_: None)
     with pytest.raises(AssertionError, match="although|without a reset"):
         run(MovedServo(), examples=MANY)
 
