@@ -177,7 +177,7 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
         start = np.array(running.session.snapshot().values[pose])
         place = np.array(page.evaluate(where))
         aside, above = place + np.array([60.0, 25.0]), place + np.array([60.0, -35.0])
-        drawn(page, f"document.querySelector('{handle}').style.transform")
+        page.wait_for_selector(handle)
         box = page.locator(handle).bounding_box()
         assert box is not None
         np.testing.assert_allclose([box["x"] + 9, box["y"] + 9], place, atol=1.0)

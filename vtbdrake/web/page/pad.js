@@ -143,6 +143,7 @@ class Handle extends Draggable {
     super(watched, "vtb-place", `${watched.address} in the scene (with shift: up and down)`);
     this.root.dataset.address = watched.address;
     this.isSpatial = watched.variable.shape[0] > 2;
+    this.root.hidden = true; // until its place is known
     document.body.append(this.root);
     this.#follow();
   }
