@@ -108,9 +108,15 @@ class Headset:
         self.send({"time": now, "head": None, "left": None, "right": hand})
         return now
 
+    def _status(self) -> dict[str, Any]:
+        message: dict[str, Any] = json.loads(self._socket.recv(PATIENCE))
+        if "armed" not in message:
+            raise RuntimeError(f"the server refuses a headset: {message}")
+        return message
+
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> None:
         """Wait for a status."""
-        while not condition(json.loads(self._socket.recv(PATIENCE))):
+        while not condition(self._status()):
             pass
 
     def lead(self) -> None:
@@ -123,7 +129,7 @@ class Headset:
         while not leads:  # The motion of the arm changes.
             self.hold(1.0, grip=False)
             self.hold(1.0, grip=True)
-            leads = json.loads(self._socket.recv(PATIENCE))["leading"]
+            leads = self._status()["leading"]
 
 
 @contextmanager
