@@ -22,7 +22,7 @@ from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenar
 from vtbdrake_diagrams.manipulator.studies.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
 
 SECONDS = 20.0
-"""Of the recording."""
+"""The duration of the recording, in seconds."""
 WINDOW = 200
 """Steps of a rollout of MuJoCo's: longer ones run away from the recording."""
 RECORD = {POSITION: "dps.env.joint_position", TORQUE: "dps.joint_torque"}

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.components.estimation import chi_square_quantile, squared_distances
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotation
@@ -45,8 +46,8 @@ _BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
 _RIGHT, _STEM = 0.25, 0.6
 # The `outline` (m) with which the detector runs a second time: covariances are linear in its square.
 _OUTLINE = 0.05
-# Of two numbers and of one: 95 % of chi-square lie below.
-_CHI2_POSITION, _CHI2_DIAMETER = 5.99, 3.84
+# 95 % of the squared errors of positions and of diameters lie below.
+_POSITION_GATE, _DIAMETER_GATE = (chi_square_quantile(0.95, degrees) for degrees in (2, 1))
 
 
 def rioja_map(inventories: dict[str, Any], *, deviation: float = 0.3, diameter: float = 0.03) -> Landmarks:
@@ -289,7 +290,7 @@ class Errors:
         """Return the squared errors by their covariances, of positions and diameters, and -2 ln of the likelihood."""
         share = (outline / _OUTLINE) ** 2
         P, variances = self.P + share * self.dP, self.variances + share * self.dvariances
-        places = np.einsum("ki,ki->k", self.positions, np.linalg.solve(P, self.positions[:, :, None])[:, :, 0])
+        places = squared_distances(self.positions, P)
         thick = self.diameters**2 / variances
         unlikelihood = places.sum() + thick.sum() + np.log(np.linalg.det(P)).sum() + np.log(variances).sum()
         return places, thick, float(unlikelihood)
@@ -306,7 +307,7 @@ def outline_rows(name: str, full: Array, results: list[Detection]) -> Iterator[t
         outline = fitted.likeliest()
         cells = []
         for places, thick, _ in (judge.squares(0.0), judge.squares(outline)):
-            within = np.mean(places < _CHI2_POSITION), np.mean(thick < _CHI2_DIAMETER)
+            within = np.mean(places < _POSITION_GATE), np.mean(thick < _DIAMETER_GATE)
             cells += [f"{places.mean() / 2.0:.1f}, {within[0]:.0%}", f"{thick.mean():.1f}, {within[1]:.0%}"]
         yield name, f"{outline:.2f}", str(len(judge.diameters)), *cells
 

@@ -45,7 +45,7 @@ def place_of_drive(page: Page, chart: str, number: int) -> tuple[float, float]:
 
 
 def _on_screen(page: Page, chart: str, x_of_data: str, y_of_data: str) -> tuple[float, float]:
-    """Where a point of a chart lies on the screen, from expressions for its values."""
+    """Return where a point of a chart lies on the screen, from expressions for its values."""
     x, y = page.evaluate(f"[vtb.{chart}.x({x_of_data}), vtb.{chart}.y({y_of_data})]")
     box = page.locator(f"#{page.evaluate(f'vtb.{chart}.canvas.id')}").bounding_box()
     assert box is not None

@@ -44,7 +44,7 @@ COLUMNS = {
     "coverage": ("coverage", 1.0),
     "whiteness p": ("whiteness", 1.0),
 }
-"""By title, the field of a `SignalComparison` in tables, and the factor to the unit of the title."""
+"""The columns of tables: title -> field of a `SignalComparison`, and the factor to the unit of the title."""
 
 
 class Verdict(StrEnum):

@@ -168,7 +168,7 @@ class Running:
 
 @dataclass
 class StatedRollouts(ABC):
-    """What a file states about rollouts: that of a problem, or of a campaign.
+    """Rollouts as a file states them: the file of a problem, or of a campaign.
 
     Attributes:
         noun, example, error: Class attributes: a word for what the file states and some of its keys, in messages, and

@@ -355,8 +355,8 @@ def _comparison_table(comparisons: Sequence[Comparison], baseline: str) -> str:
     colour = {"better": "met", "worse": "missed"}
     rows = []
     for each in comparisons:
-        cells = [f"<td>{html.escape(text)}</td>" for text in each.row]
-        cells[-1] = f'<td class="{colour.get(each.difference, "")}">{each.difference}</td>'
+        classes = ["", "", *["number"] * (len(each.row) - 3), colour.get(each.difference, "")]
+        cells = (f'<td class="{name}">{html.escape(text)}</td>' for name, text in zip(classes, each.row, strict=True))
         rows.append(f"<tr{' class=all' if each.condition == ALL else ''}>{''.join(cells)}</tr>")
     head = "".join(f"<th>{title}</th>" for title in COMPARED)
     return (

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Part:
-    """What was set from a state on: values by address, by the number of the step since then."""
+    """Values that were set from a state on: by the number of the step since then, address -> value."""
 
     start: Snapshot
     writes: dict[int, dict[str, Any]] = field(default_factory=dict)

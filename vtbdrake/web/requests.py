@@ -16,7 +16,7 @@ _PERIOD = 0.5  # s between two looks at whether the thread is alive
 
 
 class Requests:
-    """What other threads ask a thread to do, which does it in their order when it looks for it.
+    """Requests of other threads to a thread, which carries them out in their order when it looks for them.
 
     Args:
         error: What is raised where a thread is asked that has ended.

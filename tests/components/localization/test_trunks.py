@@ -114,7 +114,7 @@ def range_bound(distance, diameter, *, noise, detector):
 
 
 def test_edges_that_are_not_seen_change_what_is_claimed_as_the_outline_says():
-    """Of each trunk one edge is dark, and returns no rays: the other ranges are as exact as before."""
+    """One edge of each trunk is dark, and returns no rays: the other ranges are as exact as before."""
     outline, rng, rows = 0.05, np.random.default_rng(3), []
     for seed in range(12):
         scene = ring(seed, count=10, distance=(4.0, 6.0))

@@ -142,7 +142,7 @@ class Auto(Solver):
         yield
         model_best = self._best
         if model_best is not None and self._has_local:
-            yield from self._descent(model_best.point, share=1.0 if reserve else 1.0 / 3.0)
+            yield from self._descent(model_best.point, whole=reserve > 0)
             yield from self._other_basins()
         fruitless, start = 0, 0
         least = self._generations if reserve else 0
@@ -164,13 +164,13 @@ class Auto(Solver):
             yield
         self._spent()
 
-    def _descent(self, start: Point, *, share: float) -> Iterator[None]:
+    def _descent(self, start: Point, *, whole: bool) -> Iterator[None]:
         """Search locally from a point; go on in another box while the best point lies at the border of its own.
 
-        A search gets a ``share`` of what is left, all of it without a reserve for the last search if that is 1.
+        A search gets the ``whole`` of what is left, or else a third of it, without the reserve for the last search.
         """
         while self._left_but_polish() > 0:
-            limit = math.inf if share == 1.0 else share * self._left_but_polish()
+            limit = math.inf if whole else self._left_but_polish() / 3.0
             self._begin_local(start, radius=LOCAL_RADIUS, limit=limit)
             yield
             end = self._stage_best

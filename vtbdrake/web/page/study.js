@@ -238,7 +238,6 @@ class Page extends Telling {
     Object.assign(shown, { title: "a click hides it", onclick: () => shown.remove() });
   }
 
-
   // -- what comes from the study
 
   #take(message) {

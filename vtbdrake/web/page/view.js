@@ -187,8 +187,12 @@ class Page extends Telling {
 
   #build() {
     this.title = element("h1");
-    this.search = element("input", { type: "search", placeholder: "find an address", oninput: () => this.#find() });
-    this.search.addEventListener("keydown", (event) => event.key === "Enter" && this.matches.children.length === 1 && this.matches.firstChild.click());
+    this.search = element("input", {
+      type: "search",
+      placeholder: "find an address",
+      oninput: () => this.#find(),
+      onkeydown: (event) => event.key === "Enter" && this.matches.children.length === 1 && this.matches.firstChild.click(),
+    });
     this.matches = element("ul", { id: "vtb-matches" });
     this.sections = element("div");
     this.switches = element("div", { id: "vtb-switches" });
