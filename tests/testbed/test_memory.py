@@ -3,10 +3,14 @@
 import gc
 import importlib
 import pkgutil
+import threading
+import time
 import weakref
+from types import SimpleNamespace
 
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
 import vtbdrake.components
@@ -15,6 +19,7 @@ import vtbdrake_diagrams
 from tests.lcm.iiwa import IiwaScenario
 from tests.testbeds import PendulumScenario
 from vtbdrake.state import AddressedSystem
+from vtbdrake.testbed import step_watch
 
 for package in (vtbdrake.components, vtbdrake.testbed, vtbdrake_diagrams):
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
@@ -35,10 +40,15 @@ def test_our_systems_have_no_dict_of_their_own():
     assert [kind for kind in ours if not issubclass(kind, AddressedSystem) and "__slots__" not in vars(kind)] == []
 
 
+def _collect():
+    for _ in range(20):  # A plant that a system of the Diagram owns is freed after it.
+        if not gc.collect():
+            return
+
+
 def _plants():
     """All plants that are alive, by identity; who holds the result keeps them so."""
-    for _ in range(3):  # A plant that a system of the Diagram owns is freed after it.
-        gc.collect()
+    _collect()
     return {id(thing): thing for thing in gc.get_objects() if isinstance(thing, MultibodyPlant)}
 
 
@@ -63,3 +73,32 @@ def test_a_context_that_was_read_is_freed(address):
     del context
     gc.collect()
     assert reference() is None
+
+
+def test_a_testbed_that_was_looked_at_is_freed_while_the_watcher_rests(monkeypatch):
+    looked, resting, rested = threading.Event(), threading.Event(), threading.Event()
+    look = step_watch.StepWatch.look
+
+    def rest(seconds):
+        time.sleep(0.01)
+        if looked.is_set():
+            resting.set()
+            rested.wait(60.0)
+
+    def look_once(self):
+        look(self)
+        looked.set()
+
+    monkeypatch.setattr(step_watch, "time", SimpleNamespace(sleep=rest))
+    monkeypatch.setattr(step_watch.StepWatch, "look", look_once)
+    testbed = PendulumScenario().build()
+    plant = weakref.ref(testbed.plant)
+    try:
+        with step_watch.StepWatch(Simulator(testbed.diagram, testbed.default_context()), str):
+            assert looked.wait(60.0)
+        assert resting.wait(60.0)
+        del testbed
+        _collect()
+        assert plant() is None
+    finally:
+        rested.set()

@@ -155,15 +155,18 @@ class _Watcher:
         with self._lock:
             return [watch for watch in self._watches if watch.active]
 
+    def _look(self) -> bool:
+        """Look at all active watches, and return whether there are any; none of them is held afterwards."""
+        watches = self._active()
+        for watch in watches:
+            watch.look()
+        return bool(watches)
+
     def _run(self) -> None:
         idle = 0.0
         while idle < _REST:
             time.sleep(PERIOD)
-            watches = self._active()
-            for watch in watches:
-                watch.look()
-            idle = 0.0 if watches else idle + PERIOD
-            del watches
+            idle = 0.0 if self._look() else idle + PERIOD
         self.runs = False
         if self._active():  # It became active before that was known.
             self.wake()
