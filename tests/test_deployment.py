@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
@@ -240,21 +242,28 @@ def test_silent_fallback_keeps_its_protected_channel() -> None:
     assert b"foreign" not in robot.data(COMMAND) != []
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-def test_error_in_the_block_sends_the_fallback_once(error: type[BaseException]) -> None:
+def fail() -> bool:
+    raise RuntimeError
+
+
+def terminate() -> bool:
+    assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL  # It would end the tests.
+    signal.raise_signal(signal.SIGTERM)
+    return False
+
+
+@pytest.mark.parametrize(("fail", "error"), [(terminate, KeyboardInterrupt), (fail, RuntimeError)])
+def test_error_in_the_block_sends_the_fallback_once(fail: Callable[[], bool], error: type[BaseException]) -> None:
     scenario = ServoMachineScenario(rate=0.0)
     with Hub(port=0) as hub, MachineProcess(scenario, hub.url):
         ear = Ear(hub.url)
-
-        def fail() -> bool:
-            raise error
-
         with pytest.raises(error), scenario.deploy(hub.url, values=FAR) as runtime:
             runtime.take_over()
             runtime.run(cycles=10)
             runtime.run(until=fail)
         heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize("interrupted", [False, True])

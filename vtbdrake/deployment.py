@@ -20,6 +20,7 @@ from vtbdrake.lcm.protocol import Protocol, protocol_of
 from vtbdrake.monitoring.residuals import ResidualConfig
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, VirtualTestbed
+from vtbdrake.testbed.interrupt import sigterm_interrupts
 
 __all__ = ["Deployment", "DeploymentError", "Runtime", "deploy"]
 
@@ -210,7 +211,11 @@ def deploy(
         target.restore(context, start)
     target.write(context, values or {})
     recorder = None
-    with deployment.runtime(target, bridge, context=context, **options) as runtime, ExitStack() as stack:
+    with (
+        sigterm_interrupts(),
+        deployment.runtime(target, bridge, context=context, **options) as runtime,
+        ExitStack() as stack,
+    ):
         if runtime.slow_parts.statistics:
             _log.info("waiting for the processes of the slow parts %s", ", ".join(runtime.slow_parts.statistics))
             runtime.slow_parts.wait_until_ready()

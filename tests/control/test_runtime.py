@@ -233,6 +233,45 @@ def test_interrupted_loop_leaves_the_machine_at_rest(rate, alone):
     assert len(bridge.sent) == left
 
 
+@pytest.mark.parametrize("presses", [{1}, {2}, {20, 21}, {1, 37}])
+@pytest.mark.parametrize("ends_by_error", [False, True])
+def test_ctrl_c_waits_until_the_machine_is_at_rest(ends_by_error, presses):
+    guards = Guards(ServoScenario(rate=20.0).interface(), PERIOD, leave_time=0.1)
+    runtime, bridge, _ = switched(rate=20.0, guards=guards)
+    runtime.run(cycles=60)
+    assert np.abs(sent(bridge)[-1]).min() > 0.4
+    count, publish = len(bridge.sent), bridge.publish
+
+    def pressed(actuation):
+        if len(bridge.sent) - count in presses:
+            signal.raise_signal(signal.SIGINT)
+        return publish(actuation)
+
+    bridge.publish = pressed
+    with pytest.raises(KeyboardInterrupt):
+        if ends_by_error:
+            runtime.run(until=lambda: 1 / 0)
+        runtime.leave("the loop ended")
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0] and len(bridge.sent) - count == pytest.approx(101, abs=2)
+
+
+def test_ctrl_c_ends_fallbacks_that_go_on_for_longer_than_two_seconds():
+    guards = Guards(ServoScenario().interface(), PERIOD, leave_time=np.inf)
+    runtime, bridge, clock = switched(guards=guards)
+    runtime.run(cycles=10)
+    begin, publish = clock.now(), bridge.publish
+
+    def pressed(actuation):
+        if clock.now() > begin + 0.5:
+            signal.raise_signal(signal.SIGINT)
+        return publish(actuation)
+
+    bridge.publish = pressed
+    with pytest.raises(KeyboardInterrupt):
+        runtime.leave("the loop ended")
+    assert clock.now() - begin == pytest.approx(2.0, abs=3 * PERIOD)
+
+
 def test_loop_without_commands_leaves_at_once(caplog):
     runtime, bridge, clock = make()
     runtime.run(cycles=5)

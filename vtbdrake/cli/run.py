@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from vtbdrake.child_process import ending_signals, logging_in_thread
+from vtbdrake.child_process import logging_in_thread
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
@@ -113,8 +112,7 @@ def run(
     )
     incomplete: RecordingError | None = None
     try:
-        # SIGTERM ends the loop as Ctrl-C does.
-        with ending_signals(signal.default_int_handler), logging_in_thread(), loop as runtime:
+        with logging_in_thread(), loop as runtime:
             begin = runtime.clock.now()
             with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 show(real_time, {"real_time": real_time.grants})

@@ -34,7 +34,7 @@ from vtbdrake.control.switching import (
 )
 from vtbdrake.failures import FAILURES
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
-from vtbdrake.testbed.interrupt import Interruptible
+from vtbdrake.testbed.interrupt import Interruptible, interrupts_postponed
 from vtbdrake.testbed.testbed import Positions
 
 _log = logging.getLogger(__name__)
@@ -42,6 +42,7 @@ _log = logging.getLogger(__name__)
 _MOST_POLLS = 100  # of what has waited while the loop was held up
 _KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
 _WAIT = 0.1  # s, for newer samples after a pause
+_POSTPONED = 2.0  # s, for which Ctrl-C waits at most while the fallbacks bring the machine to rest
 
 
 class Runtime(Closing, Stepped):
@@ -410,26 +411,28 @@ class Runtime(Closing, Stepped):
 
         They command for the guards' ``leave_time``, until the machine is released, or until they send nothing more. A
         machine in lock-step gets one command: it stands still afterwards. Without a cycle since the last call, nothing
-        is done.
+        is done. Ctrl-C, and SIGTERM if it has a handler, are postponed until they have ended, for 2 s at most: a press
+        too many, or one that arrives twice, does not leave a machine with half a command.
         """
         if self._left == self.cycles:
             return
-        self._left = self.cycles
-        now = self.clock.now()
-        # In cycles: on a busy computer they take longer, and each changes a limited command by a period's worth.
-        left = 0.0 if self._in_lock_step else self.guards.leave_time / self.period
-        verdict = self.guards.latch(
-            reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now, level=logging.INFO
-        )
-        commands = verdict.actuation
-        while commands:
-            self.guards.note_unsent(self.bridge.publish(commands))
-            left -= 1.0
-            if left < 0.0 or self._released:
-                return
-            now = self.clock.wait_until(now + self.period)
-            self.bridge.poll()
-            commands = self.guards.fall_back(now, self.bridge.sensed, at=now)
+        with interrupts_postponed() as interrupts:
+            self._left = self.cycles
+            begin = now = self.clock.now()
+            # In cycles: on a busy computer they take longer, and each changes a limited command by a period's worth.
+            left = 0.0 if self._in_lock_step else self.guards.leave_time / self.period
+            verdict = self.guards.latch(
+                reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now, level=logging.INFO
+            )
+            commands = verdict.actuation
+            while commands:
+                self.guards.note_unsent(self.bridge.publish(commands))
+                left -= 1.0
+                if left < 0.0 or self._released or (interrupts and now - begin > _POSTPONED):
+                    return
+                now = self.clock.wait_until(now + self.period)
+                self.bridge.poll()
+                commands = self.guards.fall_back(now, self.bridge.sensed, at=now)
 
     @property
     def _released(self) -> bool:

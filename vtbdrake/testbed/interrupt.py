@@ -1,10 +1,11 @@
-"""Ctrl-C while Drake runs: an exception that pybind11 drops is raised again."""
+"""Ctrl-C and SIGTERM: while Drake runs, while a machine is brought to rest, and in a program that has no handler."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -57,3 +58,42 @@ class Interruptible:
         self._restore()
         if error is not self._raised:
             self.raise_interrupt()
+
+
+@contextmanager
+def interrupts_postponed() -> Iterator[list[int]]:
+    """Within the block, keep SIGINT and SIGTERM that have a handler; their handlers run at its end.
+
+    Yields the numbers of the signals that have come. Nothing happens outside the main thread.
+    """
+    handlers: dict[int, Any] = {}
+    arrived: list[int] = []
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for which in (signal.SIGINT, signal.SIGTERM):
+                if callable(handler := signal.getsignal(which)):
+                    handlers[which] = handler
+                    signal.signal(which, lambda number, frame: arrived.append(number))
+        yield arrived
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if arrived:
+            signal.raise_signal(arrived[0])
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Within the block, SIGTERM raises KeyboardInterrupt, as Ctrl-C does, where it would kill the process at once.
+
+    Nothing happens outside the main thread, or if the program handles or ignores SIGTERM.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
