@@ -110,6 +110,10 @@ class Spline:
         padded = np.concatenate(([0.0] * 2, inner, [self.duration] * 2))
         return (padded[:-2] + padded[1:-1] + padded[2:]) / 3.0
 
+    @cached_property
+    def _site_values(self) -> Array:
+        return self.matrix(self.sites)
+
     def matrix(self, times: ArrayLike, derivative: int = 0) -> Array:
         """Return B at some times, or one of its derivatives, so that ``matrix(times) @ knots`` are values.
 
@@ -192,7 +196,7 @@ class Spline:
         At `sites` the two curves agree. They agree everywhere if ``dt`` is a whole number of pieces, as far as the
         curve w reaches, for the orders ``zero`` and ``linear``.
         """
-        shift = np.linalg.solve(self.matrix(self.sites), self.matrix(self.sites + dt))
+        shift = np.linalg.solve(self._site_values, self.matrix(self.sites + dt))
         return np.asarray(shift, dtype=float)
 
 

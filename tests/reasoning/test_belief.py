@@ -17,6 +17,7 @@ from vtbdrake.reasoning import Belief, BeliefError, BeliefToStart
 from vtbdrake.rollout import ProcessExecutor, RolloutRunner, RolloutTask, SerialExecutor, ThreadExecutor
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 THETA, OMEGA = "sim.sys.Pendulum.theta.position", "sim.sys.Pendulum.theta.velocity"
@@ -138,6 +139,20 @@ def test_a_perfect_belief_of_a_discrete_walk_is_exact_contacts_included():
     found = RolloutRunner(task).run({}, start=start).record
     np.testing.assert_array_equal(found[pose], _future(task, testbed, simulator, pose))
     assert found["sim.sense.foot_contact.foot_contact"].any(axis=1).all(), "a foot is always on the ground"
+
+
+def test_a_perfect_belief_sets_an_inertia_that_the_mass_would_scale():
+    testbed = (scenario := CartPoleScenario()).build()
+    context = testbed.default_context()
+    mass, inertia = (f"sim.sys.cart_pole.pole.{name}" for name in ("mass", "inertia"))
+    expected = testbed.read(context, inertia)
+    assert expected.any()
+    testbed.write(context, {mass: 2.0 * testbed.read(context, mass)})
+    testbed.write(context, {inertia: expected})
+    runner = RolloutRunner(RolloutTask(scenario.mental(), T, sample_period=T, record=(mass, inertia)))
+    record = runner.run({}, start=Belief.perfect(testbed, context).start(runner.testbed)).record
+    assert record[mass][0] == testbed.read(context, mass)
+    np.testing.assert_allclose(record[inertia][0], expected, rtol=1e-12)
 
 
 def test_a_perfect_belief_reaches_a_world_with_another_integrator():

@@ -12,7 +12,7 @@ from vtbdrake.compiled import UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
-from vtbdrake.reasoning import Budget, SearchConfig
+from vtbdrake.reasoning import Belief, Budget, SearchConfig
 from vtbdrake.rollout import Constraint, Cutoff, Pruning, Quality, RolloutResult, RolloutTask, SerialExecutor
 from vtbdrake.rollout.compiled import CompiledExecutor
 from vtbdrake.rollout.executor import run_rollouts
@@ -241,3 +241,20 @@ def test_studies_and_boundaries_are_the_same() -> None:
     np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
     boundaries = [problem.boundary(resolution=2.0, coarse=20.0, executor=executor) for executor in studies]
     assert str(boundaries[0]) == str(boundaries[1])
+
+
+def test_a_perfect_belief_is_compiled_unless_the_true_plant_differs(caplog: pytest.LogCaptureFixture) -> None:
+    testbed = SCENARIO.build()
+    context = testbed.default_context()
+    testbed.simulator(context).AdvanceTo(0.2)
+    with (
+        make_reasoner(SCENARIO, rollouts=8, executor="compiled") as compiled,
+        make_reasoner(SCENARIO, rollouts=8, executor="serial") as serial,
+    ):
+        for mass, computed in ((1.0, "compiled"), (1.3, "drake")):
+            testbed.write(context, {MASS: mass})
+            belief = Belief.perfect(testbed, context)
+            decision, expected = compiled.decide(belief), serial.decide(belief)
+            assert decision.quality == pytest.approx(expected.quality, rel=1e-11)
+            assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {computed}
+            assert (f"{MASS} is 1.3 instead of 1.0" in caplog.text) == (computed == "drake")

@@ -185,10 +185,7 @@ class CompiledRollouts:
 
     def from_z(self, z: Array, t0: float) -> CompiledBatch:
         """Make the rollouts that begin at the vectors z, shape (n, nz), and the time t0 (s)."""
-        fixed = self.walker.fixed
-        for entries, path, why in fixed:
-            if not (z[:, entries] == self._z0[entries]).all():
-                raise UnsupportedTestbedError(f"{path} differs from what was compiled: {why}")
+        self.walker.check_fixed(z, self._z0)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
         chunks = list(_chunks(len(z)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +21,9 @@ from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Unsuppo
 from vtbdrake.compiled.registry import equations_of
 from vtbdrake.state import AddressError, Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
+from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, read_group, write_group
-from vtbdrake.state.variables import Place
+from vtbdrake.state.variables import A, Place
 from vtbdrake.testbed.dependencies import connections, writer_of
 
 MEMORY, EXTRA = "memory", "extra"
@@ -108,6 +109,9 @@ class Walker:
         self.draws = tuple(self._reserved())
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
+        self._places: dict[str, slice] = {}
+        self._state = _indices(b.entries for b in self.blocks.values() if b.kind == DISCRETE and b.path != "switches")
+        self._all_fixed = _indices(entries for entries, _, _ in self.fixed)
         self._compiled_in = self._read_compiled_in(context)
 
     # -- z
@@ -144,8 +148,8 @@ class Walker:
         for path, value in self._read_compiled_in(context).items():
             if value != self._compiled_in[path]:
                 raise UnsupportedTestbedError(
-                    f"{path} differs from what was compiled, such as a mass, a locked joint or the position of a "
-                    "switch: compile the testbed in this context"
+                    f"{path} differs from what was compiled{self._difference(path, context)}: compile the testbed in "
+                    "this context, or name what varies in parameters="
                 )
         for (path, number), value in self._fixed_inputs.items():
             other = self._fixed_value(context, path, number)
@@ -156,17 +160,33 @@ class Walker:
                     "testbed in this context"
                 )
 
+    def _difference(self, path: str, context: Context) -> str:
+        """Return the variables of a system that differ from the compiled ones as text, at most three of them."""
+        pairs = {
+            address: (variable.get(context), variable.get(self.context))
+            for address, variable in self.variables.items()
+            if variable.kind == A and not variable.derived and self._within(path, address)
+        }
+        differing = [
+            f"{address} is {np.asarray(value).tolist()} instead of {np.asarray(compiled).tolist()}"
+            for address, (value, compiled) in pairs.items()
+            if not np.array_equal(value, compiled)
+        ]
+        return f" ({', '.join([*differing[:3], *(['...'] if differing[3:] else [])])})" if differing else ""
+
     def place(self, address: str) -> slice:
         """Return where the value of a variable lies in z, to be varied.
 
         Raises:
             ValueError: It does not lie there, or is compiled in; the reason is named.
         """
-        entries = self._lies(address)
-        for fixed, _, reason in self.fixed:
-            if fixed.start < entries.stop and entries.start < fixed.stop:
-                raise ValueError(f"{address} cannot be varied in the compiled testbed: {reason}")
-        return entries
+        if address not in self._places:
+            entries = self._lies(address)
+            for fixed, _, reason in self.fixed:
+                if fixed.start < entries.stop and entries.start < fixed.stop:
+                    raise ValueError(f"{address} cannot be varied in the compiled testbed: {reason}")
+            self._places[address] = entries
+        return self._places[address]
 
     def _lies(self, address: str) -> slice:
         variable = self.variables[address]
@@ -190,13 +210,32 @@ class Walker:
             return False
         return True
 
+    def check_fixed(self, z: Array, compiled: Array) -> None:
+        """Check that vectors z, shape (n, size), have the values of the compiled one in what is compiled in.
+
+        Raises:
+            UnsupportedTestbedError: They differ.
+        """
+        if not (z[:, self._all_fixed] == compiled[self._all_fixed]).all():
+            path, why = next(
+                (path, why) for entries, path, why in self.fixed if not (z[:, entries] == compiled[entries]).all()
+            )
+            raise UnsupportedTestbedError(f"{path} differs from what was compiled: {why}")
+
     def is_finite(self, z: Array) -> Any:
         """Return whether all state of each z is finite, shape (n,)."""
-        finite = np.ones(len(z), dtype=bool)
-        for block in self.blocks.values():
-            if block.kind == DISCRETE and block.path != "switches":
-                finite &= np.isfinite(z[:, block.entries]).all(axis=1)
-        return finite
+        return np.isfinite(z[:, self._state]).all(axis=1)
+
+    def shared_with(self, layout: StateLayout) -> tuple[Array, Array]:
+        """Return where numbers of a layout lie in z, and where they lie among its numbers: two arrays of indices."""
+        pairs = [
+            (block.entries, place)
+            for block in self.blocks.values()
+            if block.kind in (DISCRETE, PARAMETER)
+            for place in [layout.slice_of_group(self._systems[block.path], block.kind, int(block.name))]
+            if place is not None
+        ]
+        return _indices(entries for entries, _ in pairs), _indices(place for _, place in pairs)
 
     # -- expressions
 
@@ -463,6 +502,10 @@ class _Reading(At):
         if isinstance(port, int):
             return port
         return int(self._evaluation.walker.equations[self._path].system.GetInputPort(port).get_index())
+
+
+def _indices(places: Iterable[slice]) -> Array:
+    return np.concatenate([np.arange(0), *(np.arange(place.start, place.stop) for place in places)])
 
 
 def _matters(system: System) -> bool:

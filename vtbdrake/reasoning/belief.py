@@ -393,10 +393,13 @@ class BeliefToStart:
         context = self._mental.default_context()
         context.SetTime(dps.time)
         self._mental.dps_layout.put(context, dps.contents)
-        shapes = {v.address: v.shape for v in self._variables.values() if not v.derived}
-        alike = {a: value for a, value in world.values.items() if shapes.get(a) == np.shape(value)}
+        variables = [v for v in self._variables.values() if not v.derived and v.address in world.values]
         try:
-            self._variables.write(context, alike)
+            # In the order in which `Variables.write` sets them. What is equal stays, as setting an inertia rounds it.
+            for variable in sorted(variables, key=lambda variable: variable.order):
+                value = world.values[variable.address]
+                if variable.shape == np.shape(value) and not np.array_equal(variable.get(context), value):
+                    variable.set(context, value)
         except VariableError as error:
             raise BeliefError(f"the true values cannot be set in the mental world: {error}") from error
         return Start(dps.time, self._mental.whole_layout.take(context), values)

@@ -93,7 +93,8 @@ class Candidate:
     @property
     def spread(self) -> float:
         """Return the standard deviation of the quality over the samples; 0 for one sample."""
-        return float(np.std([rollout.value for rollout in self.rollouts])) if self.rollouts else nan
+        values = [rollout.value for rollout in self.rollouts]
+        return float(np.std(values)) if len(values) > 1 else values[0] - values[0] if values else nan
 
     @property
     def has_trajectory(self) -> bool:

@@ -9,8 +9,6 @@ from dataclasses import replace
 from math import inf, nan
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vtbdrake.optimization.evaluator import Evaluator
 from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.risk import Worst
@@ -94,6 +92,7 @@ class DecisionRun:
         self._plan_in_use = plan_in_use
         self._user_plan = user_plan
         self._requested_at = requested_at
+        self._interruptible = Interruptible()
         self._results: dict[RolloutKey, RolloutResult] = {}
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
@@ -107,11 +106,12 @@ class DecisionRun:
 
     def decision(self) -> Decision:
         """Try candidates until the budget is spent or the method has finished."""
-        try:
-            end, message = METHOD, self._search()
-        except _BudgetSpentError as spent:
-            end, message = spent.end, str(spent)
-        return self._conclude(end, message)
+        with self._interruptible:
+            try:
+                end, message = METHOD, self._search()
+            except _BudgetSpentError as spent:
+                end, message = spent.end, str(spent)
+            return self._conclude(end, message)
 
     def _search(self) -> str:
         """Try candidates; return how the method ended."""
@@ -208,11 +208,10 @@ class DecisionRun:
 
     def _collect(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
         try:
-            with Interruptible() as interruptible:
-                for index, result in results:
-                    self._results[keys[index]] = result
-                    self._count += 1
-                    interruptible.raise_interrupt()
+            for index, result in results:
+                self._results[keys[index]] = result
+                self._count += 1
+                self._interruptible.raise_interrupt()
         finally:
             results.close()  # type: ignore[attr-defined]
 
@@ -252,7 +251,7 @@ class DecisionRun:
             rollouts=len(results),
             failed=sum(result.failed for result in results),
             cut_off=sum(result.end in (PRUNED, STALLED) for result in results),
-            rollout_time=float(np.mean([result.wall_time for result in results])) if results else nan,
+            rollout_time=sum(result.wall_time for result in results) / len(results) if results else nan,
             elapsed=elapsed,
             used=max(len(results) / (budget.rollouts or inf), elapsed / (budget.seconds or inf)),
             improvement=improvement,
@@ -281,14 +280,12 @@ class DecisionRun:
         results = [self._results.get((point, sample)) for sample in range(self._reasoner.samples)]
         evaluation = self._evaluations.get(point) or self._evaluator.evaluation(point)
         finished = tuple(result for result in results if result is not None)
-        if evaluation.failed:
-            status = FAILED
-        elif len(finished) < len(results):
-            status = UNFINISHED
-        elif not evaluation.feasible:
-            status = VIOLATES
-        else:
+        if len(finished) == len(results) and evaluation.feasible:
             status = ELIGIBLE if evaluation.exact else CUT_OFF
+        elif evaluation.failed:
+            status = FAILED
+        else:
+            status = UNFINISHED if len(finished) < len(results) else VIOLATES
         has_quality = status in (ELIGIBLE, VIOLATES, CUT_OFF)
         return Candidate(
             number=number,

@@ -69,21 +69,19 @@ class CompiledExecutor(Executor):
             ValueError: The task needs what compiled rollouts cannot do: pruning, a recorded motion, states.
         """
         starts = start_of_each(start, len(points))
-        with Interruptible() as interruptible:
-            for indices in _by_fields(points):
-                of_fields = [points[i] for i in indices]
-                compiled = self._of(task, of_fields)
-                if cutoff is not None and cutoff.is_over:
-                    return
-                results = compiled.run(of_fields, [starts[i] for i in indices])
-                for i, result in zip(indices, results, strict=True):
-                    interruptible.raise_interrupt()
-                    if result is None:
-                        try:
-                            result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
-                        except CancelledError:
-                            return
-                    yield i, result
+        for indices in _by_fields(points):
+            of_fields = [points[i] for i in indices]
+            compiled = self._of(task, of_fields)
+            if cutoff is not None and cutoff.is_over:
+                return
+            results = compiled.run(of_fields, [starts[i] for i in indices])
+            for i, result in zip(indices, results, strict=True):
+                if result is None:
+                    try:
+                        result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
+                    except CancelledError:
+                        return
+                yield i, result
 
     def close(self) -> None:
         self._compiled.clear()
@@ -101,8 +99,9 @@ class CompiledExecutor(Executor):
         if compiled is None or not compiled.varies(addresses):
             if compiled is not None:
                 addresses |= compiled.addresses
-            testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
-            compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
+            with Interruptible():
+                testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
+                compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
             self._compiled.add(key, compiled)
         return compiled
 
@@ -164,6 +163,8 @@ class _CompiledTask:
             workers=workers,
         )
         self._start_context = StartContext(testbed, s0, testbed.copier_from(testbed))
+        self._z0 = self._rollouts.z_of(s0)
+        self._into, self._from = self._rollouts.walker.shared_with(testbed.start_layout)
         self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
 
@@ -204,17 +205,25 @@ class _CompiledTask:
 
     def _begin(self, start: Start | None) -> tuple[np.ndarray, float]:
         if self._last_start is None or self._last_start[0] is not start:
-            self._start_context.set(start)
-            context = self._start_context.context
-            z = self._rollouts.walker.read(context) if self._is_compiled(start) else self._rollouts.z_of(context)
-            self._last_start = start, z, context.get_time()
+            walker = self._rollouts.walker
+            is_compiled = start is not None and self._is_compiled(start)
+            # Other variables change more than their own value: a mass scales an inertia.
+            if start is not None and is_compiled and all(walker.variables[a].place for a in start.values):
+                z = self._z0.copy()
+                z[self._into] = start.contents.numbers[self._from]
+                self._last_start = start, self._rollouts.filled(z, start.values)[0], start.time
+            else:
+                with Interruptible():
+                    self._start_context.set(start)
+                    context = self._start_context.context
+                    z = walker.read(context) if is_compiled else self._rollouts.z_of(context)
+                    self._last_start = start, z, context.get_time()
         return self._last_start[1:]
 
-    def _is_compiled(self, start: Start | None) -> bool:
+    def _is_compiled(self, start: Start) -> bool:
         """Return whether a start has no part in which it could differ from what is compiled in."""
-        if start is None or start.contents.names != self._testbed.start_layout.names:
-            return False
-        return self.varies(frozenset(start.values))
+        is_alike = start.contents.names == self._testbed.start_layout.names
+        return is_alike and self.varies(frozenset(start.values))
 
     def _results(
         self, points: Sequence[Parameters], batch: CompiledBatch, wall_time: float
@@ -228,7 +237,7 @@ class _CompiledTask:
             if k == 0 and f is not None and task.threshold is not None and not task.run_on:
                 exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
                 counts = np.where(exceeded.any(axis=1), exceeded.argmax(axis=1) + 1, counts)
-        for count in np.unique(counts[valid]).tolist():
+        for count in set(counts[valid].tolist()):
             rows = np.flatnonzero(valid & (counts == count))
             yield from self._read(points, rows, batch, [each[rows, :count] for each in samples], wall_time)
 

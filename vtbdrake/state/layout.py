@@ -85,12 +85,16 @@ class StateLayout:
     def slice_of(self, variable: Variable) -> slice | None:
         """Return the slice of the numbers with the value of a variable, in C order; None if it is not among them."""
         place = variable.place
-        for system, groups in self._groups if place is not None else ():
-            for group, index, whole in groups:
-                if place is not None and system is place.system and (group, index) == (place.group, place.index):
-                    start = whole.start + place.start
-                    return slice(start, start + int(np.prod(variable.shape, dtype=int)))
-        return None
+        whole = None if place is None else self.slice_of_group(place.system, place.group, place.index)
+        if place is None or whole is None:
+            return None
+        start = whole.start + place.start
+        return slice(start, start + int(np.prod(variable.shape, dtype=int)))
+
+    def slice_of_group(self, system: System, group: str, index: int) -> slice | None:
+        """Return the slice of the numbers with a numeric group of a leaf system; None if it is not among them."""
+        groups = next((groups for each, groups in self._groups if each is system), [])
+        return next((place for kind, number, place in groups if (kind, number) == (group, index)), None)
 
     def take(self, context: Context) -> FlatState:
         """Return the contents in a root context.
