@@ -220,22 +220,23 @@ class PresentPose(AddressedSystem):
         return PoseEstimate.of(X_WH, covariance, time=estimate.time)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        motion, pose, covariance, status, X_OH, time = (port.Eval(context) for port in self._ports.values())
+        pose, covariance, X_OH = (self._ports[name].Eval(context) for name in ("pose", "covariance", "odometry"))
+        status, time = (float(self._ports[name].Eval(context)[0]) for name in ("status", "time"))
         now = context.get_time()
-        if np.isfinite(covariance).all() and now - time[0] > self._settings.view(context).patience:
+        if np.isfinite(covariance).all() and now - time > self._settings.view(context).patience:
             lost = Localization.unknown(LOST)
-            pose, covariance, status = lost.pose, lost.covariance, [lost.status]
+            pose, covariance, status = lost.pose, lost.covariance, lost.status
         elif np.isfinite(covariance).all():
-            last = MOTION.view(motion)
+            last = MOTION.view(self._ports["motion"].Eval(context))
             elapsed = now - last.time
             X_OA = compose([*last.position.tolist(), last.heading], [self._axle, 0.0, 0.0])
             X_OA_now = compose(X_OA, chord(last.speed * elapsed, last.turn_rate * elapsed))
             X_OH_now = compose(X_OA_now, [-self._axle, 0.0, 0.0])
             X_HH_now = compose(inverse(X_OH), X_OH_now)
-            pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - float(time[0]))
+            pose, covariance = moved(pose, covariance.reshape(3, 3), X_HH_now, self._drift, now - time)
         estimate = self._estimate.mutable(state)
         estimate.time, estimate.position, estimate.heading = now, pose[:2], pose[2]
-        estimate.covariance, estimate.status = np.reshape(covariance, (3, 3)), status[0]
+        estimate.covariance, estimate.status = np.reshape(covariance, (3, 3)), status
 
 
 def moved(X_WH: Array, covariance: Array, motion: Array, drift: DriftModel, duration: float) -> tuple[Array, Array]:

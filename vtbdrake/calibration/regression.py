@@ -529,11 +529,9 @@ def _consistent(model: TorqueRegressor, Y: Array, tau: Array, prior: float) -> A
     size = np.sqrt(len(Y))
     program.Add2NormSquaredCost(R / size, d / size, p)
     inertial = INERTIA_SIZE * len(model.bodies)
-    scales = np.tile(_scales_of(model), len(model.bodies))
-    m, _, _, _, moment, *_ = _MARGIN * _scales_of(model)
-    # Of a sphere.
-    least = [m, 0.0, 0.0, 0.0, moment, moment, moment, 0.0, 0.0, 0.0]
-    far = prior * size * scales
+    mass, mass_moment, moment = _scales_of(model)
+    far = prior * size * np.tile([mass, *3 * [mass_moment], *6 * [moment]], len(model.bodies))
+    least = _MARGIN * np.array([mass, *3 * [0.0], *3 * [moment], *3 * [0.0]])  # of a sphere
     program.Add2NormSquaredCost(np.diag(1.0 / far), model.nominal[:inertial] / far, p[:inertial])
     for k in range(len(model.bodies)):
         rows = slice(INERTIA_SIZE * k, INERTIA_SIZE * (k + 1))
@@ -547,12 +545,12 @@ def _consistent(model: TorqueRegressor, Y: Array, tau: Array, prior: float) -> A
     return np.asarray(result.GetSolution(p))
 
 
-def _scales_of(model: TorqueRegressor) -> Array:
+def _scales_of(model: TorqueRegressor) -> tuple[float, float, float]:
     """Return how large mass, moments of mass and moments of inertia of a body are in this model."""
     numbers = abs(model.nominal[: INERTIA_SIZE * len(model.bodies)].reshape(-1, INERTIA_SIZE))
     mass = max(float(numbers[:, 0].mean()), 1e-9)
-    length = np.sqrt(max(float(numbers[:, 4:7].mean()), 1e-12) / mass)
-    return np.array([mass, *3 * [mass * length], *6 * [mass * length**2]])
+    length = float(np.sqrt(max(float(numbers[:, 4:7].mean()), 1e-12) / mass))
+    return mass, mass * length, mass * length**2
 
 
 def _pseudo(p: Sequence[Any]) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.manipulation import (
@@ -49,6 +49,15 @@ def simulated_gripper(config: SchunkWsgDriver) -> Diagram:
     builder.ExportOutput(measured.get_output_port(), "state_measured")
     builder.ExportOutput(force.get_output_port(), "force_measured")
     return builder.Build()
+
+
+class _Errors(NamedTuple):
+    """The errors of mean and grip, in m, and of their rates, in m/s."""
+
+    mean: float
+    grip: float
+    mean_rate: float
+    grip_rate: float
 
 
 class SchunkWsgControl(AddressedSystem):
@@ -112,16 +121,20 @@ class SchunkWsgControl(AddressedSystem):
             after.moves, after.target, after.start = 1.0, target, context.get_time()
             after.begins, after.parts = [begin for begin, *_ in parts[1:]], [part for _, *part in parts]
 
-    def _errors(self, context: Context) -> tuple[float, float, float, float, float]:
-        """Return the errors of mean and grip, those of their rates, and the force limit."""
-        _, _, limit, start, second, third, end, *parts = self._motion.array(context).tolist()
+    def _errors(self, context: Context) -> _Errors:
+        motion = self._motion.view(context)
+        second, third = motion.begins.tolist()
         # As PiecewisePolynomial does: a part lasts until the next one begins, and beyond its ends nothing moves.
-        elapsed = min(max(context.get_time() - start, 0.0), end)
-        begin, k = (0.0, 0) if elapsed < second else (second, 4) if elapsed < third else (third, 8)
-        grip = parts[k] + (elapsed - begin) * parts[k + 2]
-        rate = parts[k + 1] + (elapsed - begin) * parts[k + 3]
+        elapsed = min(max(context.get_time() - motion.start, 0.0), motion.end)
+        begin, part = (0.0, 0) if elapsed < second else (second, 1) if elapsed < third else (third, 2)
+        grip, rate, grip_slope, rate_slope = motion.parts[part].tolist()
         q0, q1, v0, v1 = self._state_port.Eval(context).tolist()
-        return -(0.5 * q0 + 0.5 * q1), grip - (q0 - q1), -(0.5 * v0 + 0.5 * v1), rate - (v0 - v1), limit
+        return _Errors(
+            mean=-(0.5 * q0 + 0.5 * q1),
+            grip=grip + (elapsed - begin) * grip_slope - (q0 - q1),
+            mean_rate=-(0.5 * v0 + 0.5 * v1),
+            grip_rate=rate + (elapsed - begin) * rate_slope - (v0 - v1),
+        )
 
     def _integrals(self, context: Context) -> tuple[float, float]:
         """Return the integrals of the errors of mean and grip."""
@@ -129,10 +142,10 @@ class SchunkWsgControl(AddressedSystem):
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
         kp, ki, kd = self._gains
-        mean, grip, mean_rate, grip_rate, limit = self._errors(context)
+        errors, most = self._errors(context), 0.5 * self._motion.view(context).max_force
         mean_integral, grip_integral = self._integrals(context)
-        mean_force = kp * mean + kd * mean_rate + ki * mean_integral
-        grip_force = min(max(kp * grip + kd * grip_rate + ki * grip_integral, -0.5 * limit), 0.5 * limit)
+        mean_force = kp * errors.mean + kd * errors.mean_rate + ki * mean_integral
+        grip_force = min(max(kp * errors.grip + kd * errors.grip_rate + ki * grip_integral, -most), most)
         output.SetAtIndex(0, 0.5 * mean_force + grip_force)
         output.SetAtIndex(1, 0.5 * mean_force - grip_force)
 
@@ -149,8 +162,8 @@ class SchunkWsgIntegralControl(SchunkWsgControl):
         return mean, grip
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        mean, grip, *_ = self._errors(context)
-        derivatives.get_mutable_vector().SetFromVector([mean, grip])
+        errors = self._errors(context)
+        derivatives.get_mutable_vector().SetFromVector([errors.mean, errors.grip])
 
 
 def _ramp(start: float, target: float) -> tuple[list[tuple[float, ...]], float]:
