@@ -144,5 +144,6 @@ def test_problem_that_cannot_be_viewed_is_told() -> None:
     assert "expected MODULE:NAME" in error_of("view", PENDULUM, "--problem", "nothing")
     assert "cannot import nothing" in error_of("view", PENDULUM, "--problem", "nothing:problem")
     assert "is no Problem" in error_of("view", PENDULUM, "--problem", "tests.testbeds:PENDULUM")
+    assert "SCENARIO --problem swing:NAME" in error_of("view", "studies/swing.py")
     other = error_of("view", PENDULUM, "--problem", "tests.web.test_drive:problem")
     assert "the problem is one of LimitedPendulumScenario" in other

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,8 @@ from vtbdrake.cli.problem import executor_options, on_error_option
 from vtbdrake.failures import one_line
 
 if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+
     from vtbdrake.testing.campaign import Campaign, Rerun
     from vtbdrake.testing.campaign_report import Evidence
     from vtbdrake.testing.campaign_results import CampaignResult, CampaignRollout, Cell, Comparison
@@ -156,6 +159,14 @@ def _gather_evidence(
     return kept
 
 
+@cache
+def _meshcat() -> Meshcat:
+    """Return the server in which all motions are drawn, one after the other."""
+    from vtbdrake.visualization import make_meshcat
+
+    return make_meshcat()
+
+
 def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: Path) -> Evidence:
     """Write log and animation of a rollout that was run again, and return what there is of it."""
     from vtbdrake.testing.campaign_report import Evidence
@@ -170,10 +181,10 @@ def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: P
         log = f"{stem}.npz"
         save_recording(folder / log, rerun.result.times, numeric)
     if rerun.motion is not None:
-        from vtbdrake.visualization import make_meshcat, show_motion
+        from vtbdrake.visualization import show_motion
 
         try:
-            show_motion(make_meshcat(), rerun.motion).save(folder / f"{stem}.html", shared=True)
+            show_motion(_meshcat(), rerun.motion).save(folder / f"{stem}.html", shared=True)
             animation = f"{stem}.html"
         except ValueError as error:  # There is nothing to draw.
             notes.append(f"There is no animation: {one_line(error)}.")

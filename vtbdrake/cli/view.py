@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +41,31 @@ def _named_problem(text: str) -> Problem:
     return problem
 
 
+def _parse_viewed(text: str) -> Scenario | ProblemFile:
+    """Load a scenario or the file of a problem; the error about a problem in Python tells how it is shown."""
+    from vtbdrake.testbed import ScenarioError
+
+    try:
+        return parse_problem(text)
+    except ScenarioError as error:
+        if text.endswith(".py"):
+            example = f"SCENARIO --problem {Path(text).stem}:NAME"
+        elif _is_problem(text):
+            example = f"SCENARIO --problem {text}"
+        else:
+            raise
+        raise click.BadParameter(f"{error}. A problem in Python is shown with its scenario: {example}") from error
+
+
+def _is_problem(text: str) -> bool:
+    from vtbdrake.optimization import Problem
+
+    module_name, _, name = text.partition(":")
+    return isinstance(getattr(sys.modules.get(module_name), name, None), Problem)
+
+
 @click.command()
-@partial(scenario_argument, parse=parse_problem, metavar="SCENARIO|PROBLEM.yaml")
+@partial(scenario_argument, parse=_parse_viewed, metavar="SCENARIO|PROBLEM.yaml")
 @set_option
 @start_option
 @option(
