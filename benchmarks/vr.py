@@ -27,7 +27,7 @@ from benchmarks.measure import LOWER, Benchmark
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
-from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.hand_command import HandCommand
 from vtbdrake.web import view_loop
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 

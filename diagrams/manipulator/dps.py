@@ -12,7 +12,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Demultiplexe
 from vtbdrake.components.casadi_system import CasadiSystem, clamp
 from vtbdrake.state import NamedVector, Quantity
 from vtbdrake.state.declarations import DISCRETE, PARAMETER, Element
-from vtbdrake.testbed.hand import HAND_SIZE
+from vtbdrake.testbed.hand_command import HAND_SIZE
 from vtbdrake_diagrams.manipulator import leading
 from vtbdrake_diagrams.manipulator.arm import GRAVITY, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression, function

@@ -31,7 +31,7 @@ from vtbdrake.testbed import (
     Signal,
     VirtualTestbedBuilder,
 )
-from vtbdrake.testbed.hand import HAND_SIZE, HandCommand
+from vtbdrake.testbed.hand_command import HAND_SIZE, HandCommand
 from vtbdrake_diagrams.manipulator import leading
 from vtbdrake_diagrams.manipulator.arm import JOINT_NAMES, JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dps import gravity_torque, make_dps

@@ -11,7 +11,7 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from vtbdrake.testbed import Interface, Signal, SignalError
-from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.hand_command import HandCommand
 from vtbdrake.web.hand import Clutch, Delay, HandError, HandMessage, Lead
 
 pytestmark = pytest.mark.one_python

@@ -27,7 +27,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
-from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.hand_command import HandCommand
 from vtbdrake.web import View, view, view_loop
 from vtbdrake.web.hand import HandError, HandMessage
 from vtbdrake.web.tls import Tls, TlsError

@@ -23,7 +23,7 @@ from vtbdrake.lcm.drake_messages import image_array_map
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.station.models import JointLimits, arm_model, driven_joints
 from vtbdrake.testbed import ScenarioError, Signal, VirtualTestbedBuilder
-from vtbdrake.testbed.gripper import FORCE_LIMIT, STATUS_PERIOD
+from vtbdrake.testbed.schunk_wsg import FORCE_LIMIT, STATUS_PERIOD
 
 AGE = 10.0
 """The largest age of a sensor signal, in periods of its messages."""

@@ -43,8 +43,8 @@ from pydrake.systems.sensors import CameraConfig, RgbdSensor, RgbdSensorDiscrete
 from pydrake.visualization import VisualizationConfig
 
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
-from vtbdrake.testbed.gripper import simulated_gripper
 from vtbdrake.testbed.scenario import Scenario, ScenarioError
+from vtbdrake.testbed.schunk_wsg import simulated_gripper
 from vtbdrake.testbed.testbed import VirtualTestbed
 
 _log = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from vtbdrake.deployment import Deployment, Runtime
-    from vtbdrake.testbed.hand import HandCommand
+    from vtbdrake.testbed.hand_command import HandCommand
     from vtbdrake.validity_domain import ValidityDomain
 
 # With 1.51.1, and not with 1.58, poses and contact results after a fixed step of CENIC are those before the step.

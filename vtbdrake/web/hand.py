@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.hand_command import HandCommand
 
 FORGET_TIME = 2.0
 """Seconds beyond the release time without a message after which a headset no longer leads and the robot is disarmed."""

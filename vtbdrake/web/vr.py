@@ -25,7 +25,7 @@ from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.monitoring.live.client import LiveClient, LiveTimeoutError
 from vtbdrake.testbed import Scenario
-from vtbdrake.testbed.hand import HandCommand
+from vtbdrake.testbed.hand_command import HandCommand
 from vtbdrake.testbed.switch import COMMAND
 from vtbdrake.web.hand import HandError, HandMessage, Lead
 from vtbdrake.web.host import CLOSED, first_of, send
