@@ -20,11 +20,9 @@ from vtbdrake_diagrams.forest.studies.drives import (
     SEED,
     Drives,
     Score,
-    best_error_along,
-    least_error_along,
+    against_best,
     scores,
 )
-from vtbdrake_diagrams.forest.world.stand import MAPS
 
 CYCLES = 150
 """The number of cycles of the loop in lock-step with the process that sends the sensors' data."""
@@ -33,11 +31,11 @@ PATIENCE = 60.0
 LARGEST_DIFFERENCE = 1e-3
 """The largest difference of the pose over LCM from the simulated one, in m and rad: points travel with 32 bits."""
 BOUNDED = "poor"
-"""The map whose goal no estimate can meet (see `least_error_along`): it is judged by the error of the best estimate."""
+"""The map whose goal no estimate can meet (see `best_estimates`): it is judged by the error of the best estimate."""
 LEAST_LOCALIZED = 0.9
 """The least share of the scans that must have a pose, with each map."""
 LARGEST_RATIO = 1.1
-"""The largest ratio of the error with that map to that of the best estimate on the same maps, `best_error_along`."""
+"""The largest ratio of the error with that map to that of the best estimate on the same maps, see `BestError`."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +94,9 @@ def localization(full: bool) -> Answer:
     seeds = range(SEED, SEED + (20 if full else 4))
     tracks = list(drives.through(seeds))
     scores_by_map = scores(tracks)
-    driven = {seed: by_map[BOUNDED].drive for seed, by_map in zip(seeds, tracks, strict=True)}
-    least = least_error_along(driven, MAPS[BOUNDED])
-    ratio = scores_by_map[BOUNDED].position / best_error_along(driven, BOUNDED, scenario=drives.scenario)
+    best = against_best(
+        {seed: by_map[BOUNDED] for seed, by_map in zip(seeds, tracks, strict=True)}, BOUNDED, scenario=drives.scenario
+    )
     machine = over_lcm(ForestScenario(seed=1, length=60.0, width=60.0))
     accurate = scores_by_map["accurate"]
     return Answer(
@@ -110,14 +108,15 @@ def localization(full: bool) -> Answer:
         paper="done on a harvester; no figures",
         holds=machine.agrees
         and all(GOALS[name].is_met(score) for name, score in scores_by_map.items() if name != BOUNDED)
-        and ratio <= LARGEST_RATIO
+        and best.ratio <= LARGEST_RATIO
         and scores_by_map[BOUNDED].independent_nees <= scores_by_map[BOUNDED].bounds[1]
         and all(score.localized >= LEAST_LOCALIZED and not score.wrong for score in scores_by_map.values()),
         note=f"{accurate.forests} forests, {accurate.path:.0f} m of path, each drive begins without a guess. "
         + "; ".join(_summary(name, score) for name, score in scores_by_map.items())
         + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
-        f"trees within {REACH:g} m of these drives errs by {least:.2f} m (RMS); on these very maps the unit's error is "
-        f"{ratio:.2f} times that of this estimate (at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
+        f"trees within {REACH:g} m of the path so far errs by {best.least:.2f} m (RMS); on these very maps the unit's "
+        f"error is {best.ratio:.2f} times that of this estimate ({best.interval[0]:.2f} to {best.interval[1]:.2f} with "
+        f"95 % over forests; at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
         + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
     )
 

@@ -27,7 +27,7 @@ from typing import TypeVar
 import click
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
@@ -47,11 +47,12 @@ from vtbdrake_diagrams.plain.scenario import PlainScenario
 INDEPENDENT = 100.0
 """Estimates count as independent if they are at least this far apart along the path, in m."""
 REACH = 20.0
-"""Trees within this distance of the path count as seen, in m; see `least_error_along`. Assumed."""
+"""Trees within this distance of the path count as seen, in m; see `best_estimates`. Assumed."""
 LATE = 10.0
 """The time in s after which errors of the vertical do not belong to the start any more."""
 NOISE = 0.02
-"""Standard deviation in m, per axis, of the position of a tree relative to the carrier; see `least_error`. Assumed."""
+"""Standard deviation in m, per axis, of a tree's position relative to the carrier; see `best_estimates`. Assumed."""
+_DRAWS = 4000  # of forests, for an interval
 STANDING = 2.0
 """The time in s for which the carrier stands before it drives: the gyros show their bias, and the attitude settles."""
 _SPEED = "sim.act.driver.speed"
@@ -321,73 +322,113 @@ def nees_bounds(count: int) -> tuple[float, float]:
     return low, high
 
 
-def least_error(errors: MapErrors, places: Array, *, noise: float = NOISE) -> float:
-    """Return the least RMS error in m, in the plane, of an unbiased estimate of the position by trees on a map.
+def best_estimates(
+    path: Array, places: Array, displacements: Array, errors: MapErrors, *, noise: float = NOISE
+) -> tuple[Array, Array]:
+    """Return errors of the best unbiased estimate of the position along a path, and their variances.
 
-    The heading is known to this estimate, and the relative position of each tree, up to independent errors. The common
-    error of the trees on the map can then be inferred only from how their errors vary from place to place. With the
-    covariances C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis, where s is the standard deviation of the
-    map, the best linear unbiased estimate (Gauss and Markov) has the error sqrt(2 / (1' C^-1 1)).
+    At each point of the path, this estimate (of Gauss and Markov) has seen every tree within `REACH` of the path up to
+    there, and knows its position relative to the carrier to ``noise`` per axis. The heading is unknown. The map says
+    where the trees are, with the covariances C_ij = s^2 exp(-r_ij^2 / (2 L^2)) + noise^2 delta_ij per axis: what the
+    errors of all trees have in common can be inferred only from how they vary from place to place. An error [t; theta]
+    of the pose displaces the tree at d from the carrier by t + theta J d, where J is the rotation by a right angle. So
+
+        [t; theta] = (X' C^-1 X)^-1 X' C^-1 e,    X = [I, J d] for each tree,    covariance (X' C^-1 X)^-1.
 
     Args:
+        path: The points in m, shape (m, 2).
+        places: The true positions of the trees that are on the map in m, shape (n, 2).
+        displacements: Their errors e on the map in m, shape (n, 2).
         errors: The errors of the map.
-        places: The positions of the trees in m, shape (n, 2).
-        noise: Standard deviation in m, per axis, of the position of each tree relative to the carrier.
+        noise: Standard deviation of the relative position of a tree, per axis, in m.
+
+    Returns:
+        The errors t in m, shape (m, 2), and their variances (of both axes together) in m^2, shape (m,). NaN where fewer
+        than two trees have been seen.
     """
-    return float(np.sqrt(2.0 / _information(errors, places, noise).sum()))
+    is_near = np.hypot(*(places[:, np.newaxis] - path).transpose(2, 0, 1)) < REACH
+    first = np.where(is_near.any(axis=1), is_near.argmax(axis=1), len(path))
+    order = np.argsort(first, kind="stable")[: np.count_nonzero(first < len(path))]
+    p, e = places[order], displacements[order]
+    squares = ((p[:, np.newaxis] - p) ** 2).sum(axis=2)
+    shared = np.exp(-0.5 * squares / errors.correlation**2) if errors.correlation > 0.0 else np.eye(len(p))
+    # With the trees in the order in which they are seen, those that were seen first are a leading block of C = L L'.
+    L = np.linalg.cholesky(errors.position**2 * shared + noise**2 * np.eye(len(p)))
+    Y = solve_triangular(L, np.column_stack([np.ones(len(p)), p, e]), lower=True)
+    sums = np.cumsum(Y[:, :, np.newaxis] * Y[:, np.newaxis, :], axis=0)
+    count = np.searchsorted(first[order], np.arange(len(path)), side="right")
+    is_seen = count >= 2
+    # Sums over pairs of trees, weighted by C^-1: of 1, x and y (from the carrier), and of their products with e.
+    G = np.empty((is_seen.sum(), 5, 5))
+    G[:] = sums[count[is_seen] - 1]
+    T = np.tile(np.eye(5), (len(G), 1, 1))
+    T[:, 1:3, 0] = -path[is_seen]
+    G = T @ G @ T.transpose(0, 2, 1)
+    zero = np.zeros(len(G))
+    A = np.array(
+        [
+            [G[:, 0, 0], zero, -G[:, 0, 2]],
+            [zero, G[:, 0, 0], G[:, 0, 1]],
+            [-G[:, 0, 2], G[:, 0, 1], G[:, 1, 1] + G[:, 2, 2]],
+        ]
+    ).transpose(2, 0, 1)
+    b = np.array([G[:, 0, 3], G[:, 0, 4], G[:, 1, 4] - G[:, 2, 3]]).T
+    covariance = np.linalg.inv(A)
+    estimates, variances = np.full((len(path), 2), np.nan), np.full(len(path), np.nan)
+    estimates[is_seen] = (covariance @ b[:, :, np.newaxis])[:, :2, 0]
+    variances[is_seen] = covariance[:, 0, 0] + covariance[:, 1, 1]
+    return estimates, variances
 
 
-def _information(errors: MapErrors, places: Array, noise: float) -> Array:
-    """Return C^-1 1 of `least_error` in 1/m^2, shape (n,): the weights of the trees, before they are normalized."""
-    squares = ((places[:, np.newaxis] - places) ** 2).sum(axis=2)
-    shared = np.exp(-0.5 * squares / errors.correlation**2) if errors.correlation > 0.0 else np.eye(len(places))
-    C = errors.position**2 * shared + noise**2 * np.eye(len(places))
-    weights: Array = np.linalg.solve(C, np.ones(len(places)))
-    return weights
+@dataclass(frozen=True)
+class BestError:
+    """The errors of a unit beside those of the best estimate, `best_estimates`, at the same scans.
+
+    Attributes:
+        least: RMS error of the best estimate over all maps of this kind, in m.
+        on_maps: RMS error of the best estimate on the very maps of the drives, in m. It differs from ``least`` if the
+            maps are few.
+        ratio: RMS error of the unit over ``on_maps``.
+        interval: The interval of ``ratio`` with 95 % confidence, by drawing the forests again (bootstrap).
+    """
+
+    least: float
+    on_maps: float
+    ratio: float
+    interval: tuple[float, float]
 
 
-def least_error_along(
-    drives: Mapping[int, Drive], errors: MapErrors, *, scenario: Callable[[int], CarrierScenario] | None = None
-) -> float:
-    """Return the RMS of `least_error` over drives, by all landmarks within `REACH` of each, as if all were on the map.
+def against_best(
+    tracks: Mapping[int, Track], name: str, *, scenario: Callable[[int], CarrierScenario] | None = None
+) -> BestError:
+    """Compare the errors of a unit with those of the best estimate on the same maps.
 
     Args:
-        drives: The drives by the seed of their scenario.
-        errors: The errors of the map.
+        tracks: The tracks by the seed of their scenario.
+        name: The name of the map in `MAPS`.
         scenario: The function that returns the scenario of a seed; by default `forest`.
     """
-    least = []
-    for seed, drive in drives.items():
-        places = (scenario or forest)(seed).truth().positions()[:, :2]
-        near = cKDTree(drive.truth[:, :2]).query(places)[0] < REACH
-        least.append(least_error(errors, places[near]))
-    return _rms(least)
-
-
-def best_error_along(drives: Mapping[int, Drive], name: str, *, scenario: Callable[[int], CarrierScenario]) -> float:
-    """Return the RMS of the error of the best estimate of `least_error` on the very maps that drives were made with.
-
-    On a few maps the RMS differs from its expectation, `least_error_along`. Errors of a unit on the same maps are
-    compared with this one. Only the trees count that are on the map and within `REACH` of the drive.
-
-    Args:
-        drives: The drives by the seed of their scenario.
-        name: The name of the map in `MAPS`.
-        scenario: The function that returns the scenario of a seed.
-    """
-    errors, distances = MAPS[name], []
-    for seed, drive in drives.items():
-        survey = scenario(seed).surveyed_map
+    errors, sums, count = MAPS[name], [], 0
+    for seed, track in tracks.items():
+        survey = (scenario or forest)(seed).surveyed_map
         # Without errors of the positions, the same survey has the same entries in the same order.
         mapped, places = (
             survey(survey_errors).positions()[:, :2] for survey_errors in (errors, replace(errors, position=0.0))
         )
         # A wrong entry is displaced from nothing.
         is_true = (mapped != places).any(axis=1)
-        near = is_true & (cKDTree(drive.truth[:, :2]).query(places)[0] < REACH)
-        weights = _information(errors, places[near], NOISE)
-        distances.append(np.hypot(*(weights @ (mapped - places)[near] / weights.sum())))
-    return _rms(distances)
+        path = track.drive.truth[:, :2]
+        best, variances = best_estimates(path, places[is_true], (mapped - places)[is_true], errors)
+        both = track.is_localized & np.isfinite(variances)
+        units = (track.poses[:, :2] - path)[both]
+        sums.append([(units**2).sum(), (best[both] ** 2).sum(), variances[both].sum()])
+        count += int(both.sum())
+    unit, on_maps, least = (totals := np.array(sums)).sum(axis=0)
+    drawn = totals[np.random.default_rng(0).integers(len(totals), size=(_DRAWS, len(totals)))].sum(axis=1)
+    low, high = np.sqrt(np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])).tolist()
+    return BestError(
+        float(np.sqrt(least / count)), float(np.sqrt(on_maps / count)), float(np.sqrt(unit / on_maps)), (low, high)
+    )
 
 
 def _rms(values: ArrayLike) -> float:
@@ -567,18 +608,20 @@ def main(forests: int, seed: int, bias: float, full: bool, source: str, workers:
     print(table(HEADER, [row(name, score_of_map) for name, score_of_map in results.items()]))
     path = next(iter(results.values())).path
     print(f"{len(tracks_of_drives)} drives, {path:.0f} m of path, range bias {bias:g} m")
-    driven = {seed: tracks["poor"].drive for seed, tracks in zip(seeds, tracks_of_drives, strict=True)}
-    tilts = 1e3 * np.concatenate([drive.tilts for drive in driven.values()])
+    driven = {seed: tracks["poor"] for seed, tracks in zip(seeds, tracks_of_drives, strict=True)}
+    tilts = 1e3 * np.concatenate([track.drive.tilts for track in driven.values()])
     if len(tilts):
-        late = np.concatenate([drive.times for drive in driven.values()]) > LATE
+        late = np.concatenate([track.drive.times for track in driven.values()]) > LATE
         for when, rows in (("", slice(None)), (f", later than {LATE:g} s after the start", late)):
             roll, pitch = (_rms(angles) for angles in tilts[rows].T)
             print(f"error of the vertical: {roll:.2f} mrad in roll and {pitch:.2f} mrad in pitch (RMS){when}")
-    least = least_error_along(driven, MAPS["poor"], scenario=drives.scenario)
-    print(f"least error of an unbiased estimate on a poor map, by all landmarks within {REACH:g} m: {least:.2f} m")
-    best = best_error_along(driven, "poor", scenario=drives.scenario)
-    ratio = results["poor"].position / best
-    print(f"error of the best estimate on these very maps: {best:.3f} m, {ratio:.3f} times that much by the unit")
+    best = against_best(driven, "poor", scenario=drives.scenario)
+    print(f"best unbiased estimate on a poor map, by all landmarks within {REACH:g} m so far: {best.least:.2f} m")
+    low, high = best.interval
+    print(
+        f"its error on these very maps: {best.on_maps:.3f} m; the unit errs {best.ratio:.3f} times as much "
+        f"(95 %: {low:.2f} to {high:.2f})"
+    )
 
 
 if __name__ == "__main__":
