@@ -56,6 +56,9 @@ def monitor(*times: float, tolerance: float = 0.1) -> PaceMonitor:
         ([1.0] * (WINDOW - 10) + [9.0] + [0.1] * 9, False),  # a hub that stalled
         ([0.1, 0.1, 0.1, 3.7] * WINDOW, False),  # in bursts
         ([1.0, 1.0, 2.0] * WINDOW, False),  # a quarter of the messages is lost
+        ([1.0, 2.5] * WINDOW, False),  # four of seven are lost
+        ([1.0, 1.0, 5.0, 8.0] * WINDOW, True),  # more than that, in pauses
+        ([1.0] * 80 + [5.0] * 20, False),  # the same, not for long yet
         ([1.0] * WINDOW + [0.2] * (WINDOW // 2), False),
         ([1.0] * WINDOW + [0.2] * (WINDOW // 2 + 1), True),
         ([0.2] * WINDOW + [1.0] * WINDOW, False),
@@ -84,9 +87,11 @@ def test_pace_is_unknown_at_first() -> None:
         ([0.75] * 51 + [0.0] * 49, True),
         ([0.5] * 51 + [1.0] * 39 + [2.0] * 10, False),  # the sum is 84.5 periods
         ([0.5] * 51 + [1.0] * 39 + [2.0] * 9 + [1.75], True),
-        ([1.125] * 11 + [4.0] * 89, False),  # longer by the tolerance is not too long
-        ([1.0] * 10 + [4.0] * 90, True),  # nine of ten
-        ([1.0] * 11 + [4.0] * 89, False),
+        ([1.125] * 11 + [1.5] * 89, False),  # longer by the tolerance is not too long
+        ([1.0] * 10 + [1.5] * 90, True),  # nine of ten
+        ([1.0] * 11 + [1.5] * 89, False),
+        ([1.0] * 50 + [3.0] * 50, False),  # the mean is two periods
+        ([1.0] * 50 + [3.0] * 49 + [3.25], True),
         ([1.25] * 90 + [0.5] * 6 + [0.0] * 4, False),  # the sum is 115.5 periods
         ([1.25] * 89 + [1.5] + [0.5] * 6 + [0.0] * 4, True),
     ],

@@ -517,6 +517,12 @@ def test_finite_command_passes_every_bit_and_refuses_what_is_not_finite():
     for values in ([0.0, -0.0, 1.5], [-1.7e308, 5e-324, np.pi], [-np.finfo(float).max, 1e200, -1e-300]):
         port.FixValue(context, values)
         assert guard.get_output_port().Eval(context).tobytes() == np.array(values).tobytes()
+    # The state that Drake asks for stays zero.
+    assert (
+        context.get_continuous_state_vector().CopyToVector()
+        == [0.0]
+        == guard.EvalTimeDerivatives(context).CopyToVector()
+    )
     for bad in (np.nan, np.inf, -np.inf):
         port.FixValue(context, [1.0, 2.0, bad])
         with pytest.raises(ValueError, match="out of domain"):

@@ -18,6 +18,10 @@ PAUSE = 4.0
 """Number of periods: a longer time between two messages is a pause, and counts for no more."""
 
 
+LOST = 2.0
+"""Number of periods: a longer mean of the times, pauses included, is too slow, however they vary."""
+
+
 class PaceMonitor:
     """Compares the times between the messages that begin a loop's cycles with the period of the DPS.
 
@@ -27,7 +31,8 @@ class PaceMonitor:
     Of the last `WINDOW` times, none of which counts for more than `PAUSE` periods, the pace is too quick if half are
     too short by more than the tolerance, and so is their sum, by `JITTER` periods more. The sum alone would be changed
     by a late message, the half by messages in pairs. The pace is too slow if nine of ten are too long, and so is
-    their sum: on a busy computer, where a machine loses time, its times vary.
+    their sum: on a busy computer, where a machine loses time, its times vary. It is too slow, too, if the mean is more
+    than `LOST` periods: so many messages are lost that the DPS lives through less than half of the time.
 
     Args:
         signal: Name of the sensor signal whose messages begin the cycles.
@@ -74,7 +79,7 @@ class PaceMonitor:
         count = len(self._times)
         excess, allowed = self._total - count * self.period, (count * self.tolerance + JITTER) * self.period
         quick = self._short > 0.5 * count and excess < -allowed
-        slow = self._long >= 0.9 * count and excess > allowed
+        slow = excess > allowed and (self._long >= 0.9 * count or self._total > LOST * count * self.period)
         if count < SETTLED or not (quick or slow):
             return None
         return (
