@@ -20,21 +20,25 @@ from vtbdrake.project.station_file import StationFile
 
 TEMPLATES = Path(__file__).parent / "templates"
 # Template -> file of the project.
-_COMMON = {"pyproject.toml": "pyproject.toml", "gitignore": ".gitignore", "ci.yml": ".github/workflows/tests.yml"}
+_COMMON = {
+    "pyproject.toml": "pyproject.toml",
+    "gitignore": ".gitignore",
+    "ci.yml": ".github/workflows/tests.yml",
+    "notebook.ipynb": "{name}.ipynb",
+    "package/__init__.py": "{name}/__init__.py",
+    "package/drive.py": "{name}/drive.py",
+}
 _ROBOT = {
     **_COMMON,
     "README.md": "README.md",
-    "notebook.ipynb": "{name}.ipynb",
     "test.py": "tests/test_{name}.py",
-    **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("__init__", "robot", "dps", "scenario")},
-    **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("optimize", "drive")},
+    **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("robot", "dps", "scenario", "optimize")},
 }
 _STATION = {
     **_COMMON,
     "station/README.md": "README.md",
-    "station/notebook.ipynb": "{name}.ipynb",
     "station/test.py": "tests/test_{name}.py",
-    **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("__init__", "dps", "scenario", "optimize", "drive")},
+    **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("dps", "scenario", "optimize")},
 }
 _LONGEST_LINE = 120
 
@@ -78,13 +82,13 @@ def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
     """
     check_name(name, folder)
     if isinstance(source, Robot):
-        templates, values = _ROBOT, _robot_values(source)
+        templates, values, kind = _ROBOT, _robot_values(source), "Scenario"
     else:
-        templates, values = _STATION, _station_values(source)
+        templates, values, kind = _STATION, _station_values(source), "Station"
     values |= {
         "name": name,
         "NAME": name.upper(),
-        "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")),
+        "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")) + kind,
         "notes": "".join(["\n## What is assumed\n\n", *(f"* {note}\n" for note in source.notes)])
         if source.notes
         else "",
@@ -110,6 +114,7 @@ def _robot_values(robot: Robot) -> dict[str, str]:
     is_exact = len(drives) == len(joints)
     names = ["DRIVEN", "JOINTS", *(["TOUCHING"] if robot.touching else []), "B", "add_robot", "limits"]
     return {
+        "subject": "robot",
         "model_file": robot.model.name,
         "model_path": robot.model.as_posix(),
         "robot_imports": _robot_imports(robot),
@@ -254,6 +259,8 @@ def _station_values(station: StationFile) -> dict[str, str]:
     path, _, key = station.file.partition("#")
     return {
         "model_file": Path(path).name,
+        "subject": "station",
+        "position_unit": "rad",
         "station_path": path,
         "station_key": f"#{key}" if key else "",
         "home": "\n".join(f'    "{arm.name}": {_list("", [_number(q) for q in arm.home])},' for arm in station.arms),
