@@ -9,7 +9,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantValueSource, Integrator, LinearSystem, PassThrough
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, Integrator, LinearSystem, PassThrough
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import AcrobotScenario, PendulumScenario
@@ -414,6 +414,23 @@ def test_simulated_actuators_get_the_command_unless_real_ones_alone_do(mode):
     else:
         assert _matrix(look) == _matrix(SEEN)
         assert speed.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_idle_commands_are_set_by_the_address_of_their_signal():
+    names = ["turn", "lift", "grip"]
+    builder = VirtualTestbedBuilder(Interface([], [Signal(n, size=2, idle=float(i)) for i, n in enumerate(names)]))
+    dps = DiagramBuilder()
+    for name in names:
+        dps.ExportOutput(dps.AddSystem(ConstantVectorSource([9.0, 9.0])).get_output_port(), name)
+        builder.sim_actuator(name, builder.add("act", name, PassThrough(2)).get_input_port())
+    builder.set_dps(dps.Build())
+    testbed = builder.build()
+    context = testbed.default_context()
+    testbed.switch(context, "real")
+    for i, name in enumerate(names):
+        assert testbed.read(context, f"T_act.{name}.idle").tolist() == [i, i]
+        testbed.write(context, {f"T_act.{name}.idle": [i + 0.5, -i]})
+        assert testbed.read(context, f"sim.act.{name}.y").tolist() == [i + 0.5, -i]
 
 
 def test_the_flags_are_those_of_each_signal():
