@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
-from tests.control.servo_machine import COMMAND, ServoMachineScenario
+from tests.control.servo_machine import COMMAND, PATIENCE, ServoMachineScenario
 from tests.control.test_loop import Ear
 from tests.lcm.hub.clients import Client
 from tests.machine.looking import LookingScenario
@@ -289,6 +290,25 @@ def test_machine_without_time_out_is_left_at_rest(interrupted: bool, tmp_path: P
     assert heard[-1].tolist() == [0.0, 0.0]
     report = replay(tmp_path / "servo.lcm")
     assert report.identical and report.cycles == runtime.cycles
+
+
+def test_end_of_the_block_ends_a_loop_in_another_thread() -> None:
+    scenario = ServoMachineScenario(rate=2.0, leave_time=0.2)
+    with Hub(port=0, protect=[COMMAND]) as hub, MachineProcess(scenario, hub.url):
+        ear = Ear(hub.url)
+        with scenario.deploy(hub.url, values={"u.target": [0.1, -0.05]}) as runtime:
+            runtime.take_over()
+            thread = threading.Thread(target=runtime.run)
+            thread.start()
+            ear.listen(lambda: max(map(abs, ear.torques), default=0.0) > 0.1)
+        thread.join(PATIENCE)
+        runtime.stop()
+        assert not runtime.bridge.connected
+        heard = np.array(ear.listen(lambda: ear.torques[-2:] == [0.0, 0.0])).reshape(-1, 2)
+        status = hub.statistics().protected[COMMAND]
+    # One after the other, the loop and the fallback command within the limits, from one connection.
+    assert np.abs(np.diff(heard, axis=0)).max() <= 2.0 * PERIOD * (1 + 1e-9)
+    assert heard[-1].tolist() == [0.0, 0.0] and status.refused == 0
 
 
 def test_block_without_take_over_commands_nothing() -> None:

@@ -175,6 +175,16 @@ def test_fallback_ends_when_the_machine_confirms():
     assert len(bridge.sent) == 25
 
 
+def test_machine_that_cannot_be_asked_is_brought_to_rest(caplog):
+    guards = Guards(ServoScenario(rate=20.0).interface(), PERIOD, leave_time=0.1)
+    runtime, bridge, _ = switched(rate=20.0, guards=guards, released_by=lambda: {}["brakes"])
+    runtime.run(cycles=60)
+    assert np.abs(sent(bridge)[-1]).min() > 0.4
+    runtime.leave("the loop ended")
+    assert sent(bridge)[-1].tolist() == [0.0, 0.0]
+    assert [record.message[:18] for record in caplog.records if record.exc_info] == ["released_by raised"]
+
+
 def test_fallback_ends_when_another_publisher_commands():
     class Contended(ScriptedBridge):
         competing_publisher = None

@@ -43,6 +43,7 @@ _MOST_POLLS = 100  # of what has waited while the loop was held up
 _KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
 _WAIT = 0.1  # s, for newer samples after a pause
 _POSTPONED = 2.0  # s, for which Ctrl-C waits at most while the fallbacks bring the machine to rest
+_ENDING = 2.0  # s, to wait at most for the last cycle of another thread
 
 
 class Runtime(Closing, Stepped):
@@ -160,6 +161,9 @@ class Runtime(Closing, Stepped):
         self._longest_gap = max(min(ages, default=inf), (MOST_UNSENT + 1) * period)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
+        self._runner: threading.Thread | None = None  # that is in `run`
+        self._ended = threading.Event()
+        self._log_release = Throttle(self.clock)
         self.uncompared: set[str] = set()
         self._foreign = bridge.foreign
         self._log_foreign = Throttle(self.clock)
@@ -192,11 +196,13 @@ class Runtime(Closing, Stepped):
         if seconds is not None and isnan(seconds):
             raise ValueError(f"a loop runs for a number of seconds, not for {seconds}")
         self._stop.clear()
-        self.read_switches()
-        begins = self._read_waiting()
-        begin = self.clock.now()
-        deadline, done = begin, 0
+        self._ended.clear()
+        self._runner = threading.current_thread()
         try:
+            self.read_switches()
+            begins = self._read_waiting()
+            begin = self.clock.now()
+            deadline, done = begin, 0
             with Interruptible() as interruptible:
                 while not self._stop.is_set():
                     if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
@@ -213,6 +219,9 @@ class Runtime(Closing, Stepped):
         except BaseException:
             self.leave("the loop ended")
             raise
+        finally:
+            self._runner = None
+            self._ended.set()
 
     def watch(self, watcher: Callable[[Cycle], None]) -> None:
         """Call a watcher with every `Cycle` from the next one on."""
@@ -411,9 +420,14 @@ class Runtime(Closing, Stepped):
 
         They command for the guards' ``leave_time``, until the machine is released, or until they send nothing more. A
         machine in lock-step gets one command: it stands still afterwards. Without a cycle since the last call, nothing
-        is done. Ctrl-C, and SIGTERM if it has a handler, are postponed until they have ended, for 2 s at most: a press
-        too many, or one that arrives twice, does not leave a machine with half a command.
+        is done. A `run` in another thread is stopped first.
+
+        Ctrl-C, and SIGTERM if it has a handler, are postponed until they have ended, for 2 s at most: a press too many,
+        or one that arrives twice, does not leave a machine with half a command.
         """
+        if self._runner not in (None, threading.current_thread()):
+            self.stop()
+            self._ended.wait(_ENDING)
         if self._left == self.cycles:
             return
         with interrupts_postponed() as interrupts:
@@ -437,7 +451,12 @@ class Runtime(Closing, Stepped):
     @property
     def _released(self) -> bool:
         """Return whether the machine needs no fallback: it does without commands, or another publisher commands it."""
-        return self.released_by() or self.bridge.competing_publisher is not None
+        try:
+            released = self.released_by()
+        except FAILURES:
+            released = False  # It does not confirm anything; the fallbacks go on.
+            self._log_release(_log.exception, "released_by raised, so the machine is not taken for released")
+        return released or self.bridge.competing_publisher is not None
 
     @property
     def pace_problem(self) -> str | None:

@@ -231,7 +231,8 @@ class Scenario(ABC):
         The block begins when the processes of slow parts and recorder are ready: no result and no cycle is missed.
         The DPS runs without its simulated world, and commands from `Runtime.take_over` on. At the end of the block, the
         fallbacks command for a while (see `Runtime.leave`), and the connection is closed. In the block, SIGTERM raises
-        KeyboardInterrupt, unless the program handles it: it ends the block as Ctrl-C does.
+        KeyboardInterrupt, unless the program handles it: it ends the block as Ctrl-C does. A loop that runs in another
+        thread is stopped at the end.
 
         Args:
             url: The URL of the LCM bus.
