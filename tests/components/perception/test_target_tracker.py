@@ -14,8 +14,16 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from vtbdrake.components.perception.estimate import PoseEstimate, cross_matrix, rotation_matrix, rotation_vector
-from vtbdrake.components.perception.target_tracker import SPHERE, MotionModel, TargetTracker, Track, pose_of_state
+from vtbdrake.components.perception.target_tracker import (
+    SPHERE,
+    MotionModel,
+    TargetTracker,
+    Track,
+    body_state,
+    pose_of_state,
+)
 from vtbdrake.state import AddressedSystem
+from vtbdrake.state.systems import pose_from_array
 
 COVARIANCE = np.diag([0.01, 0.01, 0.02, 0.01, 0.01, 0.03]) ** 2
 COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-5
@@ -158,11 +166,11 @@ def test_track_moves_as_the_body_does() -> None:
     model = MotionModel(inertia=INERTIAS["skew"])
     track = replace(model.begin(measured(X, 0.0, np.random.default_rng(0))), R=X.rotation().matrix(), w=w)
     _, (R, rate) = free_flight(INERTIAS["skew"], X, w, np.array([0.0, 3.0]))
-    later = model.moved(track, 3.0)
+    later = model.predict(track, 3.0)
     np.testing.assert_allclose(later.R, R, atol=2e-4)
     np.testing.assert_allclose(later.w, rate, atol=2e-5)
-    back = model.moved(later, 0.0)
-    np.testing.assert_allclose(back.R, track.R, atol=2e-4)
+    back = model.present(later.numbers(), 0.0)
+    np.testing.assert_allclose(pose_of_state(back).rotation().matrix(), track.R, atol=2e-4)
 
 
 def test_impossible_inertia_is_refused() -> None:
@@ -194,7 +202,41 @@ def test_deviations_are_those_of_the_predicted_covariance(inertia: list[float]) 
     for k in range(1, 6):
         track, _ = model.fuse(track, measured(truth(0.2 * k), 0.2 * k, generator))
     variances = model.predict(track, 2.0).P.diagonal().reshape(4, 3).mean(axis=1)
-    assert model.deviations(track, 2.0) == pytest.approx(np.sqrt(variances[:2]), rel=0.02)
+    assert model.present(track.numbers(), 2.0)[19:] == pytest.approx(np.sqrt(variances[:2]), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [RollPitchYaw(0.3, -0.5, 2.8), *(RollPitchYaw(0.3, pitch, 0.8) for pitch in (np.pi / 2, 1.5707, -np.pi / 2))],
+)
+def test_present_is_as_drake_has_it(turn: RollPitchYaw) -> None:
+    model, v = MotionModel(), np.array([0.1, -0.2, 0.3])
+    track = replace(model.begin(measured(RigidTransform([1.0, 2.0, 3.0]), 1.0, np.random.default_rng(0))), v=v)
+    track = replace(track, R=RotationMatrix(turn).matrix())
+    present, X = model.present(track.numbers(), 3.0), RigidTransform(turn, track.p + 2.0 * v)
+    np.testing.assert_allclose(present[:13], body_state(X, np.zeros(3), v), atol=1e-12)
+    # With a pitch of a right angle, roll and yaw are not unique.
+    np.testing.assert_allclose(pose_from_array(present[13:19]).GetAsMatrix4(), X.GetAsMatrix4(), atol=1e-12)
+
+
+def test_error_is_carried_as_two_neighbouring_flights_part() -> None:
+    model = MotionModel(rate_noise=0.0, velocity_noise=0.0, inertia=INERTIAS["skew"])
+    start = model.begin(
+        measured(RigidTransform(RollPitchYaw(0.3, -0.5, 0.8), [1.0, 2.0, 3.0]), 0.0, np.random.default_rng(0))
+    )
+    start = replace(start, w=np.array([0.1, -0.2, 0.15]), v=np.array([0.1, 0.0, -0.1]))
+
+    def landed(error: np.ndarray) -> Track:
+        R = rotation_matrix(error[:3]) @ start.R
+        parts = replace(start, R=R, p=start.p + error[3:6], w=start.w + error[6:9], v=start.v + error[9:])
+        return model.predict(parts, 1.0)
+
+    def parting(error: np.ndarray) -> np.ndarray:
+        a, b = landed(error), landed(-error)
+        return np.concatenate([rotation_vector(a.R @ b.R.T), a.p - b.p, a.w - b.w, a.v - b.v]) / 2e-5
+
+    F = np.column_stack([parting(error) for error in 1e-5 * np.eye(12)])
+    np.testing.assert_allclose(model.predict(start, 1.0).P, F @ start.P @ F.T, atol=2e-5)
 
 
 class Source(AddressedSystem):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from math import ceil, hypot, inf, sqrt
+from math import ceil, hypot, inf, isqrt
 
+import casadi
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import Value
@@ -15,16 +16,16 @@ from pydrake.multibody.tree import RotationalInertia
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
+from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
     PoseEstimate,
-    cross_matrix,
     rotation_matrix,
     rotation_vector,
 )
 from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
-from vtbdrake.state.systems import POSE_UNIT, pose_to_array
+from vtbdrake.state.systems import POSE_UNIT
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,77 +115,33 @@ class MotionModel:
 
     def predict(self, track: Track, time: float) -> Track:
         """Return the track at a later (or the same) time."""
-        flight = list(self._flight(track, time - track.time))
-        F = self._transition(track, time - track.time, flight)
-        return replace(_landed(track, time, flight), P=F @ track.P @ F.T + self._noise(time - track.time))
+        return Track.of(_predicted().value(self._flight(track.numbers(), time)).copy())
 
-    def moved(self, track: Track, time: float) -> Track:
-        """Return the track at another time, without its covariance there."""
-        return _landed(track, time, list(self._flight(track, time - track.time)))
+    def present(self, track: Array, time: float) -> Array:
+        """Return where a track leads at another time, as one vector (21,).
 
-    def _flight(self, track: Track, dt: float) -> Iterator[tuple[Array, Array, Array]]:
-        """Yield R_IT and ω after each of some equal steps over ``dt``, with J_I^-1 in the middle of it: (R, J_I^-1, ω).
+        Args:
+            track: The `Track.numbers`.
+            time: The time in s.
 
-        The steps are of second order, and exact for a `SPHERE`.
+        Returns:
+            The `body_state` (13,), the pose [x, y, z, roll, pitch, yaw] in m and rad, and the standard deviations of
+            attitude (rad) and position (m): the roots of the mean variances, of first order in the angle turned since.
         """
-        J, inverse = _inertia(*self.inertia)
-        R, w = track.R, track.w
-        L = R @ (J @ (w @ R))
-        # Each step turns the body by at most 0.1 rad, unless the track has long been lost.
-        steps = min(max(1, ceil(hypot(*w.tolist()) * abs(dt) / 0.1)), 30)
-        h = dt / steps
+        return _present().value(self._flight(track, time)).copy()
+
+    def _flight(self, track: Array, time: float) -> tuple[Array, Array, Array]:
+        """Return the arguments of the kernels that lead a track to ``time``: itself, its flight, and how it went.
+
+        Each of some equal steps turns the body by at most 0.1 rad, unless the track has long been lost.
+        """
+        then, w = track.item(0), track[13:16].tolist()
+        steps = min(max(1, ceil(hypot(*w) * abs(time - then) / 0.1)), 30)
+        conditions = np.array([time, (time - then) / steps, self.rate_noise**2, self.velocity_noise**2, *self.inertia])
+        flight = np.concatenate([track[1:10], track[13:16], _NOT_TURNED])
         for _ in range(steps):
-            middle = rotation_matrix(0.5 * h * w) @ R
-            K = middle @ inverse @ middle.T
-            R = rotation_matrix(h * (K @ L)) @ R
-            w = R @ (inverse @ (L @ R))
-            yield R, K, w
-
-    def _transition(self, track: Track, dt: float, flight: list[tuple[Array, Array, Array]]) -> Array:
-        """Return F(dt), which carries the error of a track over its flight during ``dt``, (12, 12)."""
-        J_T, _ = _inertia(*self.inertia)
-        J = track.R @ J_T @ track.R.T
-        turning, h = cross_matrix(J @ track.w), dt / len(flight)
-        before = J @ cross_matrix(track.w) - turning  # δL = before θ + J δω
-        A, B = np.eye(3), np.zeros((3, 3))  # θ = A θ(0) + B δL
-        for _, K, _ in flight:
-            M = h * K @ turning
-            square = M @ M
-            E = np.eye(3) + M + square @ (np.eye(3) / 2.0 + M / 6.0)
-            A, B = E @ A, E @ B + h * (np.eye(3) + M / 2.0 + square / 6.0) @ K
-        F = np.eye(12)
-        F[:3, :3], F[:3, 6:9] = A + B @ before, B @ J
-        R, _, w = flight[-1]
-        J_after = R @ J_T @ R.T
-        after = J_after @ cross_matrix(w) - turning
-        F[6:9, :3] = np.linalg.solve(J_after, before - after @ F[:3, :3])
-        F[6:9, 6:9] = np.linalg.solve(J_after, J - after @ F[:3, 6:9])
-        F[3:6, 9:] = dt * np.eye(3)
-        return F
-
-    def _noise(self, dt: float) -> Array:
-        density = np.repeat([self.rate_noise**2, self.velocity_noise**2], 3)
-        pose, velocity = np.arange(6), np.arange(6, 12)
-        Q = np.zeros((12, 12))
-        Q[pose, pose], Q[velocity, velocity] = density * dt**3 / 3.0, density * dt
-        Q[pose, velocity] = Q[velocity, pose] = density * dt**2 / 2.0
-        return Q
-
-    def deviations(self, track: Track, time: float) -> tuple[float, float]:
-        """Return the standard deviations of attitude (rad) and position (m) at a later time.
-
-        They are the roots of the mean variances, of first order in the angle turned since.
-        """
-        dt = time - track.time
-        # The variances of the pose's six numbers, and their covariances with their rates.
-        variances, shared = track.P.diagonal(), track.P.diagonal(6)
-        rotation, translation = (
-            (variances[:6] + 2.0 * dt * shared + dt**2 * variances[6:]).reshape(2, 3).sum(1).tolist()
-        )
-        return (
-            sqrt((rotation + self.rate_noise**2 * dt**3) / 3.0),
-            sqrt((translation + self.velocity_noise**2 * dt**3) / 3.0),
-        )
+            flight = _turned().value((track, flight, conditions))
+        return track, flight, conditions
 
     def fuse(self, track: Track, estimate: PoseEstimate) -> tuple[Track, float]:
         r"""Return the track with a measured pose, and the normalized innovation squared (six degrees of freedom).
@@ -194,15 +151,16 @@ class MotionModel:
         with the track; the exact solution is in Bar-Shalom, "Update with out-of-sequence measurements in tracking",
         2002.
         """
-        if estimate.time > track.time:
+        covariance = estimate.covariance
+        if estimate.time >= track.time:
             track = self.predict(track, estimate.time)
-        dt = estimate.time - track.time
-        H, there = np.eye(6, 12), track
-        if dt < 0.0:
-            flight = list(self._flight(track, dt))
-            H, there = self._transition(track, dt, flight)[:6], _landed(track, estimate.time, flight)
-        nu = np.concatenate([rotation_vector(estimate.matrix[:, :3] @ there.R.T), estimate.matrix[:, 3] - there.p])
-        step, P, squares = kalman_update(track.P, nu, H=H, R=estimate.covariance + self._noise(-dt)[:6, :6])
+            H, R, p = np.eye(6, 12), track.R, track.p
+        else:
+            there = _looked_back().value(self._flight(track.numbers(), estimate.time)).copy()
+            H, R, p = there[:72].reshape(6, 12), there[72:81].reshape(3, 3), there[81:84]
+            covariance = covariance + np.diag(there[84:])
+        nu = np.concatenate([rotation_vector(estimate.matrix[:, :3] @ R.T), estimate.matrix[:, 3] - p])
+        step, P, squares = kalman_update(track.P, nu, H=H, R=covariance)
         fused = replace(
             track,
             R=rotation_matrix(step[:3]) @ track.R,
@@ -214,17 +172,157 @@ class MotionModel:
         return fused, float(squares)
 
 
+# A and B of a flight that begins, see `_turned`.
+_NOT_TURNED = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """The symbols of a flight, of which kernels are made.
+
+    Attributes:
+        track: `Track.numbers` at its start, (163, 1).
+        flight: [R, ω, A, B] at its present end: with the error of attitude θ(0) at the start, and δL of the angular
+            momentum, which is that of all the flight, θ = A θ(0) + B δL. (30, 1).
+        conditions: [the time at its end, the length of a step, the spectral densities of the angular acceleration and
+            of the acceleration, the inertia], (10, 1).
+    """
+
+    track: casadi.SX = field(default_factory=lambda: casadi.SX.sym("track", TRACK_SIZE))
+    flight: casadi.SX = field(default_factory=lambda: casadi.SX.sym("flight", 30))
+    conditions: casadi.SX = field(default_factory=lambda: casadi.SX.sym("conditions", 10))
+
+    def start(self) -> tuple[casadi.SX, ...]:
+        """Return time, R, p, ω, v and P at the start."""
+        time, R, p, w, v, P = casadi.vertsplit(self.track, [0, 1, 10, 13, 16, 19, TRACK_SIZE])
+        return time, _matrix(R), p, w, v, _matrix(P)
+
+    def end(self) -> tuple[casadi.SX, ...]:
+        """Return R, ω, A and B at its end."""
+        R, w, A, B = casadi.vertsplit(self.flight, [0, 9, 12, 21, 30])
+        return _matrix(R), w, _matrix(A), _matrix(B)
+
+    def inertia(self, R_IT: casadi.SX, *, inverse: bool = False) -> casadi.SX:
+        """Return J_I, or its inverse."""
+        xx, yy, zz, xy, xz, yz = casadi.vertsplit(self.conditions[4:])
+        J_T = casadi.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return R_IT @ (casadi.inv(J_T) if inverse else J_T) @ R_IT.T
+
+    def duration(self) -> casadi.SX:
+        """Return its duration."""
+        return self.conditions[0] - self.track[0]
+
+    def position(self) -> casadi.SX:
+        """Return the position at its end."""
+        _, _, p, _, v, _ = self.start()
+        return p + self.duration() * v
+
+    def transition(self) -> casadi.SX:
+        """Return F, which carries the error of a track over the flight, (12, 12)."""
+        _, R_start, _, w_start, _, _ = self.start()
+        R, w, A, B = self.end()
+        J = self.inertia(R_start)
+        turning = casadi.skew(J @ w_start)
+        before = J @ casadi.skew(w_start) - turning  # δL = before θ + J δω
+        after, inverse = self.inertia(R) @ casadi.skew(w) - turning, self.inertia(R, inverse=True)
+        F = casadi.SX.eye(12)
+        F[:3, :3], F[:3, 6:9] = A + B @ before, B @ J
+        F[6:9, :3], F[6:9, 6:9] = inverse @ (before - after @ F[:3, :3]), inverse @ (J - after @ F[:3, 6:9])
+        F[3:6, 9:] = self.duration() * casadi.SX.eye(3)
+        return F
+
+    def kernel(self, name: str, *values: casadi.SX) -> Kernel:
+        """Return values as a kernel of the flight; those of matrices row after row."""
+        y = casadi.densify(casadi.vertcat(*(casadi.vec(value.T) if value.is_square() else value for value in values)))
+        return Kernel(name, [self.track, self.flight, self.conditions], y, compile=False)
+
+
 @lru_cache
-def _inertia(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[Array, Array]:
-    """Return the inertia J in T, (3, 3), and its inverse."""
-    J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return J, np.linalg.inv(J)
+def _turned() -> Kernel:
+    """Return the flight after another step, which is of second order, and exact for a `SPHERE`."""
+    f = _Flight()
+    (_, R_start, _, w_start, _, _), (R, w, A, B), h = f.start(), f.end(), f.conditions[1]
+    L, eye = f.inertia(R_start) @ w_start, casadi.SX.eye(3)
+    K = f.inertia(_exponential(0.5 * h * w) @ R, inverse=True)  # in the middle of the step
+    R = _exponential(h * (K @ L)) @ R
+    M = h * K @ casadi.skew(L)
+    E = eye + M + M @ M @ (eye / 2 + M / 6)
+    B = E @ B + h * (eye + M / 2 + M @ M / 6) @ K
+    return f.kernel("turned", R, f.inertia(R, inverse=True) @ L, E @ A, B)
 
 
-def _landed(track: Track, time: float, flight: list[tuple[Array, Array, Array]]) -> Track:
-    """Return the track at the end of a flight, without its covariance there."""
-    R, _, w = flight[-1]
-    return replace(track, time=time, R=R, p=track.p + (time - track.time) * track.v, w=w)
+@lru_cache
+def _predicted() -> Kernel:
+    """Return the track at the end of a flight."""
+    f = _Flight()
+    (_, _, _, _, v, P), (R, w, _, _), F, dt = f.start(), f.end(), f.transition(), f.duration()
+    Q = casadi.kron(
+        casadi.blockcat([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]),
+        casadi.diag(casadi.vertcat(*[f.conditions[2]] * 3, *[f.conditions[3]] * 3)),
+    )
+    return f.kernel("predicted", f.conditions[0], R, f.position(), w, v, F @ P @ F.T + Q)
+
+
+@lru_cache
+def _looked_back() -> Kernel:
+    """Return what a late measurement measures: [the rows H of F for the pose, R, p, variances of the noise since]."""
+    f = _Flight()
+    R, _, _, _ = f.end()
+    H, since = f.transition()[:6, :], -f.duration()
+    noise = since**3 / 3 * casadi.vertcat(*[f.conditions[2]] * 3, *[f.conditions[3]] * 3)
+    return f.kernel("looked_back", casadi.vec(H.T), R, f.position(), noise)
+
+
+@lru_cache
+def _present() -> Kernel:
+    """Return what `MotionModel.present` returns."""
+    f = _Flight()
+    (_, _, _, _, v, P), (R, w, _, _), p, dt = f.start(), f.end(), f.position(), f.duration()
+    q = _quaternion(R)
+    variances, shared = casadi.diag(P), casadi.diag(P[:6, 6:])
+    pose = variances[:6] + 2 * dt * shared + dt**2 * variances[6:]
+    deviations = [
+        casadi.sqrt((casadi.sum1(pose[3 * k : 3 * k + 3]) + f.conditions[2 + k] * dt**3) / 3) for k in range(2)
+    ]
+    return f.kernel("present", q, p, w, v, p, _roll_pitch_yaw(q, R), *deviations)
+
+
+def _exponential(theta: casadi.SX) -> casadi.SX:
+    """Return exp([θ]×), as `rotation_matrix` does."""
+    angle = casadi.fmax(casadi.norm_2(theta), 1e-150)
+    K = casadi.skew(theta)
+    return casadi.SX.eye(3) + casadi.sin(angle) / angle * K + 2 * (casadi.sin(angle / 2) / angle) ** 2 * K @ K
+
+
+def _quaternion(R: casadi.SX) -> casadi.SX:
+    """Return the unit quaternion (w, x, y, z) of R, by the largest of its numbers; w is not negative."""
+    trace = casadi.trace(R)
+    # Rows of 4 q q', each in proportion to q.
+    squares = [1 + trace, *(1 + 2 * R[k, k] - trace for k in range(3))]
+    spin = casadi.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    rows = [casadi.vertcat(squares[0], spin)]
+    for k in range(3):
+        rows.append(casadi.vertcat(spin[k], *(squares[1 + k] if j == k else R[j, k] + R[k, j] for j in range(3))))
+    row, largest = rows[0], squares[0]
+    for other, square in zip(rows[1:], squares[1:], strict=True):
+        row, largest = casadi.if_else(square > largest, other, row), casadi.fmax(largest, square)
+    return casadi.if_else(row[0] < 0, -row, row) / casadi.norm_2(row)
+
+
+def _roll_pitch_yaw(q: casadi.SX, R: casadi.SX) -> casadi.SX:
+    """Return the angles of R as Drake's RollPitchYaw does, exact also where the pitch is near a right angle."""
+    w, x, y, z = casadi.vertsplit(q)
+    pitch = casadi.atan2(-R[2, 0], casadi.sqrt((R[0, 0] ** 2 + R[1, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2) / 2))
+    half_sum, half_difference = casadi.atan2(x + z, w - y), casadi.atan2(z - x, w + y)
+    angles = casadi.vertcat(half_sum - half_difference, half_sum + half_difference)
+    angles -= 2 * np.pi * casadi.sign(angles) * (casadi.fabs(angles) > np.pi)
+    return casadi.vertcat(angles[0], pitch, angles[1])
+
+
+def _matrix(numbers: casadi.SX) -> casadi.SX:
+    """Return the square matrix whose rows follow one another in ``numbers``."""
+    n = isqrt(numbers.numel())
+    return casadi.reshape(numbers, n, n).T
 
 
 STATE_SIZE, STATUS_SIZE = 13, 4
@@ -296,6 +394,9 @@ class TargetTracker(AddressedSystem):
         self._inputs = [self.DeclareAbstractInputPort(name, Value(PoseEstimate.missing())) for name in sources]
         model = motion or MotionModel()
         model.check()
+        # Made before threads use them: CasADi's expressions are not for several threads.
+        for kernel in (_turned, _predicted, _looked_back, _present):
+            kernel()
         positive = (0.0, inf)
         self._pose = self.declare_discrete_state(pose=Quantity(np.zeros(6), POSE_UNIT))
         self._state = self.declare_discrete_state(
@@ -356,7 +457,6 @@ class TargetTracker(AddressedSystem):
         settings, counts = self._settings.view(context), self._counts.mutable(state)
         model: MotionModel = self._model(context)
         times = counts.last_times
-        track = Track.of(self._track.array(context)) if counts.fused else None
         fresh: list[tuple[float, int, PoseEstimate]] = []
         for k, port in enumerate(self._inputs):
             estimate: PoseEstimate = port.Eval(context)
@@ -364,6 +464,10 @@ class TargetTracker(AddressedSystem):
             if estimate.valid and times[k] < estimate.time <= context.get_time() + settings.lost_after:
                 times[k] = estimate.time
                 fresh.append((estimate.time, k, estimate))
+        if not (fresh or counts.fused):
+            return
+        numbers = self._track.mutable_array(state)
+        track = Track.of(numbers.copy()) if fresh and counts.fused else None
         for _, k, estimate in sorted(fresh, key=lambda entry: entry[:2]):
             if track is None or (counts.left_out_now >= settings.patience and self._starting[k]):
                 if self._starting[k]:
@@ -375,15 +479,14 @@ class TargetTracker(AddressedSystem):
             else:
                 counts.left_out_now += 1.0
                 counts.left_out += 1.0
-        if track is None:
+        if track is not None:
+            numbers[:] = track.numbers()
+        elif not counts.fused:
             return
-        if fresh:
-            self._track.mutable(state).track = track.numbers()
-        now, age = max(context.get_time(), track.time), context.get_time() - track.time
-        present = model.moved(track, now)
-        X_IT = present.X
-        self._state.mutable_array(state)[:] = body_state(X_IT, present.w, track.v)
-        self._pose.mutable(state).pose = pose_to_array(X_IT)
+        time, now = numbers.item(0), context.get_time()
+        age, present = now - time, model.present(numbers, max(now, time))
+        self._state.mutable_array(state)[:] = present[:13]
+        self._pose.mutable_array(state)[:] = present[13:19]
         status = self._status.mutable(state)
         status.valid, status.age = counts.fused >= settings.fewest and age <= settings.lost_after, age
-        status.attitude_deviation, status.position_deviation = model.deviations(track, now)
+        status.attitude_deviation, status.position_deviation = present[19:]
