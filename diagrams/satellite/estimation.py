@@ -70,8 +70,9 @@ class BaseEstimator(AddressedSystem):
         following[:] = self._kernel.value((self._base.array(context), self._imu.Eval(context)))
         # The samples before the first interval are over at t = 0 and are about no motion.
         self._base.mutable(state).time = context.get_time() - self._period
-        past = self._history.array(context)
-        self._history.mutable_array(state)[:] = np.concatenate((following[:POSE], past[:-POSE]))
+        history = self._history.mutable_array(state)
+        history[POSE:] = history[:-POSE]
+        history[:POSE] = following[:POSE]
 
 
 def pose_at(history: ArrayLike, time: float) -> RigidTransform:

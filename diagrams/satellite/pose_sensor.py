@@ -68,6 +68,10 @@ class PoseSensor(SampledSensor):
         return self._relative(self._state_port.Eval(context))
 
 
+# The covariance of poses with a deviation of 1 m: an error of 1 m is one of 2 rad, see `PoseSensor`.
+_COVARIANCE = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0])
+
+
 class PoseReader(AddressedSystem):
     """The data processing of a `PoseSensor`: it relates each pose to the inertial frame I of the base's navigation.
 
@@ -116,12 +120,12 @@ class PoseReader(AddressedSystem):
         arrived = self._arrived.view(context)
         taken, pose = context.get_time() - self._period - settings.latency, self._pose.Eval(context)
         # Nothing was measured before the start; times are rounded.
-        is_new = taken > -0.5 * self._period and not (pose == last).all()
+        is_new = taken > -0.5 * self._period and pose.tolist() != last.tolist()
         if not (is_new or arrived.waiting):
             return EventStatus.DidNothing()
         if arrived.waiting:
             X_IB: RigidTransform = pose_at(self._history.Eval(context), arrived.last_time)
-            covariance = np.diag(np.repeat([2.0 * settings.deviation, settings.deviation], 3) ** 2)
+            covariance = settings.deviation**2 * _COVARIANCE
             estimate = PoseEstimate.of(X_IB @ pose_of_state(last), covariance, time=arrived.last_time)
             state.get_mutable_abstract_state(self._estimate).set_value(estimate)
         numbers = state.get_mutable_discrete_state()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from math import hypot
+from math import exp, hypot
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
@@ -116,6 +116,11 @@ def stopping_speed(distance: float, *, gain: float, acceleration: float) -> floa
     """
     knee = acceleration / max(gain**2, 1e-12)
     return gain * distance if distance <= knee else float(np.sqrt(2.0 * acceleration * (distance - 0.5 * knee)))
+
+
+def _all_below(values: Array, limit: float) -> bool:
+    """Return whether no value is beyond a limit, in either direction; NaN is."""
+    return all(abs(value) < limit for value in values.tolist())
 
 
 @dataclass
@@ -235,10 +240,10 @@ class Supervisor(AddressedSystem):
         joints = self._joints.Eval(context)
         arm, fingers = joints[:ARM_JOINTS], joints[ARM_JOINTS:]
         behind = arm - self._smooth.array(context)
-        rests = float(np.abs(behind).max()) < p.still_rate * _SMOOTHING
+        rests = _all_below(behind, p.still_rate * _SMOOTHING)
         go = float(self._capture.Eval(context)[0])
-        still = bool((np.abs(fingers - memory.last_fingers) < 5e-4 * T / 0.02).all())
-        holds = 0.6 * self._bar < float(fingers.sum()) < 1.4 * self._bar
+        still = _all_below(fingers - memory.last_fingers, 5e-4 * T / 0.02)
+        holds = 0.6 * self._bar < sum(fingers.tolist()) < 1.4 * self._bar
         in_mode, since = memory.time_in_mode + T, memory.capture_time + T if mode != Mode.WAIT else 0.0
 
         step = _Step(
@@ -279,7 +284,7 @@ class Supervisor(AddressedSystem):
         remembered.reason, remembered.time_in_mode, remembered.capture_time = step.reason, in_mode, since
         remembered.steady_for, remembered.attempts_made = step.steady, step.attempts
         remembered.last_fingers = fingers
-        self._smooth.mutable(state).smooth_position = arm - behind * np.exp(-T / _SMOOTHING)
+        self._smooth.mutable(state).smooth_position = arm - behind * exp(-T / _SMOOTHING)
 
     def _lasts(self, step: _Step, true: bool) -> float:
         """Return for how long something has been true, in s."""

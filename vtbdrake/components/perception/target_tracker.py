@@ -10,6 +10,7 @@ from math import ceil, hypot, inf, isqrt
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import RotationalInertia
@@ -344,8 +345,6 @@ def body_state(X_IT: RigidTransform, w: ArrayLike, v: ArrayLike) -> Array:
 
 def pose_of_state(state: ArrayLike) -> RigidTransform:
     """Return the pose in a `body_state` (13,); its quaternion may be of any length but 0."""
-    from pydrake.common.eigen_geometry import Quaternion
-
     x = np.asarray(state, dtype=float)
     return RigidTransform(Quaternion(x[:4] / np.linalg.norm(x[:4])), x[4:7])
 
