@@ -86,6 +86,7 @@ def recording_cost(cycles: int = 6_000, rounds: int = 12) -> list[Benchmark]:
 def _ratio(name: str, late: dict[bool, list[list[float]]], goal: float | None, against: str, note: str) -> Benchmark:
     of_rounds = {on: np.percentile(rounds, 99.0, axis=1) for on, rounds in late.items()}
     p99 = {on: float(np.median(values)) for on, values in of_rounds.items()}
+    spreads = {on: spread(1e6 * values, unit="us") for on, values in of_rounds.items()}
     return Benchmark(
         name=name,
         value=p99[True] / p99[False],
@@ -93,8 +94,7 @@ def _ratio(name: str, late: dict[bool, list[list[float]]], goal: float | None, a
         goal=goal,
         better=LOWER,
         against=f"{against}: p99 {1e6 * p99[False]:.0f} us late",
-        note=f"with both {spread(1e6 * of_rounds[True], unit='us')}, without {spread(1e6 * of_rounds[False], unit='us')}"
-        f"{note}",
+        note=f"with both {spreads[True]}, without {spreads[False]}{note}",
     )
 
 
