@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydrake.manipulation import (
@@ -15,6 +15,7 @@ from pydrake.manipulation import (
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, Diagram, DiagramBuilder
 
 from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.testbed.schunk_kernel import actuation, errors
 
 FORCE_LIMIT = 40.0
 """The largest force in N of a gripper that gets no other."""
@@ -49,15 +50,6 @@ def simulated_gripper(config: SchunkWsgDriver) -> Diagram:
     builder.ExportOutput(measured.get_output_port(), "state_measured")
     builder.ExportOutput(force.get_output_port(), "force_measured")
     return builder.Build()
-
-
-class _Errors(NamedTuple):
-    """The errors of mean and grip, in m, and of their rates, in m/s."""
-
-    mean: float
-    grip: float
-    mean_rate: float
-    grip_rate: float
 
 
 class SchunkWsgControl(AddressedSystem):
@@ -121,33 +113,19 @@ class SchunkWsgControl(AddressedSystem):
             after.moves, after.target, after.start = 1.0, target, context.get_time()
             after.begins, after.parts = [begin for begin, *_ in parts[1:]], [part for _, *part in parts]
 
-    def _errors(self, context: Context) -> _Errors:
-        motion = self._motion.view(context)
-        second, third = motion.begins.tolist()
-        # As PiecewisePolynomial does: a part lasts until the next one begins, and beyond its ends nothing moves.
-        elapsed = min(max(context.get_time() - motion.start, 0.0), motion.end)
-        begin, part = (0.0, 0) if elapsed < second else (second, 1) if elapsed < third else (third, 2)
-        grip, rate, grip_slope, rate_slope = motion.parts[part].tolist()
-        q0, q1, v0, v1 = self._state_port.Eval(context).tolist()
-        return _Errors(
-            mean=-(0.5 * q0 + 0.5 * q1),
-            grip=grip + (elapsed - begin) * grip_slope - (q0 - q1),
-            mean_rate=-(0.5 * v0 + 0.5 * v1),
-            grip_rate=rate + (elapsed - begin) * rate_slope - (v0 - v1),
-        )
-
     def _integrals(self, context: Context) -> tuple[float, float]:
         """Return the integrals of the errors of mean and grip."""
         return 0.0, 0.0
 
     def _calc_actuation(self, context: Context, output: BasicVector) -> None:
-        kp, ki, kd = self._gains
-        errors, most = self._errors(context), 0.5 * self._motion.view(context).max_force
-        mean_integral, grip_integral = self._integrals(context)
-        mean_force = kp * errors.mean + kd * errors.mean_rate + ki * mean_integral
-        grip_force = min(max(kp * errors.grip + kd * errors.grip_rate + ki * grip_integral, -most), most)
-        output.SetAtIndex(0, 0.5 * mean_force + grip_force)
-        output.SetAtIndex(1, 0.5 * mean_force - grip_force)
+        actuation(
+            self._motion.array(context),
+            self._state_port.Eval(context),
+            output.get_mutable_value(),
+            time=context.get_time(),
+            gains=self._gains,
+            integrals=self._integrals(context),
+        )
 
 
 class SchunkWsgIntegralControl(SchunkWsgControl):
@@ -162,8 +140,8 @@ class SchunkWsgIntegralControl(SchunkWsgControl):
         return mean, grip
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        errors = self._errors(context)
-        derivatives.get_mutable_vector().SetFromVector([errors.mean, errors.grip])
+        now = errors(self._motion.array(context), self._state_port.Eval(context), time=context.get_time())
+        derivatives.get_mutable_vector().SetFromVector(now[:2])
 
 
 def _ramp(start: float, target: float) -> tuple[list[tuple[float, ...]], float]:
