@@ -34,17 +34,17 @@ def obj_mesh(
     from pydrake.geometry import InMemoryMesh
 
     corner = "%d" if normals is None else "%d//%d"
-    text = _lines("v %.9g %.9g %.9g", np.asarray(vertices))
+    text = obj_lines("v %.9g %.9g %.9g", np.asarray(vertices))
     if normals is not None:
-        text += _lines("vn %.3g %.3g %.3g", normals)
+        text += obj_lines("vn %.3g %.3g %.3g", normals)
     # Faces with equally many vertices at once.
     for rows in [faces] if isinstance(faces, np.ndarray) else [np.array([face]) for face in faces]:
         numbers = np.repeat(rows + 1, 1 if normals is None else 2, axis=1)
-        text += _lines(" ".join(["f", *[corner] * rows.shape[1]]), numbers)
+        text += obj_lines(" ".join(["f", *[corner] * rows.shape[1]]), numbers)
     return InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name))
 
 
-def _lines(form: str, rows: NDArray[Any]) -> str:
+def obj_lines(form: str, rows: NDArray[Any]) -> str:
     """Return a line of text for each row of numbers, (n, k), formatted at once, which is faster."""
     return (form + "\n") * len(rows) % tuple(rows.ravel().tolist())
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.components.meshes import Surface, vertex_normals
+from vtbdrake.components.meshes import Surface, obj_lines, vertex_normals
 
 if TYPE_CHECKING:
     from pydrake.geometry import Mesh
@@ -46,13 +46,9 @@ def _mesh(
     from pydrake.geometry import InMemoryMesh, Mesh
 
     obj = "mtllib texture.mtl\nusemtl texture\n"
-    for line, rows in (
-        ("v %.9f %.9f %.9f\n", np.asarray(vertices)),
-        ("vt %.9f %.9f\n", np.asarray(coordinates)),
-        ("vn %.9f %.9f %.9f\n", np.asarray(normals)),
-        ("f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.asarray(corners) + 1),
-    ):
-        obj += line * len(rows) % tuple(rows.ravel().tolist())
+    obj += obj_lines("v %.9f %.9f %.9f", np.asarray(vertices)) + obj_lines("vt %.9f %.9f", np.asarray(coordinates))
+    obj += obj_lines("vn %.9f %.9f %.9f", np.asarray(normals))
+    obj += obj_lines("f %d/%d/%d %d/%d/%d %d/%d/%d", np.asarray(corners) + 1)
     material = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd texture.png\n"
     files = {
         "texture.mtl": MemoryFile(material.encode(), ".mtl", "texture.mtl"),

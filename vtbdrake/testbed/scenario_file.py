@@ -298,16 +298,21 @@ def _filled(scenario: S, content: yaml.Node, path: Path, name: str) -> S:
         if isinstance(error, ScenarioError):
             raise ScenarioError(f"{path}: {error}") from error
         raise ScenarioError(f"{path} does not fit {name}: {error}") from error
-    filled.set_origin(str(path.absolute()), dict(_lines(content)))
+    filled.set_origin(str(path.absolute()), dict(lines_by_name(content)))
     return filled
 
 
-def _lines(node: yaml.Node, name: str = "") -> Iterator[tuple[str, int]]:
-    """Yield (dotted name, line) of every key, counted from 1."""
-    for key, value in node.value if isinstance(node, yaml.MappingNode) else []:
-        below = f"{name}.{key.value}".lstrip(".")
-        yield below, key.start_mark.line + 1
-        yield from _lines(value, below)
+def lines_by_name(node: yaml.Node | None, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield (dotted name, line, counted from 1) of keys and of the entries of lists, which have numbers."""
+    entries: list[tuple[str, yaml.Node, yaml.Node]] = []
+    if isinstance(node, yaml.MappingNode):
+        entries = [(str(key.value), key, value) for key, value in node.value]
+    elif isinstance(node, yaml.SequenceNode):
+        entries = [(str(index), value, value) for index, value in enumerate(node.value)]
+    for key, place, value in entries:
+        below = f"{name}.{key}".lstrip(".")
+        yield below, place.start_mark.line + 1
+        yield from lines_by_name(value, below)
 
 
 def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:

@@ -14,7 +14,7 @@ import yaml
 
 from vtbdrake.settings import check_settings, field_types
 from vtbdrake.testbed.scenario import ScenarioError
-from vtbdrake.testbed.scenario_file import compose_yaml, refuse_unknown, resolve_types
+from vtbdrake.testbed.scenario_file import compose_yaml, lines_by_name, refuse_unknown, resolve_types
 
 T = TypeVar("T")
 # The name of an entry in a message: criteria[a], or qualities[0].
@@ -32,7 +32,7 @@ class Lines:
 
     def __init__(self, path: Path = Path(), node: yaml.Node | None = None, kind: str = "") -> None:
         self._path = path
-        self._names = dict(_names(node))
+        self._names = dict(lines_by_name(node))
         self._texts: dict[str, int] = {f"{kind}.{name}": line for name, line in self._names.items()}
         for text, line in [*self._names.items(), *_texts(node)]:
             if "." in text or ":" in text:
@@ -59,19 +59,6 @@ class Lines:
             places.append((0, -len(key), self._names[key]))
         line = f"line {min(places)[2]}: " if places else ""
         return f"{self._path}: {line}{text}"
-
-
-def _names(node: yaml.Node | None, name: str = "") -> Iterator[tuple[str, int]]:
-    """Yield (dotted name, line) of keys and of the entries of lists, which have numbers."""
-    entries: list[tuple[str, yaml.Node, yaml.Node]] = []
-    if isinstance(node, yaml.MappingNode):
-        entries = [(str(key.value), key, value) for key, value in node.value]
-    elif isinstance(node, yaml.SequenceNode):
-        entries = [(str(index), value, value) for index, value in enumerate(node.value)]
-    for key, place, value in entries:
-        below = f"{name}.{key}".lstrip(".")
-        yield below, place.start_mark.line + 1
-        yield from _names(value, below)
 
 
 def _texts(node: yaml.Node | None) -> Iterator[tuple[str, int]]:
