@@ -8,18 +8,22 @@ from itertools import accumulate
 from math import ceil, exp, inf, log, nan
 from typing import Any
 
+RESOLUTION = 0.01
+"""Ratio of the ends of a bin of a histogram, less one."""
+
+LOWEST, HIGHEST = 1e-6, 10.0
+"""Durations in seconds below and above which all share a bin; also negative ones."""
+
+_SCALE = 1.0 / log(1.0 + RESOLUTION)
+_SHIFT = 1.0 - _SCALE * log(LOWEST)
+
 
 class Histogram:
     """Durations in bins of equal ratio, in constant memory.
 
     A percentile is the upper end of the bin in which it lies: never below the true one (of the kind "inverted_cdf"),
-    and above it by at most a factor of 1 + resolution; below ``lowest`` it is ``lowest``, above ``highest`` the
-    largest. Count, total, least and largest are exact.
-
-    Args:
-        resolution: Ratio of the ends of a bin, less one.
-        lowest: Shortest duration, in seconds; shorter and negative durations share one bin.
-        highest: Longest duration, in seconds; longer durations share one bin.
+    and above it by at most a factor of 1 + `RESOLUTION`; below `LOWEST` it is `LOWEST`, above `HIGHEST` the largest.
+    Count, total, least and largest are exact.
 
     Attributes:
         count: Number of durations.
@@ -28,18 +32,11 @@ class Histogram:
         largest: Longest duration in seconds; NaN if there is none.
     """
 
-    def __init__(self, *, resolution: float = 0.01, lowest: float = 1e-6, highest: float = 10.0) -> None:
-        if not 0.0 < resolution <= 1.0:
-            raise ValueError(f"the resolution of a histogram lies above 0 and is at most 1, not {resolution}")
-        if not 0.0 < lowest < highest < inf:
-            raise ValueError(f"a histogram needs 0 < lowest < highest, not {lowest} and {highest}")
-        self.resolution, self.lowest, self.highest = resolution, lowest, highest
+    def __init__(self) -> None:
         self.count, self.total = 0, 0.0
         self.least = self.largest = nan
-        # Bin 0 ends at lowest, bin k > 0 at lowest exp(k / scale); the last one starts at highest and has no end.
-        self._scale = 1.0 / log(1.0 + resolution)
-        self._shift = 1.0 - self._scale * log(lowest)
-        self._bins = [0] * (ceil(self._scale * log(highest / lowest)) + 2)
+        # Bin 0 ends at the lowest, bin k > 0 at LOWEST exp(k / scale); the last one starts at the highest, without end.
+        self._bins = [0] * (ceil(_SCALE * log(HIGHEST / LOWEST)) + 2)
 
     def __repr__(self) -> str:
         return f"Histogram({self.count} durations, mean {self.mean:.3g} s, largest {self.largest:.3g} s)"
@@ -50,11 +47,11 @@ class Histogram:
         Raises:
             ValueError: It is NaN.
         """
-        if seconds <= self.lowest:
+        if seconds <= LOWEST:
             self._bins[0] += 1
-        elif seconds < self.highest:
-            self._bins[int(log(seconds) * self._scale + self._shift)] += 1
-        elif seconds >= self.highest:
+        elif seconds < HIGHEST:
+            self._bins[int(log(seconds) * _SCALE + _SHIFT)] += 1
+        elif seconds >= HIGHEST:
             self._bins[-1] += 1
         else:
             raise ValueError("a duration is a number of seconds, not NaN")
@@ -81,20 +78,11 @@ class Histogram:
         # The rounding corrects products such as 99.9 % of 1000, which is 999.0000000000001.
         rank = max(1, ceil(round(percent / 100.0 * self.count, 6)))
         index = next(index for index, passed in enumerate(accumulate(self._bins)) if passed >= rank)
-        end = inf if index == len(self._bins) - 1 else self.lowest * exp(index / self._scale)
+        end = inf if index == len(self._bins) - 1 else LOWEST * exp(index / _SCALE)
         return min(end, self.largest)
 
     def merge(self, other: Histogram) -> None:
-        """Add all durations of ``other``.
-
-        Raises:
-            ValueError: Its bins are different.
-        """
-        if self._shape() != other._shape():
-            raise ValueError(
-                "histograms merge if their resolution, lowest and highest agree, but these are "
-                f"{self._shape()} and {other._shape()}"
-            )
+        """Add all durations of ``other``."""
         if other.count:
             self._bins = [a + b for a, b in zip(self._bins, other._bins, strict=True)]
             self.least = min(self.least if self.count else inf, other.least)
@@ -105,9 +93,9 @@ class Histogram:
     def to_dict(self) -> dict[str, Any]:
         """Return the histogram as plain data, fit for JSON."""
         return {
-            "resolution": self.resolution,
-            "lowest": self.lowest,
-            "highest": self.highest,
+            "resolution": RESOLUTION,
+            "lowest": LOWEST,
+            "highest": HIGHEST,
             "total": self.total,
             "least": self.least if self.count else None,
             "largest": self.largest if self.count else None,
@@ -121,7 +109,7 @@ class Histogram:
         Raises:
             ValueError: The data contain a bin that such a histogram does not have.
         """
-        histogram = cls(resolution=data["resolution"], lowest=data["lowest"], highest=data["highest"])
+        histogram = cls()
         for index, number in data["bins"].items():
             if not (0 <= int(index) < len(histogram._bins) and number > 0):
                 raise ValueError(f"a histogram of {len(histogram._bins)} bins has no bin {index} with {number} entries")
@@ -130,9 +118,6 @@ class Histogram:
         if histogram.count:
             histogram.total, histogram.least, histogram.largest = data["total"], data["least"], data["largest"]
         return histogram
-
-    def _shape(self) -> tuple[float, float, float]:
-        return self.resolution, self.lowest, self.highest
 
 
 @dataclass
@@ -144,10 +129,6 @@ class Threshold:
     warnings: int = 0  # number of durations above ``warning``, up to ``error``
     errors: int = 0  # number of durations above ``error``
 
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.warning <= self.error:
-            raise ValueError(f"a threshold needs 0 <= warning <= error, not {self.warning} and {self.error}")
-
 
 QUANTITIES = ("lateness", "step", "cycle")
 _COUNTS = ("misses", "run", "longest_run", "foreign", "off_pace")
@@ -158,12 +139,11 @@ class LoopStatistics:
 
     Args:
         period: Period of the loop, in seconds.
-        thresholds: By quantity; by default, warnings start above half a period and errors above a whole one.
 
     Attributes:
         histograms: Histograms of ``lateness`` (from the deadline to the wake-up), ``step`` (of the DPS) and ``cycle``
             (all work of a cycle, from the wake-up on).
-        thresholds: Thresholds of the same quantities.
+        thresholds: Thresholds of the same quantities: warnings above half a period, errors above a whole one.
         misses: Number of deadlines that passed while the loop worked on an earlier cycle.
         run: Number of misses in a row, up to now.
         longest_run: Number of misses in the longest such row.
@@ -171,17 +151,12 @@ class LoopStatistics:
         off_pace: Number of cycles in which the messages that begin them came at another pace than the period.
     """
 
-    def __init__(self, period: float, *, thresholds: Mapping[str, Threshold] | None = None) -> None:
+    def __init__(self, period: float) -> None:
         if not 0.0 < period < inf:
             raise ValueError(f"a loop has a positive period, not {period} s")
-        thresholds = thresholds or {}
-        if unknown := sorted(set(thresholds) - set(QUANTITIES)):
-            raise ValueError(f"there are thresholds for {', '.join(QUANTITIES)}, but none for {', '.join(unknown)}")
         self.period = period
         self.histograms = {name: Histogram() for name in QUANTITIES}
-        self.thresholds = {
-            name: thresholds[name] if name in thresholds else Threshold(0.5 * period, period) for name in QUANTITIES
-        }
+        self.thresholds = {name: Threshold(0.5 * period, period) for name in QUANTITIES}
         self.misses = 0
         self.run = 0
         self.longest_run = 0
@@ -245,9 +220,9 @@ class LoopStatistics:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LoopStatistics:
         """Return the statistics that `to_dict` described."""
-        thresholds = {name: Threshold(**threshold) for name, threshold in data["thresholds"].items()}
-        statistics = cls(data["period"], thresholds=thresholds)
+        statistics = cls(data["period"])
         for name in QUANTITIES:
+            vars(statistics.thresholds[name]).update(data["thresholds"][name])
             statistics.histograms[name].merge(Histogram.from_dict(data["histograms"][name]))
         for name in _COUNTS:
             setattr(statistics, name, data[name])
