@@ -93,6 +93,29 @@ def test_impossible_values_are_refused(values: dict[str, object], message: str) 
     assert str(refusal.value).startswith(message)
 
 
+@dataclass
+class Slice:
+    """A range of heights and of widths."""
+
+    heights: tuple[float, float] = setting((0.0, 1.0), unit="m", ascending=True)
+    least: int = setting(2, below="largest")
+    largest: int = 3
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"heights": (1.0, 1.0)}, r"Slice.heights must be the lower one, then the upper one, not \(1.0, 1.0\)"),
+        ({"least": 3}, "Slice.least must be below the largest, 3, not 3"),
+        ({"largest": 1}, "Slice.least must be below the largest, 1, not 2"),
+    ],
+)
+def test_settings_out_of_order_are_refused(values: dict[str, object], message: str) -> None:
+    check_settings(Slice())
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        check_settings(Slice(**values))
+
+
 def test_another_default_keeps_the_range() -> None:
     assert declared_settings(SlowEye)["rate"] == declared_settings(Eye)["rate"]
     with pytest.raises(ValueError, match="SlowEye.rate must be a number above 0"):

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from inspect import getdoc
+from itertools import pairwise
 from math import inf, isfinite
 from numbers import Integral, Real
 from typing import Any, NamedTuple, get_args
@@ -47,6 +48,8 @@ class Setting:
         le: The largest value.
         choices: The only values; empty for all in the range.
         finite: Whether infinity is excluded.
+        below: The field whose value this one is below.
+        ascending: Whether two entries are the lower one, then the upper one.
         remedy: The reason for the range, or what to do, for error messages.
     """
 
@@ -58,6 +61,8 @@ class Setting:
     le: float | None = None
     choices: tuple[Any, ...] = ()
     finite: bool = True
+    below: str = ""
+    ascending: bool = False
     remedy: str = ""
 
     def contains(self, value: Any) -> bool:
@@ -204,6 +209,13 @@ def check_settings(config: Any, *, name: str = "", error: type[ValueError] = Val
     for key, annotation in field_types(config).items():
         path = f"{name or type(config).__name__}.{key}"
         check_value(path, getattr(config, key), annotation, settings.get(key), error=error)
+    for key, limits in settings.items():
+        path, value = f"{name or type(config).__name__}.{key}", getattr(config, key)
+        if limits.below and not value < getattr(config, limits.below):
+            most = f"{limits.below}, {getattr(config, limits.below):g} {limits.unit}".rstrip()
+            raise error(f"{path} must be below the {most}, not {value!r}")
+        if limits.ascending and not all(lower < upper for lower, upper in pairwise(value)):
+            raise error(f"{path} must be the lower one, then the upper one, not {value!r}")
 
 
 def check_value(

@@ -39,17 +39,15 @@ class RockField:
     length: float = setting(100.0, "Extent along x.", unit="m", gt=0)
     width: float = setting(100.0, "Extent along y.", unit="m", gt=0)
     abundance: float = setting(0.05, "Share k of the ground that rocks of all sizes cover.", ge=0.005, le=0.3)
-    least_diameter: float = setting(0.3, "Diameter of the smallest rocks that are not left out.", unit="m", ge=0.1)
+    least_diameter: float = setting(
+        0.3, "Diameter of the smallest rocks that are not left out.", unit="m", ge=0.1, below="largest_diameter"
+    )
     largest_diameter: float = setting(2.0, "Diameter of the largest rocks.", unit="m", le=5)
     track_width: float = setting(0.0, "Width of the tracks, which have no rocks; 0: no tracks.", unit="m", ge=0, le=8)
     track_spacing: float = setting(28.0, "Distance of the tracks.", unit="m", gt=0)
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if not self.least_diameter < self.largest_diameter:
-            raise ValueError(
-                f"rocks have diameters from {self.least_diameter} to {self.largest_diameter} m: no such range"
-            )
 
     def density(self) -> float:
         """Return the number of rocks per m^2, before tracks are cleared."""

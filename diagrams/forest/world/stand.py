@@ -93,7 +93,7 @@ class Stand:
     spacing: float = setting(1.0, "Least distance of two trees; a plantation has its own.", unit="m", ge=0)
     diameter_scale: float = setting(0.2, "Scale of the distribution of trunk diameters.", unit="m", gt=0)
     diameter_shape: float = setting(2.5, "Shape of the distribution of trunk diameters.", gt=0)
-    least_diameter: float = setting(0.06, "Least trunk diameter.", unit="m", gt=0)
+    least_diameter: float = setting(0.06, "Least trunk diameter.", unit="m", gt=0, below="largest_diameter")
     largest_diameter: float = setting(0.41, "Largest trunk diameter.", unit="m", gt=0)
     kind: str = setting("natural", "How trees are distributed.", choices=KINDS)
     road_width: float = setting(
@@ -103,10 +103,6 @@ class Stand:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if not self.least_diameter < self.largest_diameter:
-            raise ValueError(
-                f"diameters lie between {self.least_diameter} and {self.largest_diameter} m: no such range"
-            )
         if self.kind == "plantation":
             return
         coverage = self.density / HECTARE * pi * self.spacing**2 / 4.0

@@ -164,7 +164,7 @@ def test_heights_are_plausible() -> None:
         (lambda: Stand(length=0.0), "length must be a finite number above 0 m, not 0.0"),
         (lambda: Stand(density=float("nan")), "density must be a finite number above 0 1/ha, not nan"),
         (lambda: Stand(spacing=-1.0), "spacing must be a finite number of at least 0 m, not -1.0"),
-        (lambda: Stand(least_diameter=0.5), "no such range"),
+        (lambda: Stand(least_diameter=0.5), "least_diameter must be below the largest_diameter"),
         (lambda: Stand(kind="jungle"), "one of natural, clustered, plantation, windthrown, not 'jungle'"),
         (lambda: Stand(road_width=9.0), "road_width must be a number from 0 to 8 m, not 9.0"),
         (lambda: Stand(kind="clustered", density=1500.0, spacing=1.9, length=30.0).trees(), "no place in clusters"),

@@ -89,7 +89,7 @@ def test_carrier_drives_on_mars() -> None:
     ("fields", "message"),
     [
         ({"abundance": 0.5}, "abundance must be a number from 0.005 to 0.3, not 0.5"),
-        ({"least_diameter": 3.0}, "from 3.0 to 2.0 m: no such range"),
+        ({"least_diameter": 3.0}, "least_diameter must be below the largest_diameter, 2 m, not 3.0"),
         ({"track_width": 1.0}, "the carrier is 1.5 m wide"),
     ],
 )

@@ -42,7 +42,7 @@ class RockDetectorConfig(ScanDetectorConfig):
     least_roundness: float = setting(
         0.4, "The least bulge of the visible outline, as a share of that of a circle of the same width.", ge=0.0, lt=1.0
     )
-    least_width: float = setting(0.2, "The least width of a rock.", unit="m", gt=0.0)
+    least_width: float = setting(0.2, "The least width of a rock.", unit="m", gt=0.0, below="largest_width")
     largest_width: float = setting(3.0, "The largest width of a rock.", unit="m", gt=0.0)
     least_points: int = setting(3, "The least number of points of a rock.", ge=2)
     cell: float = setting(
@@ -54,12 +54,6 @@ class RockDetectorConfig(ScanDetectorConfig):
     elongation: float = setting(
         0.25, "Standard deviation of the diameters of a rock's outline, as a share of their mean.", ge=0.0, lt=1.0
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.least_width < self.largest_width:
-            most = f"below the largest_width, {self.largest_width:g} m"
-            raise ValueError(f"RockDetectorConfig.least_width must be {most}, not {self.least_width!r}")
 
 
 def detect_rocks(points_H: ArrayLike, detector: RockDetectorConfig, *, p_HoLo_H: ArrayLike) -> Landmarks:

@@ -44,13 +44,16 @@ class StereoTrunkDetectorConfig:
     """
 
     heights: tuple[float, float] = setting(
-        (-1.3, 1.5), "The lower and the upper end of the slice that is searched, above the camera.", unit="m"
+        (-1.3, 1.5),
+        "The lower and the upper end of the slice that is searched, above the camera.",
+        unit="m",
+        ascending=True,
     )
     extent: float = setting(
         1.8, "The least height of the part of an object that is seen within the slice.", unit="m", gt=0.0
     )
     reach: float = setting(16.0, "The largest distance at which trunks are searched for.", unit="m", gt=0.0)
-    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", ge=0.0)
+    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", ge=0.0, below="largest_diameter")
     largest_diameter: float = setting(0.7, "The largest diameter of a trunk.", unit="m", gt=0.0)
     disparity_deviation: float = setting(
         0.2, "Standard deviation of the mean disparity of a trunk.", unit="pixels", gt=0.0
@@ -78,16 +81,9 @@ class StereoTrunkDetectorConfig:
     def __post_init__(self) -> None:
         check_settings(self)
         low, high = self.heights
-        if not low < high:
-            raise ValueError(
-                f"StereoTrunkDetectorConfig.heights must be the lower one, then the upper one, not {self.heights!r}"
-            )
         if not self.extent < high - low:
             most = f"below the height of the slice, {high - low:g} m"
             raise ValueError(f"StereoTrunkDetectorConfig.extent must be {most}, not {self.extent!r}")
-        if not self.least_diameter < self.largest_diameter:
-            most = f"below the largest_diameter, {self.largest_diameter:g} m"
-            raise ValueError(f"StereoTrunkDetectorConfig.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
 def detect_stereo_trunks(

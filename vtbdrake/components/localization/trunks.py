@@ -78,12 +78,12 @@ class TrunkDetectorConfig(ScanDetectorConfig):
         ge=0.0,
     )
     heights: tuple[float, float] = setting(
-        (0.7, 2.7), "The lower and the upper end of the slice over the ground.", unit="m", gt=0.0
+        (0.7, 2.7), "The lower and the upper end of the slice over the ground.", unit="m", gt=0.0, ascending=True
     )
     reference_height: float = setting(
         1.3, "Height over the ground of the point of the axis that is the position of the landmark.", unit="m", ge=0.0
     )
-    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", gt=0.0)
+    least_diameter: float = setting(0.04, "The least diameter of a trunk.", unit="m", gt=0.0, below="largest_diameter")
     largest_diameter: float = setting(1.0, "The largest diameter of a trunk.", unit="m", gt=0.0)
     upright_share: float = setting(
         0.6, "The least share of the rows of rays passing a place that a trunk there returns.", ge=0.0, le=1.0
@@ -110,16 +110,6 @@ class TrunkDetectorConfig(ScanDetectorConfig):
         unit="m",
         ge=0.0,
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.heights[0] < self.heights[1]:
-            raise ValueError(
-                f"TrunkDetectorConfig.heights must be the lower one, then the upper one, not {self.heights!r}"
-            )
-        if not self.least_diameter < self.largest_diameter:
-            most = f"below the largest_diameter, {self.largest_diameter:g} m"
-            raise ValueError(f"TrunkDetectorConfig.least_diameter must be {most}, not {self.least_diameter!r}")
 
 
 def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_H: ArrayLike) -> Landmarks:
