@@ -181,18 +181,15 @@ class CartPoleScenario(Scenario):
         and from the force that acts.
         """
         T, model = self.period, CartPole()
-        for k, name in enumerate(JOINT_NAMES):
-            for i, (value, errors) in enumerate(
-                (("position", self.position_errors), ("velocity", self.velocity_errors))
-            ):
-                builder.believe(
-                    f"sim.sys.cart_pole.{name}.{value}",
-                    of=[PERCEIVED, FORCE],
-                    by=partial(_present, model, entry=JOINTS * i + k),
-                    age=(1 + errors.latency) * T,
-                    period=T,
-                )
+        for i, (value, errors) in enumerate((("position", self.position_errors), ("velocity", self.velocity_errors))):
+            builder.believe(
+                [f"sim.sys.cart_pole.{name}.{value}" for name in JOINT_NAMES],
+                of=[PERCEIVED, FORCE],
+                by=partial(_present, model, entries=slice(JOINTS * i, JOINTS * (i + 1))),
+                age=(1 + errors.latency) * T,
+                period=T,
+            )
 
 
-def _present(model: CartPole, state: np.ndarray, force: float, *, entry: int, late: float) -> float:
-    return float(model.advanced(state, float(force), late)[entry])
+def _present(model: CartPole, state: np.ndarray, force: float, *, entries: slice, late: float) -> np.ndarray:
+    return model.advanced(state, float(force), late)[entries]

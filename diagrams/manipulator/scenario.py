@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
 
 import numpy as np
 from drake import lcmt_force_torque, lcmt_scope
@@ -269,12 +268,6 @@ class ManipulatorScenario(Scenario):
 
         push = builder.add("env", "push", Push(plant, "tip"))
         builder.connect(push.get_output_port(), plant.get_applied_spatial_force_input_port())
-        for k, name in enumerate(JOINT_NAMES):
-            for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
-                # One reading for all joints: the belief is read while the loop runs.
-                builder.believe(
-                    f"sim.sys.arm.{name}.{value}",
-                    of=[f"dps.env.joint_{value}"],
-                    by=itemgetter(k),
-                    age=(1 + errors.latency) * T,
-                )
+        for value, errors in (("position", self.position_errors), ("velocity", self.velocity_errors)):
+            targets = [f"sim.sys.arm.{name}.{value}" for name in JOINT_NAMES]
+            builder.believe(targets, of=[f"dps.env.joint_{value}"], age=(1 + errors.latency) * T)

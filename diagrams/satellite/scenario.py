@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Self
 
@@ -290,14 +289,11 @@ class SatelliteScenario(Scenario):
         moves on with the velocities that it is believed to have. The fingers rest.
         """
         measured, rate = "dps.impl.controller.measured_position", "dps.impl.controller.joint_rate_command"
-        for k, name in enumerate(JOINT_NAMES):
-            address = f"sim.sys.servicer.{name}"
-            if k < ARM_JOINTS:
-                by = partial(_joint_later, joint=k)
-                builder.believe(f"{address}.position", of=[measured, rate], by=by, age=PERIOD, period=PERIOD)
-                builder.believe(f"{address}.velocity", of=[rate], by=itemgetter(k), age=PERIOD)
-            else:
-                builder.believe(f"{address}.position", of=[measured], by=itemgetter(k), age=PERIOD)
+        positions, velocities = (
+            [f"sim.sys.servicer.{name}.{value}" for name in JOINT_NAMES] for value in ("position", "velocity")
+        )
+        builder.believe(positions, of=[measured, rate], by=_joints_later, age=PERIOD, period=PERIOD)
+        builder.believe(velocities[:ARM_JOINTS], of=[rate], by=itemgetter(slice(ARM_JOINTS)), age=PERIOD)
         base, target = "dps.env.base", "dps.env.target"
         builder.believe(
             "sim.sys.servicer.base.pose",
@@ -327,8 +323,8 @@ def _lcm_map(signal: Signal, channel: str) -> LcmMap:
     return vector_map(channel, lcmt_scope, {signal.name: "value"})
 
 
-def _joint_later(position: np.ndarray, rate: np.ndarray, *, joint: int, late: float) -> float:
-    return position.item(joint) + late * rate.item(joint)
+def _joints_later(position: np.ndarray, rate: np.ndarray, *, late: float) -> np.ndarray:
+    return position + late * np.append(rate[:ARM_JOINTS], np.zeros(len(position) - ARM_JOINTS))
 
 
 def _base_later(q: np.ndarray, p: np.ndarray, w: np.ndarray, v: np.ndarray, *, late: float) -> np.ndarray:

@@ -175,15 +175,16 @@ class SpaceClimberScenario(Scenario):
             v_WB = R_WB @ [level * gait.speed(stroke=stroke, period=period), 0.0, 0.0]
             return np.concatenate([R_WB @ imu[:3], v_WB])
 
-        def pose(*of: Any, late: float) -> np.ndarray:
-            motion, where = of[: len(turning)], of[len(turning) :]
-            return pose_later(np.concatenate([position(*where), motion[:3]]), velocity(motion[:3], *motion[3:]), late)
+        def motion(*of: Any, late: float) -> tuple[np.ndarray, np.ndarray]:
+            (rpy, gait_of), where = (of[:3], of[3 : len(turning)]), of[len(turning) :]
+            V_WB = velocity(rpy, *gait_of)
+            return pose_later(np.concatenate([position(*where), rpy]), V_WB, late), V_WB
 
         T = self.period
         turning = ["dps.env.roll", "dps.env.pitch", "dps.env.yaw", "dps.sense.calibration.imu"]
         turning += [f"dps.impl.gait.{name}" for name in ("level", "stroke", "period")]
-        builder.believe("sim.sys.climber.base.pose", of=[*turning, *place], by=pose, age=T, period=T)
-        builder.believe("sim.sys.climber.base.velocity", of=turning, by=lambda *of: velocity(of[:3], *of[3:]), age=T)
+        targets = [f"sim.sys.climber.base.{name}" for name in ("pose", "velocity")]
+        builder.believe(targets, of=[*turning, *place], by=motion, age=T, period=T)
 
     def _believe_joints(self, builder: VirtualTestbedBuilder) -> None:
         """Declare that the joints were where they were measured, and move as they are commanded."""
@@ -192,38 +193,19 @@ class SpaceClimberScenario(Scenario):
             "dps.impl.gait.joint_position",
             "dps.act.joint_position",
         )
-        for i, name in enumerate(JOINT_NAMES):
-            motion, T = [next_command, command, "dps.act.rate"], self.period
-            builder.believe(
-                f"sim.sys.climber.{name}.position",
-                of=[f"{encoders}[{i}]", *motion],
-                by=partial(_joint_position, joint=i, period=T),
-                age=T,
-                period=T,
-            )
-            by = partial(_joint_velocity, joint=i, period=T)
-            builder.believe(f"sim.sys.climber.{name}.velocity", of=motion, by=by, age=T)
+        targets = [f"sim.sys.climber.{name}.{value}" for value in ("position", "velocity") for name in JOINT_NAMES]
+        of, T = [encoders, next_command, command, "dps.act.rate"], self.period
+        builder.believe(targets, of=of, by=partial(_joints, period=T), age=T, period=T)
 
 
-def _joint_position(
-    measured: float,
-    next_command: np.ndarray,
-    command: np.ndarray,
-    rate: float,
-    *,
-    joint: int,
-    period: float,
-    late: float,
-) -> float:
-    """Return the position (rad) of a joint ``late`` seconds after it was measured.
+def _joints(
+    measured: np.ndarray, next_command: np.ndarray, command: np.ndarray, rate: float, *, period: float, late: float
+) -> np.ndarray:
+    """Return the positions (rad) of all joints ``late`` seconds after they were measured, and their velocities (rad/s).
 
-    It has moved towards its command, as fast as that moves, and no further.
+    A joint has moved towards its command, as fast as that moves, and no further. That moves from the present command to
+    the next one, limited to a rate.
     """
-    reach = late * abs(_joint_velocity(next_command, command, rate, joint=joint, period=period))
-    return measured + min(max(command.item(joint) - measured, -reach), reach)
-
-
-def _joint_velocity(next_command: np.ndarray, command: np.ndarray, rate: float, *, joint: int, period: float) -> float:
-    """Return the velocity (rad/s) of a joint from its next command and the present one (rad), limited to a rate."""
-    velocity = (next_command.item(joint) - command.item(joint)) / period
-    return min(max(velocity, -rate), rate)
+    velocity = np.clip((next_command - command) / period, -rate, rate)
+    reach = late * np.abs(velocity)
+    return np.concatenate((measured + np.clip(command - measured, -reach, reach), velocity))

@@ -11,6 +11,7 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from pydrake.systems.sensors import ImageRgba8U
 
 from tests.testbeds import PoseRelay
+from vtbdrake.reasoning import Belief, BeliefToStart
 from vtbdrake.state import AddressedSystem, Quantity, VariableError
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.signal import SignalError
@@ -236,6 +237,23 @@ def test_belief_sets_the_simulated_world():
     context = testbed.default_context()
     testbed.start_from_belief(context)
     assert testbed.read(context, "sim.sense.y.value").tolist() == [4.0, 6.0]
+
+
+@pytest.mark.parametrize("by", [None, lambda estimate: (estimate.item(0), estimate.item(1))])
+def test_a_rule_sets_several_variables(by):
+    targets = ["sim.sense.y.value[1]", "sim.sense.y.value[0]"]
+    testbed = _believing(targets, by=by).build()
+    context = testbed.default_context()
+    testbed.start_from_belief(context)
+    assert testbed.read(context, "sim.sense.y.value").tolist() == [0.6, 0.4]
+    start = BeliefToStart(testbed).start(Belief.of(testbed, context))
+    assert [start.values[address] for address in targets] == [0.4, 0.6]
+
+
+def test_a_rule_has_a_value_for_each_of_its_targets():
+    testbed = _believing([f"sim.sense.y.value[{k}]" for k in range(2)], by=lambda estimate: estimate[:1]).build()
+    with pytest.raises(ValueError, match="has 1 values for 2 targets"):
+        testbed.start_from_belief(testbed.default_context())
 
 
 def test_a_rule_with_a_period_is_told_how_late_its_estimates_are():

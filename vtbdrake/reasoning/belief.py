@@ -207,19 +207,25 @@ class BeliefToStart:
         vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
         self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and can_resume(s)}
         self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and can_resume(s)}
-        self._targets = [_Target(mental, rule) for rule in mental.belief_rules]
-        self._copied = _Copied([t for t in self._targets if t.is_copy and t.rule.target not in uncertain])
-        self._computed = [target for target in self._targets if target not in self._copied.targets]
+        copied: list[_Target] = []
+        self._computed: list[tuple[BeliefRule, list[_Target]]] = []
+        for rule in mental.belief_rules:
+            targets = [_Target(mental, rule, number) for number in range(len(rule.targets))]
+            if all(target.is_copy and target.address not in uncertain for target in targets):
+                copied += targets
+            else:
+                self._computed.append((rule, targets))
+        self._copied = _Copied(copied)
         self._estimates = {
             address: (variable, mental.dps_layout.slice_of(variable))
-            for target in self._computed
-            for address in target.rule.of
+            for rule, _ in self._computed
+            for address in rule.of
             for variable in [self._variables[address]]
         }
         self._draws = {address: self._draw(address, how) for address, how in spreads.items()}
         # The believed values of uncertain variables without a rule.
         self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in uncertain}
-        set_by = [*self._prior, *(target.rule.target for target in self._targets)]
+        set_by = [*self._prior, *(address for rule in mental.belief_rules for address in rule.targets)]
         self._kinds = {a: (v.kind, mental.start_layout.slice_of(v)) for a in set_by for v in [self._variables[a]]}
 
     def _whole(self, sample: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
@@ -320,7 +326,7 @@ class BeliefToStart:
 
     def _believed(self, dps: DpsState) -> dict[str, ArrayLike]:
         """Return the believed values by address, except copies of single estimates (see `_Copied`)."""
-        if not self._targets:
+        if not self._mental.belief_rules:
             raise BeliefError(
                 f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
                 "declare them with VirtualTestbedBuilder.believe, or begin in the true world of a simulated testbed, "
@@ -340,7 +346,11 @@ class BeliefToStart:
                 estimates[address] = numbers[place].reshape(variable.shape)
             else:
                 estimates[address] = numbers.item(place.start)
-        return self._prior | {t.rule.target: t.value(estimates, t.rule.late(dps.time)) for t in self._computed}
+        believed: dict[str, ArrayLike] = dict(self._prior)
+        for rule, targets in self._computed:
+            values = rule.values_of([estimates[address] for address in rule.of], late=rule.late(dps.time))
+            believed |= {t.address: t.checked(value, estimates) for t, value in zip(targets, values, strict=True)}
+        return believed
 
     def _check_dps(self, dps: DpsState) -> None:
         try:
@@ -406,19 +416,28 @@ class BeliefToStart:
 
 
 class _Target:
-    """A variable of the simulated world that a rule sets."""
+    """A variable of the simulated world that a rule sets.
 
-    def __init__(self, mental: VirtualTestbed, rule: BeliefRule) -> None:
+    Args:
+        mental: The testbed of the rollouts.
+        rule: The rule.
+        number: The number of the variable among the targets of the rule.
+    """
+
+    def __init__(self, mental: VirtualTestbed, rule: BeliefRule, number: int) -> None:
         self.rule = rule
-        self.variable = mental.variables()[rule.target]
+        self.address = rule.targets[number]
+        self.variable = mental.variables()[self.address]
         lower, upper = (np.asarray(bound, dtype=float) for bound in self.variable.bounds)
         distance = upper - lower
         self._tolerance = np.where(np.isfinite(distance), _BEYOND * distance, 0.0)
         # An infinite value is within no bounds.
         largest = np.finfo(float).max
         self._least, self._most = np.maximum(lower, -largest), np.minimum(upper, largest)
-        # The places of the estimate and of the variable, if the variable is a copy of the estimate.
-        self.source = mental.dps_layout.slice_of(mental.variables()[rule.of[0]]) if rule.by is None else None
+        # The places of the estimate, or of one of its entries, and of the variable, if that is a copy.
+        source = mental.dps_layout.slice_of(mental.variables()[rule.of[0]]) if rule.by is None else None
+        is_fitting = source is not None and source.stop - source.start == len(rule.targets)
+        self.source = source.start + number if source is not None and is_fitting else None
         self.place = mental.start_layout.slice_of(self.variable)
         # The bounds of a scalar; no value lies within those of an array.
         self.interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
@@ -428,22 +447,20 @@ class _Target:
         """Return whether the believed value is one number of the contents of the DPS, unchanged."""
         return self.source is not None and self.place is not None and self.variable.shape == ()
 
-    def value(self, estimates: Mapping[str, Any], late: float = 0.0) -> ArrayLike:
+    def checked(self, value: Any, estimates: Mapping[str, Any]) -> ArrayLike:
         """Return the believed value, within the bounds of the variable.
 
         Args:
-            estimates: Address -> value.
-            late: Age of the estimates in seconds.
+            value: The value by the rule.
+            estimates: Address -> value of the estimates of the rule, for messages.
 
         Raises:
             BeliefError: The value is missing, or lies beyond the bounds.
         """
-        of = [estimates[address] for address in self.rule.of]
-        value = self.rule.value_of(of, late=late)
         if isinstance(value, float) and self.interval[0] <= value <= self.interval[1]:
             return value  # Most are of joints: numpy would take ten times as long.
         variable = self.variable
-        basis = dict(zip(self.rule.of, (np.asarray(e).tolist() for e in of), strict=True))
+        basis = {address: np.asarray(estimates[address]).tolist() for address in self.rule.of}
         try:
             believed = np.asarray(value, dtype=float).reshape(variable.shape)
         except (TypeError, ValueError) as error:
@@ -465,7 +482,7 @@ class _Copied:
 
     def __init__(self, targets: Sequence[_Target]) -> None:
         self.targets = targets
-        self._from = np.array([target.source.start for target in targets if target.source], dtype=int)
+        self._from = np.array([target.source for target in targets], dtype=int)
         self._to = np.array([target.place.start for target in targets if target.place], dtype=int)
         self._least, self._most = np.array([target.interval for target in targets]).reshape(-1, 2).T
 
@@ -478,7 +495,7 @@ class _Copied:
         values = estimates[self._from]
         if not ((values >= self._least) & (values <= self._most)).all():
             pairs = zip(self.targets, values.tolist(), strict=True)
-            values = np.array([target.value({target.rule.of[0]: value}) for target, value in pairs])
+            values = np.array([target.checked(value, {target.rule.of[0]: value}) for target, value in pairs])
         numbers[self._to] = values
 
 

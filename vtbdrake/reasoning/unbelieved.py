@@ -44,7 +44,7 @@ class UnbelievedReadings:
         values = measured(context)
         entries = [(n, k) for n, s in sensors.items() for k in range(_measurement(s, context).size)]
         changed = mental.default_context()
-        believed = [*(rule.target for rule in mental.belief_rules), *uncertain]
+        believed = [*(target for rule in mental.belief_rules for target in rule.targets), *uncertain]
         for number, address in enumerate(believed):
             _change(variables[address], changed, 1.0 + 0.1 * number)
         unreached = measured(changed) == values

@@ -148,7 +148,7 @@ class _CompiledTask:
         sampled = [a for k, m in enumerate(self._measures) if f"measure {k}" not in functions for a in m.of]
         variables = testbed.variables()
         # The state can be set anyway; masses and the like only if they are named.
-        believed = [rule.target for rule in testbed.belief_rules if variables[rule.target].kind == A]
+        believed = [a for rule in testbed.belief_rules for a in rule.targets if variables[a].kind == A]
         self._rollouts = CompiledRollouts(
             testbed.diagram,
             variables,

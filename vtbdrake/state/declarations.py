@@ -81,6 +81,8 @@ class NamedView:
 
     # This is called where no property of the name exists.
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # numpy looks for some whenever it makes an array; suggestions would take 80 us.
+            raise AttributeError(name)
         raise AttributeError(f"there is no {name!r} among {', '.join(self._names)}{suggestion(name, self._names)}")
 
     if TYPE_CHECKING:

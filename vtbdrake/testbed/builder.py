@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
@@ -218,19 +217,20 @@ class VirtualTestbedBuilder:
 
     def believe(
         self,
-        target: str,
+        target: str | Sequence[str],
         *,
         of: Sequence[str],
-        by: Callable[..., ArrayLike] | None = None,
+        by: Callable[..., Any] | None = None,
         age: float = 0.0,
         period: float | None = None,
     ) -> None:
-        """Declare which estimates of the DPS set which variable of the simulated world: s_sim(t0) from s_dps(t).
+        """Declare which estimates of the DPS set which variables of the simulated world: s_sim(t0) from s_dps(t).
 
         Args:
-            target: Address of the simulated variable.
+            target: Address of the simulated variable; or of several, which one call of ``by`` determines.
             of: Addresses of the estimates.
-            by: Function of the estimates that returns the target's value; by default the value of the one estimate.
+            by: Function of the estimates that returns the target's value, or one value per target, such as an array
+                with the positions of all joints; by default the value of the one estimate.
             age: Age of the estimates in seconds, when the DPS gets the sensor values that they come from. A sampled
                 sensor, which shows its state, is one period late. Predictions from the belief need the age.
             period: Sample period of the estimates in seconds; 0 if the DPS computes them at any time. If it is given,
@@ -239,7 +239,13 @@ class VirtualTestbedBuilder:
                 present, and not at an instant that lies ``age`` and up to a period before it.
         """
         self.belief_rules.append(
-            BeliefRule(target, as_addresses(f"what the belief about {target} is of", of), by, age, period)
+            BeliefRule(
+                (target,) if isinstance(target, str) else as_addresses("what is believed", target),
+                as_addresses(f"what the belief about {target} is of", of),
+                by,
+                age,
+                period,
+            )
         )
 
     def build(

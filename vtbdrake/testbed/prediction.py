@@ -55,7 +55,8 @@ class Predictor:
                 raise ValueError(f"only vector signals are predicted, but {signal.name} is abstract")
         self._beliefs: dict[int, list[BeliefRule]] = {}
         for belief in world.belief_rules:
-            world.variables()[belief.target]
+            for target in belief.targets:
+                world.variables()[target]
             self._beliefs.setdefault(_age_in_periods(belief, period), []).append(belief)
         self.estimates = {
             age: tuple(dict.fromkeys(address for belief in beliefs for address in belief.of))
@@ -95,9 +96,10 @@ class Predictor:
         variables = self._world.variables()
         values = {}
         for belief in self._beliefs[age]:
-            variable = variables[belief.target]
-            value = np.reshape(belief.value_of([estimates[address] for address in belief.of]), variable.shape)
-            values[belief.target] = np.clip(value, *variable.bounds)
+            believed = belief.values_of([estimates[address] for address in belief.of])
+            for target, value in zip(belief.targets, believed, strict=True):
+                variable = variables[target]
+                values[target] = np.clip(np.reshape(value, variable.shape), *variable.bounds)
         self._world.write(self._context, values)
 
     def step(self, actuation: Array | None) -> Array:

@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BeliefRule:
-    """A BeliefRule tells how estimates of the DPS set a variable of the world; see `VirtualTestbedBuilder.believe`.
+    """A BeliefRule tells how estimates of the DPS set variables of the world; see `VirtualTestbedBuilder.believe`.
 
-    ``target`` (an address in sim) is ``by`` of the estimates at the addresses ``of`` (in dps).
+    ``targets`` (addresses in sim) are ``by`` of the estimates at the addresses ``of`` (in dps).
 
     ``age`` is the age of the estimates in seconds when the DPS gets the sensor values from which they are computed, for
     example because a sensor is sampled. Delays between machine and DPS do not count.
 
     ``period`` is the sample period of the estimates in seconds, 0 if they are computed at any time. If it is given,
-    ``by`` gets the keyword ``late``, see `late`, to extrapolate the target to the present.
+    ``by`` gets the keyword ``late``, see `late`, to extrapolate the targets to the present.
 
     Raises:
         ValueError: There are several estimates and no ``by``; ``age`` or ``period`` is negative or infinite; or there
             is a ``period`` without ``by``.
     """
 
-    target: str
+    targets: tuple[str, ...]
     of: tuple[str, ...]
     by: Callable[..., ArrayLike] | None = None
     age: float = 0.0
@@ -70,27 +70,28 @@ class BeliefRule:
         if self.period is not None and self.by is None:
             raise ValueError(
                 f"the belief about {self.target} has a sample period, but no function that uses it: give the present "
-                "value of the target as by=f(estimates..., late=seconds)"
+                "value as by=f(estimates..., late=seconds)"
             )
 
     def check_addresses(self, variables: Variables) -> None:
         """Check the addresses of the belief.
 
         Raises:
-            ValueError: An address does not exist, the target is not simulated, or an estimate is not part of the DPS.
+            ValueError: An address does not exist, a target is not simulated, or an estimate is not part of the DPS.
         """
-        variables[self.target]
+        for target in self.targets:
+            variables[target]
+            if not target.startswith("sim."):
+                raise ValueError(f"a belief sets a variable of the simulated world, not {target}")
         for address in self.of:
             variables[address]
             if not address.startswith("dps."):
                 raise ValueError(f"the belief about {self.target} is of {address}, which the DPS does not hold")
-        if not self.target.startswith("sim."):
-            raise ValueError(f"a belief sets a variable of the simulated world, not {self.target}")
 
-    def value(self, variables: Variables, context: Context) -> ArrayLike:
-        """Return what the DPS in ``context`` believes the target to be at the present."""
-        estimates = [variables[address].get(context) for address in self.of]
-        return self.value_of(estimates, late=self.late(context.get_time()))
+    @property
+    def target(self) -> str:
+        """Return the target as text; of several, the first one."""
+        return f"{self.targets[0]}{', ...' if len(self.targets) > 1 else ''}"
 
     def late(self, time: float) -> float:
         """Return the age of the estimates at ``time``, in seconds: `age`, and the time since the DPS has sampled last.
@@ -103,16 +104,27 @@ class BeliefRule:
         last = self.period * (ceil(time / self.period - 1e-6) - 1)
         return self.age + time - last
 
-    def value_of(self, estimates: Sequence[ArrayLike], *, late: float = 0.0) -> ArrayLike:
-        """Return the target's value.
+    def values_of(self, estimates: Sequence[ArrayLike], *, late: float = 0.0) -> Sequence[ArrayLike]:
+        """Return the value of each target.
 
         Args:
             estimates: Values of the estimates, in the order of `of`.
-            late: Age of the estimates in seconds; 0: the target's value at the instant that they describe.
+            late: Age of the estimates in seconds; 0: the values at the instant that they describe.
+
+        Raises:
+            ValueError: There are not as many values as targets.
         """
+        value: Any
         if self.by is None:
-            return estimates[0]
-        return self.by(*estimates) if self.period is None else self.by(*estimates, late=late)
+            value = estimates[0]
+        else:
+            value = self.by(*estimates) if self.period is None else self.by(*estimates, late=late)
+        if len(self.targets) == 1:
+            return [value]
+        values = value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else list(value)
+        if len(values) != len(self.targets):
+            raise ValueError(f"the belief about {self.target} has {len(values)} values for {len(self.targets)} targets")
+        return values
 
 
 # Mode -> positions of (T_sense, T_act).
@@ -427,7 +439,10 @@ class VirtualTestbed(AddressedDiagram):
                 "VirtualTestbedBuilder.believe"
             )
         values = {
-            rule.target: rule.value_of([estimates[address] for address in rule.of], late=rule.late(time))
+            target: value
             for rule in self.belief_rules
+            for target, value in zip(
+                rule.targets, rule.values_of([estimates[a] for a in rule.of], late=rule.late(time)), strict=True
+            )
         }
         return {address: np.clip(value, *self._variables[address].bounds) for address, value in values.items()}

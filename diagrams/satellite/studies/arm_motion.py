@@ -170,11 +170,9 @@ class ArmMotionScenario(Scenario):
             self._add_mental_world(builder)
         else:
             self._add_plant(builder)
-        for k, name in enumerate(ARM_JOINT_NAMES):
-            age = (1 + self.joint_errors.latency) * PERIOD
-            builder.believe(
-                f"sim.sys.servicer.{name}.position", of=["dps.env.discrete_state_0"], by=itemgetter(k), age=age
-            )
+        positions = [f"sim.sys.servicer.{name}.position" for name in ARM_JOINT_NAMES]
+        age = (1 + self.joint_errors.latency) * PERIOD
+        builder.believe(positions, of=["dps.env.discrete_state_0"], by=itemgetter(slice(len(positions))), age=age)
 
     def _add_plant(self, builder: VirtualTestbedBuilder) -> None:
         from vtbdrake_diagrams.satellite.plant import add_servicer

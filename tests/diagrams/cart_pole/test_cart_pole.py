@@ -124,7 +124,7 @@ def test_the_belief_is_the_state_of_the_sample_before() -> None:
     np.testing.assert_allclose(testbed.read(context, PERCEIVED), truth, atol=1e-12)
     builder = VirtualTestbedBuilder(scenario.interface())
     scenario.add_world(builder)
-    assert {belief.target for belief in builder.belief_rules} == set(names)
+    assert {target for belief in builder.belief_rules for target in belief.targets} == set(names)
     assert {belief.age for belief in builder.belief_rules} == {scenario.period}
 
 
