@@ -190,3 +190,25 @@ def test_refuses_the_real_side() -> None:
     rollouts = testbed.compiled(horizon=0.1, sample_period=0.05, compile=False)
     with pytest.raises(UnsupportedTestbedError, match="switches differs from what was compiled"):
         rollouts(context=context)
+
+
+@pytest.mark.parametrize("decides_at", [None, 0.0, 0.12])
+def test_a_reasoner_on_board_shows_its_candidate(decides_at: float | None) -> None:
+    scenario = CartPoleScenario(onboard=True).mental()
+    candidate, candidate_at = "dps.planner.candidate", "dps.planner.candidate_at"
+    outputs = ("plant.state", "dps.planner.decision", "dps.planner.valid", "dps.planner.sampled_at")
+    point = {} if decides_at is None else {candidate_at: decides_at}
+    batch = compiled(scenario, outputs=outputs)({candidate: plans(2), **point})
+    points = [{candidate: plan, **point} for plan in plans(2)]
+    task = RolloutTask(scenario, HORIZON, sample_period=SAMPLE_PERIOD, record=outputs)
+    with SerialExecutor() as executor:
+        for i, result in executor.run(task, points):
+            for address in outputs:
+                np.testing.assert_allclose(batch.outputs[address][i], result.record[address], rtol=1e-11, atol=1e-11)
+    assert batch.valid.all()
+    assert batch.outputs["dps.planner.valid"].any() == (decides_at is not None)
+
+
+def test_a_part_that_reasons_is_not_compiled() -> None:
+    with pytest.raises(UnsupportedTestbedError, match="dps.planner: OnboardReasoner reasons itself"):
+        compiled(CartPoleScenario(onboard=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from math import inf
 
@@ -12,12 +13,13 @@ from vtbdrake.compiled import UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
-from vtbdrake.reasoning import Belief, Budget, SearchConfig
+from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Constraint, Cutoff, Pruning, Quality, RolloutResult, RolloutTask, SerialExecutor
 from vtbdrake.rollout.compiled import CompiledExecutor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.rollout.start import Start
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cart_pole.decision import reasoning
 from vtbdrake_diagrams.cart_pole.swing_up import make_reasoner
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
@@ -190,6 +192,22 @@ def test_decisions_are_the_same() -> None:
     assert computed == {"compiled"}
 
 
+def test_decisions_of_a_reasoner_on_board_are_the_same() -> None:
+    scenario = CartPoleScenario(onboard=True)
+    testbed = scenario.build()
+    context = testbed.default_context()
+    # As the part on board does it at the sample from which it decides.
+    testbed.write(context, {"dps.planner.candidate_at": 0.0})
+    decisions = []
+    for executor in ("serial", "compiled"):
+        arguments = reasoning(scenario, "dps.planner.candidate", Budget(rollouts=12), executor=executor)
+        with Reasoner(scenario=scenario, **arguments) as reasoner:
+            decisions.append(reasoner.decide(testbed, context))
+    assert decisions[0].chosen == decisions[1].chosen != 0
+    assert decisions[0].quality == pytest.approx(decisions[1].quality, rel=1e-11)
+    assert {r.computed for candidate in decisions[1].candidates for r in candidate.rollouts} == {"compiled"}
+
+
 def test_auto_compiles_the_mental_testbed() -> None:
     testbed = SCENARIO.build()
     with make_reasoner(SCENARIO, rollouts=4) as reasoner:
@@ -258,3 +276,13 @@ def test_a_perfect_belief_is_compiled_unless_the_true_plant_differs(caplog: pyte
             assert decision.quality == pytest.approx(expected.quality, rel=1e-11)
             assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {computed}
             assert (f"{MASS} is 1.3 instead of 1.0" in caplog.text) == (computed == "drake")
+
+
+def test_at_a_deadline_the_rest_of_the_rollouts_is_left_out() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    rollouts = points(20) * 1000  # Minutes, without machine code.
+    with CompiledExecutor(compile=False) as executor:
+        expected = dict(executor.run(task, rollouts[:20]))
+        results = dict(executor.run(task, rollouts, cutoff=Cutoff(deadline=time.monotonic() + 0.2)))
+    assert len(results) < len(rollouts)
+    assert all(result.identical(expected[i % 20]) for i, result in results.items())

@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.systems.framework import Context, System
 
 from vtbdrake.arrays import Array
-from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Fixed, refusal
+from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Fixed, Timing, refusal
 from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, Model, Result
 from vtbdrake.components.sensors import errors as sensor_errors
 from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
@@ -255,8 +255,38 @@ class DriveEquations(Equations):
         return {0: y[:n], 1: casadi.vertcat(y[n:], shifted)}
 
 
+class CandidateEquations(Equations):
+    """The `OnboardReasoner` of a mental copy: it shows its parameter ``candidate`` at the instant of a decision."""
+
+    may_be_infinite = True  # No decision has a time or a quality.
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        super().__init__(system, context, varied)
+        if not system.mental:
+            raise refusal(system, "reasons itself: give it mental=True in a mental copy")
+        if system.on_request:
+            raise refusal(system, "works on request, which is not compiled")
+        self.timing = Timing(system.period, system.due(0), unrestricted=True)
+
+    def output(self, port: str, at: At) -> Expression:
+        system: Any = self.system
+        return at.state(system.groups[port])
+
+    def update(self, at: At) -> dict[int | str, Expression]:
+        system: Any = self.system
+        candidate, candidate_at = (at.parameter(group) for group in system.candidate_groups)
+        tick = casadi.floor((at.time - system.offset - system.latency) / system.period + 0.5)
+        sampled_at = system.offset + tick * system.period
+        is_shown = casadi.fabs(candidate_at - sampled_at) < 0.5 * system.period
+        shown = {"decision": candidate, "sampled_at": sampled_at, "valid": 1.0}
+        groups = system.groups
+        return {groups[name]: casadi.if_else(is_shown, value, at.state(groups[name])) for name, value in shown.items()}
+
+
 class BoardEquations(Equations):
     """The board of the switches and commands: its positions are compiled in, its constants are state."""
+
+    may_be_infinite = True
 
     def __init__(self, system: System, context: Context, varied: frozenset[str]) -> None:
         super().__init__(system, context, varied)

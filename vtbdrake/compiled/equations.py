@@ -116,8 +116,10 @@ class Equations(ABC):
         extras: Variables that lie in no numeric group, such as masses, by the name under which `At.extra` returns them,
             with their sizes; they are among those that vary.
         draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
+        may_be_infinite: Whether its discrete state may be infinite or NaN in a valid rollout.
     """
 
+    may_be_infinite = False
     memory: dict[str, float]
     extras: dict[str, int]
     draws: dict[str, Draw]

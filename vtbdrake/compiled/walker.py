@@ -110,7 +110,11 @@ class Walker:
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
         self._places: dict[str, slice] = {}
-        self._state = _indices(b.entries for b in self.blocks.values() if b.kind == DISCRETE and b.path != "switches")
+        self._state = _indices(
+            block.entries
+            for block in self.blocks.values()
+            if block.kind == DISCRETE and not self.equations[block.path].may_be_infinite
+        )
         self._all_fixed = _indices(entries for entries, _, _ in self.fixed)
         self._compiled_in = self._read_compiled_in(context)
 

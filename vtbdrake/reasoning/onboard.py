@@ -24,6 +24,7 @@ from vtbdrake.testbed.dps_state import DpsState
 from vtbdrake.testbed.slow_part import SlowFunction
 
 if TYPE_CHECKING:
+    from vtbdrake.compiled.equations import Equations
     from vtbdrake.reasoning.decision import Decision
     from vtbdrake.reasoning.space import Element
     from vtbdrake.rollout import Quality
@@ -172,6 +173,23 @@ class OnboardReasoner(SlowPart):
 
     def function_beside(self, period: float) -> SlowFunction:
         return replace(self.function, function=self._decider.limited(_SHARE * (self.latency - period)))
+
+    def compiled_equations(self, context: Context, varied: frozenset[str]) -> Equations:
+        """Return the equations of the part of a mental copy; see `VirtualTestbed.compiled`."""
+        # Imported here: without it, a reasoner needs no CasADi.
+        from vtbdrake.compiled.components import CandidateEquations
+
+        return CandidateEquations(self, context, varied)
+
+    @property
+    def on_request(self) -> bool:
+        """Return whether the part decides on request only."""
+        return self._request is not None
+
+    @property
+    def candidate_groups(self) -> tuple[int, int]:
+        """Return the numbers of the parameter groups with the candidate, and with the time of its decision."""
+        return int(self._candidate.index), int(self._candidate_at.index)
 
     def _sample(self, context: Context, state: State) -> None:
         if not self.mental:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from math import nan
+from math import inf, nan
 
 import casadi
 import numpy as np
@@ -70,18 +71,20 @@ class CompiledExecutor(Executor):
         """
         starts = start_of_each(start, len(points))
         for indices in _by_fields(points):
-            of_fields = [points[i] for i in indices]
-            compiled = self._of(task, of_fields)
-            if cutoff is not None and cutoff.is_over:
-                return
-            results = compiled.run(of_fields, [starts[i] for i in indices])
-            for i, result in zip(indices, results, strict=True):
-                if result is None:
-                    try:
-                        result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
-                    except CancelledError:
-                        return
-                yield i, result
+            compiled = self._of(task, [points[i] for i in indices])
+            while indices:
+                count = len(indices) if cutoff is None else compiled.affordable(cutoff)
+                batch, indices = indices[:count], indices[count:]
+                if not batch:
+                    return
+                results = compiled.run([points[i] for i in batch], [starts[i] for i in batch])
+                for i, result in zip(batch, results, strict=True):
+                    if result is None:
+                        try:
+                            result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
+                        except CancelledError:
+                            return
+                    yield i, result
 
     def close(self) -> None:
         self._compiled.clear()
@@ -165,6 +168,7 @@ class _CompiledTask:
         self._start_context = StartContext(testbed, s0, testbed.copier_from(testbed))
         self._z0 = self._rollouts.z_of(s0)
         self._into, self._from = self._rollouts.walker.shared_with(testbed.start_layout)
+        self._duration = inf  # Of a rollout of the last batch, in seconds.
         self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
 
@@ -201,7 +205,13 @@ class _CompiledTask:
             share = (time.perf_counter() - begun) / len(points)
             for row, result in self._results([points[i] for i in order], batch, share):
                 results[order[row]] = result
+        self._duration = (time.perf_counter() - begun) / len(points)
         return results
+
+    def affordable(self, cutoff: Cutoff) -> int:
+        """Return how many rollouts take about as long as is left; none after the deadline."""
+        left = cutoff.deadline - time.monotonic()
+        return 0 if left <= 0.0 else sys.maxsize if left == inf else max(1, int(left / self._duration))
 
     def _begin(self, start: Start | None) -> tuple[np.ndarray, float]:
         if self._last_start is None or self._last_start[0] is not start:
@@ -266,12 +276,12 @@ class _CompiledTask:
         # One row per rollout.
         numbers = np.array([t_star, h, value, *measures]).T
         finite = np.isfinite(numbers[:, 3 if f is None else 2 :]).all(axis=1)
-        ends = np.where(exceeded.any(axis=1), THRESHOLD, HORIZON).tolist()
+        has_exceeded: list[bool] = np.logical_or.reduce(exceeded, axis=1).tolist()
         for k, (row, (t, best, reported, *of_row)) in enumerate(zip(rows.tolist(), numbers.tolist(), strict=True)):
             if finite[k]:
                 result = RolloutResult(
                     parameters=dict(points[row]),
-                    end=ends[k],
+                    end=THRESHOLD if has_exceeded[k] else HORIZON,
                     times=times,
                     quality=quality[k],
                     t_star=t,
@@ -279,7 +289,7 @@ class _CompiledTask:
                     value=reported,
                     measures=tuple(of_row),
                     threshold=task.f_m,
-                    exceedances=times[exceeded[k]],
+                    exceedances=times[exceeded[k]] if has_exceeded[k] else times[:0],
                     record={address: batch.outputs[address][row, :m] for address in task.record},
                     wall_time=wall_time,
                     computed=COMPILED,

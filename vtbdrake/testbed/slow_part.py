@@ -347,6 +347,11 @@ class SlowPart(AddressedSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, max(0.0, offset - _EARLY), self._sample)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency - _SHOWN_EARLY, self._show)
 
+    @property
+    def groups(self) -> Mapping[str, int]:
+        """Return the number of the discrete state group that each vector output port shows, by name."""
+        return self._indices
+
     def _declare_input(self, name: str, model: Any) -> InputPort:
         if _is_size(model):
             return self.DeclareVectorInputPort(name, model)
