@@ -21,7 +21,7 @@ BELOW: dict[str, set[str]] = {
     "testbed": {"state"},
     "rollout": {"state", "testbed", "compiled"},
     "optimization": {"state", "testbed", "rollout"},
-    "reasoning": {"state", "testbed", "rollout", "optimization"},
+    "reasoning": {"state", "testbed", "rollout", "optimization", "compiled"},
     "control": {"state", "testbed"},
     "lcm": {"state", "testbed", "control"},
     "recording": {"state", "testbed", "control", "lcm"},
@@ -48,8 +48,8 @@ BELOW: dict[str, set[str]] = {
 # travel to them, when the names of a package are imported, what a cache keeps, arrays, splines, laser scans, and where
 # a model is valid.
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "arrays", "child_process", "closing", "failures", "lazy"})
-    _layers.update({"lru", "pickling", "scan", "settings", "spline", "validity_domain"})
+    _layers.update({"argument_checks", "arrays", "child_process", "closing", "failures", "frames", "lazy"})
+    _layers.update({"lru", "pickling", "scan", "settings", "spline", "streams", "validity_domain"})
 BELOW["spline"] = {"argument_checks", "arrays", "spline_kernel"}
 BELOW["spline_kernel"] = {"state"}
 BELOW["scan"] = {"arrays"}
@@ -57,6 +57,8 @@ BELOW["arrays"] = set()
 BELOW["closing"] = set()
 BELOW["validity_domain"] = {"argument_checks", "arrays"}
 BELOW["pickling"] = set()
+BELOW["streams"] = set()
+BELOW["frames"] = {"streams"}
 BELOW["child_process"] = {"pickling"}
 BELOW["argument_checks"] = set()
 BELOW["settings"] = set()

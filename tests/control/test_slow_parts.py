@@ -16,12 +16,12 @@ from pydrake.systems.sensors import ImageRgba8U
 from tests.control.scripted import PERIOD, ScriptedBridge
 from tests.control.slow import SlowScenario, busy, chaotic, deadly, gated, moving, picky, processes
 from vtbdrake.child_process import ProcessStartError
-from vtbdrake.control.background_process import pack, unpack
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.deployment import Deployment
+from vtbdrake.frames import pack, unpack
 from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import snapshot as snapshots

@@ -1,102 +1,26 @@
-"""Background processes for slow or blocking tasks of the control loop, which never waits for them.
-
-One channel serves all of them. It carries frames, each with its length. A frame holds a message (any object, pickled,
-with its arrays beside it), or bytes that are not unpacked here: events of a log, or a message to be forwarded.
-"""
+"""Background processes for slow or blocking tasks of the control loop, which never waits for them."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
-import pickle
 import select
 import socket
-import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from vtbdrake.child_process import ChildProcess
-from vtbdrake.control.streams import Frames
+from vtbdrake.frames import CHUNK, LENGTH, FrameConnection, pack, unpack
 
 _log = logging.getLogger(__name__)
 
-_COUNT = struct.Struct("<I")
-_LENGTH = struct.Struct("<Q")
-_CHUNK = 1 << 18
 _BUFFER = 1 << 20  # bytes of a socket's send buffer; the system may grant less
 
 START_TIMEOUT = 120.0
 """Seconds within which a background process must have started; a computer with much else to do needs many of them."""
-
-
-def pack(message: Any) -> list[Any]:
-    """Return a message as parts of a frame; its arrays are parts of their own, which are not copied."""
-    buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
-    raw = [buffer.raw() for buffer in buffers]
-    lengths = [len(body), *(view.nbytes for view in raw)]
-    return [_COUNT.pack(len(lengths)), *map(_LENGTH.pack, lengths), body, *raw]
-
-
-def unpack(frame: bytes) -> Any:
-    """Return the message in a frame; its arrays are read-only views of the frame."""
-    (count,) = _COUNT.unpack_from(frame)
-    position = _COUNT.size + count * _LENGTH.size
-    parts = []
-    for (length,) in _LENGTH.iter_unpack(memoryview(frame)[_COUNT.size : position]):
-        parts.append(memoryview(frame)[position : position + length])
-        position += length
-    return pickle.loads(parts[0], buffers=parts[1:])
-
-
-class FrameConnection:
-    """The worker's end of the connection, which carries messages and other frames; its calls block."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._socket = connection
-        self._frames = Frames()
-
-    def fileno(self) -> int:
-        """Return the descriptor that becomes readable when frames arrive."""
-        return self._socket.fileno()
-
-    def receive(self, timeout: float | None = None) -> Any:
-        """Return the next message; see `receive_frame`."""
-        return unpack(self.receive_frame(timeout))
-
-    def send(self, message: Any) -> None:
-        """Send a message; see `send_frame`."""
-        self.send_frame(*pack(message))
-
-    def receive_frame(self, timeout: float | None = None) -> bytes:
-        """Return the next frame.
-
-        Args:
-            timeout: Time in seconds; None to wait forever.
-
-        Raises:
-            EOFError: The other end is closed, and all frames were returned.
-            TimeoutError: No frame arrived in time.
-        """
-        deadline = None if timeout is None else time.monotonic() + timeout
-        while (frame := self._frames.frame()) is None:
-            left = None if deadline is None else max(0.0, deadline - time.monotonic())
-            if not select.select((self._socket,), (), (), left)[0]:
-                raise TimeoutError(f"no frame arrived within {timeout} s")
-            if not self._frames.receive(self._socket.fileno(), _CHUNK):
-                raise EOFError("the other end of the connection is closed")
-        return frame
-
-    def send_frame(self, *parts: bytes) -> None:
-        """Send one frame that consists of the parts.
-
-        Raises:
-            OSError: The other end is closed.
-        """
-        self._socket.sendall(b"".join((_LENGTH.pack(sum(map(len, parts))), *parts)))
 
 
 class BackgroundProcess:
@@ -120,7 +44,6 @@ class BackgroundProcess:
         self._backlog = backlog
         self._unsent: deque[memoryview] = deque()
         self._unsent_bytes = 0
-        self._frames = Frames()
         self._received: list[bytes] = []
         self._lost = False
         self._closing = False
@@ -128,6 +51,7 @@ class BackgroundProcess:
         self._socket = self._child.connection
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         self._socket.setblocking(False)
+        self._connection = FrameConnection(self._socket)
 
     @property
     def pid(self) -> int:
@@ -160,8 +84,8 @@ class BackgroundProcess:
         if self._lost or (self._unsent_bytes and self._unsent_bytes + size > self._backlog):
             self.dropped += 1
             return False
-        pieces: list[bytes | memoryview] = [_LENGTH.pack(size), *parts]
-        if size <= _CHUNK:
+        pieces: list[bytes | memoryview] = [LENGTH.pack(size), *parts]
+        if size <= CHUNK:
             pieces = [memoryview(b"".join(pieces))]
             if not self._unsent:
                 pieces = [pieces[0][self._push(pieces[0]) :]]
@@ -178,7 +102,7 @@ class BackgroundProcess:
 
     def flush(self) -> None:
         """Send waiting data as far as the socket has room, at most 256 KiB, so that it takes little time."""
-        left = _CHUNK
+        left = CHUNK
         while self._unsent and left > 0 and not self._lost:
             first = self._unsent[0]
             sent = self._push(first[:left])
@@ -200,7 +124,7 @@ class BackgroundProcess:
             self._lose(error)
             return 0
 
-    def _lose(self, reason: OSError | str) -> None:
+    def _lose(self, reason: Exception) -> None:
         if not (self._lost or self._closing):
             _log.error("%s (process %d) is lost: %s", self._child.name, self.pid, reason)
         self._lost = True
@@ -218,19 +142,14 @@ class BackgroundProcess:
     def _receive(self) -> None:
         if self._socket.fileno() < 0:
             return
-        size = _CHUNK
-        while size == _CHUNK:  # A smaller one was all that there was.
-            try:
-                size = self._frames.receive(self._socket.fileno(), _CHUNK)
-            except OSError as error:
-                self._lose(error)
-                return
-            if not size:
-                self._lose("it has closed the connection")
-            while (frame := self._frames.frame()) is not None:
-                if self.ready:
-                    self._received.append(frame)
-                self.ready = True  # The first frame says so.
+        try:
+            frames = self._connection.pop_frames()
+        except (EOFError, OSError) as error:
+            self._lose(error)
+            return
+        # The first frame says that it is ready.
+        self._received += frames if self.ready else frames[1:]
+        self.ready = self.ready or bool(frames)
 
     def wait_until_ready(self, timeout: float = START_TIMEOUT) -> bool:
         """Wait until the worker has imported its function; return False if it has ended or is late."""

@@ -13,7 +13,8 @@ import traceback
 from enum import StrEnum
 from math import inf
 
-from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
+from vtbdrake.control.background_process import BackgroundProcess
+from vtbdrake.frames import FrameConnection
 
 
 class Report(StrEnum):

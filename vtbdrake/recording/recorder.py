@@ -15,10 +15,11 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.child_process import ProcessStartError
 from vtbdrake.closing import Closing
-from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
+from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
+from vtbdrake.frames import FrameConnection
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault

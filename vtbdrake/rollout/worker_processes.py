@@ -11,13 +11,15 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import cache, partial
+from itertools import islice
 from math import ceil, inf
-from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from vtbdrake.argument_checks import as_number
 from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
+from vtbdrake.frames import FrameConnection
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
@@ -28,8 +30,9 @@ from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds, failed, s
 
 _log = logging.getLogger(__name__)
 
-# A worker whose last rollout took less than this, in seconds, gets its next one ahead, so that it need not wait for it.
-# Longer rollouts gain nothing from it, and one that waits behind a very long one would come late.
+# A worker whose last rollout took less than this, in seconds, gets the next ones ahead, so that it need not wait for
+# them: about as many in one message as take so long. Longer rollouts gain nothing from it, and one that waits behind a
+# very long one would come late.
 _BRIEF = 0.1
 # A message of at most so many bytes fits into the buffer of a socket: sending it does not wait for the worker.
 _SMALL = 1 << 16
@@ -46,9 +49,9 @@ class ProcessExecutor(Executor):
 
     A worker that dies, or takes longer than ``time_limit`` for one rollout, costs that rollout only: it is tried once
     more by another worker, and then counts as failed. A worker that is killed while it starts costs nothing. Where
-    rollouts are short, a worker gets the next one before it has finished the last. A worker whose memory has grown by
-    ``growth`` is replaced between two rollouts, because every testbed that is built, for another value of a scenario's
-    field, leaves memory behind.
+    rollouts are short, a worker gets several at a time, before it has finished the last. A worker whose memory has
+    grown by ``growth`` is replaced when it is idle, because every testbed that is built, for another value of a
+    scenario's field, leaves memory behind.
 
     Rollouts with a `Cutoff` are urgent: while a lost worker's replacement starts and builds its testbed, the others do
     its work. It is waited for only if no other is left, and at most until the deadline.
@@ -134,7 +137,7 @@ class ProcessExecutor(Executor):
                         left -= 1
                     elif isinstance(reply, str):
                         # The rollout that it had not begun is not at fault.
-                        waiting.extendleft(job for job in worker.jobs if job != index)
+                        waiting.extendleft(job for job in reversed(worker.jobs) if job != index)
                         self._replace(worker, call)
                         if cutoff is not None and cutoff.is_over:
                             left -= 1
@@ -163,34 +166,44 @@ class ProcessExecutor(Executor):
                 worker.kill()
 
     def _hand_out(self, call: _Call) -> None:
-        """Give a rollout to every idle worker; then, as long as there are enough for all, the next ones ahead."""
+        """Give rollouts to every idle worker; then, as long as there are enough for all, the next ones ahead."""
         waiting = call.waiting
         for idle in [worker for worker in self._workers if not worker.jobs]:
             worker = self._replace(idle, call) if waiting and idle.grown else idle
             while waiting and not worker.is_preparing and not self._give(worker, call):
                 worker = self._replace(worker, call)  # It died while it was idle or starting.
         for worker in self._workers:
-            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.brief and not worker.grown:
+            if len(waiting) >= len(self._workers) and len(worker.jobs) == 1 and worker.is_brief and not worker.grown:
                 # `_replies` notices a worker that has died.
                 self._give(worker, call)
 
     def _give(self, worker: _Worker, call: _Call) -> bool:
-        """Give the next rollout, unless it is large and given ahead; return False if the worker has died."""
+        """Give the next rollouts; return False if the worker has died.
+
+        What is large does not go ahead, nor what takes another testbed, which may take long to build.
+        """
         waiting, cutoff = call.waiting, call.cutoff
-        index = waiting[0]
         limited = self.time_limit < inf or (cutoff is not None and cutoff.deadline < inf)
-        announced = limited and not worker.has_testbed(call, index)
-        start = call.starts[index]
-        new_start = None if worker.has(start) else start
-        message = b"R" + pickle.dumps((index, pack(call.points[index]), new_start, cutoff, announced))
-        if worker.jobs and len(message) > _SMALL:
+        start, rollouts, size = worker.start, list[_Rollout](), 0
+        for index in list(islice(waiting, worker.share(len(waiting) // (2 * len(self._workers))))):
+            point, new_start = pack(call.points[index]), call.starts[index]
+            size += len(point) + len(new_start)
+            is_warm = worker.has_testbed(call, index)
+            if (size > _SMALL or not is_warm) and (worker.jobs or rollouts):
+                break
+            rollouts.append(_Rollout(index, point, None if new_start == start else new_start, limited and not is_warm))
+            start = new_start
+        if not rollouts:
             return True
-        waiting.popleft()
+        for _ in rollouts:
+            waiting.popleft()
+        is_idle = not worker.jobs
         try:
-            worker.give(call.task, start, index, message)
+            worker.give(call.task, start, rollouts, cutoff)
         except (OSError, ProcessStartError) as error:
-            worker.jobs.pop()
-            waiting.appendleft(index)
+            for rollout in reversed(rollouts):
+                worker.jobs.pop()
+                waiting.appendleft(rollout.number)
             if isinstance(error, ProcessStartError):
                 self._launches_lost += 1
                 # A worker that exits cannot work; one that is killed can be replaced, unless all of them are.
@@ -198,7 +211,7 @@ class ProcessExecutor(Executor):
                     raise WorkerError(str(error)) from error
             return False
         self._launches_lost = 0
-        if len(worker.jobs) == 1:
+        if is_idle:
             self._expect(worker, call)
         return True
 
@@ -224,27 +237,26 @@ class ProcessExecutor(Executor):
         ready = {descriptor for descriptor, _ in poll.poll(timeout)}
         replies: list[tuple[_Worker, int, Any]] = []
         for connection, worker in busy.items():
-            index = worker.jobs[0]
             if connection.fileno() in ready:
                 try:
-                    message = connection.recv_bytes()
-                    if message == _BEGUN:
-                        worker.limit_time(self.time_limit, cutoff)
-                    elif message == _GROWN:
-                        worker.grown = True
-                    else:
-                        reply = pickle.loads(message)
-                        worker.finish(*reply)
-                        if worker.jobs:
-                            self._expect(worker, call)
-                        replies.append((worker, index, reply[1]))
+                    for frame in connection.pop_frames():
+                        if frame == _BEGUN:
+                            worker.limit_time(self.time_limit, cutoff)
+                        elif frame == _GROWN:
+                            worker.grown = True
+                        else:
+                            index, outcome = pickle.loads(frame)
+                            worker.finish(index, outcome)
+                            if worker.jobs:
+                                self._expect(worker, call)
+                            replies.append((worker, index, outcome))
                 except (EOFError, OSError):
                     code = worker.child.wait()
-                    replies.append((worker, index, f"its worker process died (exit code {code})"))
+                    replies.append((worker, worker.jobs[0], f"its worker process died (exit code {code})"))
             elif time.monotonic() >= worker.deadline:
                 hung = cutoff is not None and cutoff.is_over
                 reason = "it did not stop" if hung else f"it took longer than its time limit of {self.time_limit:g} s"
-                replies.append((worker, index, reason))
+                replies.append((worker, worker.jobs[0], reason))
         return replies
 
     def _replace(self, worker: _Worker, call: _Call) -> _Worker:
@@ -270,6 +282,15 @@ class _Call(NamedTuple):
     waiting: deque[int]  # indices of the points that no worker has got
 
 
+class _Rollout(NamedTuple):
+    """A rollout on its way to a worker."""
+
+    number: int
+    point: bytes
+    start: bytes | None  # None: that of the last one
+    announced: bool  # Whether the worker tells when its testbed is built.
+
+
 class _Worker:
     """A worker process and the rollouts that it was given.
 
@@ -282,13 +303,13 @@ class _Worker:
     def __init__(self, max_testbeds: int, growth: float, task: bytes | None = None) -> None:
         # Without grace: its rollout may hang.
         self.child = ChildProcess(_run_worker, max_testbeds, growth, task, name="a worker process", grace=0.0)
-        self.connection: Connection | None = None  # None until the worker is known to be ready.
+        self.connection: FrameConnection | None = None  # None until the worker is known to be ready.
         self._task = task
-        self._start = b""  # Of the rollouts that it is given; empty if they begin at the task's own s0.
-        self.jobs: deque[int] = deque()  # The rollout that it runs, and one that was given ahead.
+        self.start = b""  # Of the last rollout that it was given; empty if that begins at the task's own s0.
+        self.jobs: deque[int] = deque()  # The rollout that it runs, and those that were given ahead.
         self.deadline = inf
         self.warm = task is not None  # True after the first rollout of a task, too: it has the testbed.
-        self.brief = False  # True after a short rollout.
+        self.duration = inf  # Of its last rollout, in seconds.
         self.grown = False  # True when its memory has grown so much that it must be replaced.
 
     @property
@@ -296,27 +317,31 @@ class _Worker:
         """Return whether the worker still builds its testbed, while others work; false if it has died."""
         return self.connection is None and self._task is not None and not _readable(self.child.connection)
 
-    def has(self, start: bytes) -> bool:
-        """Return whether the worker begins at ``start`` already."""
-        return self._start is start or self._start == start
+    @property
+    def is_brief(self) -> bool:
+        """Return whether the last rollout was short."""
+        return self.duration < _BRIEF
+
+    def share(self, most: int) -> int:
+        """Return how many rollouts the worker gets at a time, at least one and at most ``most``."""
+        return max(1, int(min(most, _BRIEF / max(self.duration, 1e-6)))) if self.is_brief else 1
 
     def has_testbed(self, call: _Call, index: int) -> bool:
         """Return whether the worker need not build a testbed for a rollout."""
         return self.warm and self._task == call.task and not split(call.points[index])[0]
 
-    def give(self, task: bytes, start: bytes, index: int, message: bytes) -> None:
-        """Send a rollout; ``message`` holds the start if the worker does not have it."""
+    def give(self, task: bytes, start: bytes, rollouts: Sequence[_Rollout], cutoff: Cutoff | None) -> None:
+        """Send rollouts, of which the last one begins at ``start``, and the task if the worker does not have it."""
         # Before anything is sent: a worker that was interrupted here must not count as idle.
-        self.jobs.append(index)
+        self.jobs += [rollout.number for rollout in rollouts]
         if self.connection is None:
             self.child.wait_until_ready(None)
-            self.connection = Connection(self.child.connection.detach())
-        if self._task != task:
-            self.warm = self.brief = False
-            self.connection.send_bytes(b"T" + task)
-            self._task = task
-        self.connection.send_bytes(message)
-        self._start = start
+            self.connection = FrameConnection(self.child.connection)
+        is_new = self._task != task
+        if is_new:
+            self.warm, self.duration = False, inf
+        self.connection.send((task if is_new else None, rollouts, cutoff))
+        self._task, self.start = task, start
 
     def limit_time(self, time_limit: float, cutoff: Cutoff | None) -> None:
         """Start the time limit: the worker has its testbed, and begins its rollout or is about to."""
@@ -331,13 +356,11 @@ class _Worker:
         self.jobs.popleft()
         self.deadline = inf
         self.warm = True
-        self.brief = isinstance(outcome, RolloutResult) and outcome.wall_time < _BRIEF
+        self.duration = outcome.wall_time if isinstance(outcome, RolloutResult) else inf
 
     def kill(self) -> None:
         self.child.kill()
         self.child.close()
-        if self.connection is not None:
-            self.connection.close()
 
 
 def _readable(connection: socket.socket) -> bool:
@@ -364,8 +387,8 @@ def checked_time_limit(time_limit: float) -> float:
 def _run_worker(parent: socket.socket, max_testbeds: int, growth: float, task: bytes | None) -> None:
     """Run rollouts on request until the connection closes.
 
-    A task (T) has no answer. A rollout (R) has one, from `answer`; it is announced by `_BEGUN` on request, unless its
-    testbed cannot be built. Once, `_GROWN` comes before an answer.
+    A request is (a new task or None, rollouts, cutoff). Each rollout has an answer, from `answer`; it is announced by
+    `_BEGUN` on request, unless its testbed cannot be built. Once, `_GROWN` comes before an answer.
 
     Args:
         parent: The connection to the executor.
@@ -379,34 +402,39 @@ def _run_worker(parent: socket.socket, max_testbeds: int, growth: float, task: b
     if task is not None:
         load = cache(partial(unpack, task))
         # A rollout that is cancelled at its first sample. Any other error will be the answer to the next one, too.
-        answer(0, partial(_rollout, runners, load, pack({}), start, Cutoff(deadline=-inf), None))
+        answer(0, partial(_run_rollout, runners, load, pack({}), start, Cutoff(deadline=-inf), None))
     report_ready(parent)
-    connection = Connection(parent.detach())
+    connection = FrameConnection(parent)
     limit = inf
-    while True:
-        try:
-            message = connection.recv_bytes()
-            kind, content = message[:1], message[1:]
-            if kind == b"T":
+    with suppress(EOFError, OSError):
+        while True:
+            task, rollouts, cutoff = connection.receive()
+            if task is not None:
                 # The same object each time, as its runner is known by it. One that cannot be read raises each time.
-                load = cache(partial(unpack, content))
-                continue
-            index, point, new_start, cutoff, announced = pickle.loads(content)
-            start = start if new_start is None else new_start
+                load = cache(partial(unpack, task))
             assert load is not None, "a worker got a rollout before its task"
-            announce = partial(connection.send_bytes, _BEGUN) if announced else None
-            reply = answer(index, partial(_rollout, runners, load, point, start, cutoff, announce))
-            if limit == inf:
-                limit = _memory() + growth
-            elif _memory() > limit:
-                connection.send_bytes(_GROWN)
-                limit = growth = inf
-            connection.send_bytes(reply)
-        except (EOFError, OSError):
-            return
+            for rollout in rollouts:
+                start = start if rollout.start is None else rollout.start
+                announce = partial(connection.send_frame, _BEGUN) if rollout.announced else None
+                work: Callable[[], RolloutResult] = partial(
+                    _run_rollout, runners, load, rollout.point, start, cutoff, announce
+                )
+                if rollout is not rollouts[0] and cutoff is not None and cutoff.is_over:
+                    work = _cancel  # Without the time to reset the testbed.
+                reply = answer(rollout.number, work)
+                if limit == inf:
+                    limit = _memory() + growth
+                elif _memory() > limit:
+                    connection.send_frame(_GROWN)
+                    limit = growth = inf
+                connection.send_frame(reply)
 
 
-def _rollout(
+def _cancel() -> RolloutResult:
+    raise CancelledError
+
+
+def _run_rollout(
     runners: Runners,
     load: Callable[[], RolloutTask],
     point: bytes,

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from vtbdrake.argument_checks import suggestion
-from vtbdrake.control.background_process import FrameConnection
 from vtbdrake.control.bridge import BridgeError
+from vtbdrake.frames import FrameConnection
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.monitoring.live.messages import (
     ANSWER,

@@ -13,11 +13,12 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.closing import Closing
-from vtbdrake.control.background_process import BackgroundProcess, unpack
+from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.failures import FAILURES
+from vtbdrake.frames import unpack
 from vtbdrake.monitoring.live.messages import LoopStatus, ReadRequest, Request, SetRequest, StatusRequest
 from vtbdrake.monitoring.live.server import OUTCOME, VALUES, Record, serve
 from vtbdrake.testbed import DpsAlone

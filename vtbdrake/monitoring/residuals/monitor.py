@@ -12,11 +12,12 @@ import numpy as np
 
 from vtbdrake.arrays import Array
 from vtbdrake.closing import Closing
-from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess, FrameConnection
+from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import ChangeKind, Cycle
 from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.frames import FrameConnection
 from vtbdrake.monitoring.residuals.alarms import (
     Alarm,
     AlarmDetector,
