@@ -28,7 +28,7 @@ SOLVERS: dict[str, Callable[..., Plan]] = {
 }
 
 
-def arm_trajectory(repeats: int = 10, searched: int = 60) -> list[Benchmark]:
+def arm_trajectory(repeats: int = 10, searched: int = 30) -> list[Benchmark]:
     """Time of the momentum model beside that of a rollout, and times to 1 deg by solver.
 
     Args:

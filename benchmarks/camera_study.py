@@ -15,7 +15,7 @@ from vtbdrake_diagrams.satellite.studies.mount import BY_HAND, entries, mount_pr
 CANDIDATES = 50
 
 
-def camera_study_speedup(repeats: int = 3) -> Benchmark:
+def camera_study_speedup(repeats: int = 2) -> Benchmark:
     """Return how much faster `CANDIDATES` placements of the docking camera are judged along one recorded capture.
 
     The comparison simulates each of them with its images from the start. Processor time, in one thread. The time of the

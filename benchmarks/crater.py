@@ -36,7 +36,7 @@ X = "sim.sys.climber.base.x"
 FINE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.045, accuracy=1e-4)
 
 
-def crater_decision(repeats: int = 5) -> list[Benchmark]:
+def crater_decision(repeats: int = 3) -> list[Benchmark]:
     """Wall time of a decision among 7 headings, over that of its bare rollouts on the same cores.
 
     The rollouts are short, so that many repeats fit, and what the decision adds counts for more than in those of 300 s.

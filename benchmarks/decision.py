@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from pydrake.systems.framework import Context
 
-from benchmarks.measure import LOWER, Benchmark, seconds, spread
+from benchmarks.measure import LOWER, Benchmark, processor_time, seconds, spread
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Belief, BeliefToStart, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Quality, RolloutRunner
@@ -48,7 +47,7 @@ def decision_overhead_compiled(decisions: int = 200, rollouts: int = 32) -> Benc
         plans = {"u.plan": np.array([candidate.values["u.plan"] for candidate in decision.candidates])}
         bare(plans)
         parts = [partial(reasoner.decide, testbed, context), partial(bare, plans)]
-        times = np.array([[_processor_time(part) for part in parts] for _ in range(decisions)]) * 1e3
+        times = np.array([[processor_time(part) for part in parts] for _ in range(decisions)]) * 1e3
     ours = times[:, 0] - times[:, 1]
     return Benchmark(
         name="decision_overhead_compiled",
@@ -61,12 +60,6 @@ def decision_overhead_compiled(decisions: int = 200, rollouts: int = 32) -> Benc
         note=f"processor time, {spread(ours, unit='ms')}; a decision takes {np.median(times[:, 0]):.3g} ms, its "
         f"{rollouts} rollouts of {scenario.duration:g} s {np.median(times[:, 1]):.2g} ms",
     )
-
-
-def _processor_time(function: Callable[[], object]) -> float:
-    begin = time.process_time()
-    function()
-    return time.process_time() - begin
 
 
 def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:

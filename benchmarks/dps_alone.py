@@ -27,7 +27,7 @@ PATIENCE = 120.0  # s
 AGAINST = "the whole testbed, run on the same machine from the same snapshot"
 
 
-def dps_alone_start(repeats: int = 5) -> list[Benchmark]:
+def dps_alone_start(repeats: int = 3) -> list[Benchmark]:
     """From the start of the process to the first command, and resident memory then: ``vtbdrake run`` from a snapshot
     against the whole testbed; and memory once more where all of it is locked, as loops do that have the room."""
     scenario = ManipulatorScenario()

@@ -5,7 +5,6 @@ Processor time, of variants that run in turns. What a rung takes beyond the one 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,7 +18,7 @@ from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource, Z
 from pydrake.trajectories import PiecewisePolynomial
 
 from benchmarks.cpp_climber import JOINTS, CppClimberScenario
-from benchmarks.measure import LOWER, Benchmark
+from benchmarks.measure import LOWER, Benchmark, processor_time
 from benchmarks.plain_climber import build_plain_climber
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutRunner, RolloutTask
@@ -182,7 +181,7 @@ def _ladder(name: str, rungs: dict[str, Rung], *, seconds: float, repeats: int, 
     for _ in range(repeats):
         for rung, prepare in rungs.items():
             # Some in a row, as in a decision: the first one finds the processor's caches full of other things.
-            times[rung] += [_processor_time(prepare()) for _ in range(IN_A_ROW)]
+            times[rung] += [processor_time(prepare()) for _ in range(IN_A_ROW)]
     # What else the machine does only adds to them.
     least = {rung: 1e3 * min(taken) / seconds for rung, taken in times.items()}
     return Benchmark(
@@ -196,9 +195,3 @@ def _ladder(name: str, rungs: dict[str, Rung], *, seconds: float, repeats: int, 
         + "; ".join(f"{rung}: {value:.3g} ms" for rung, value in least.items())
         + f"; n = {IN_A_ROW * repeats}",
     )
-
-
-def _processor_time(function: Callable[[], object]) -> float:
-    begin = time.process_time()
-    function()
-    return time.process_time() - begin

@@ -97,6 +97,13 @@ def seconds(function: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
+def processor_time(function: Callable[[], Any]) -> float:
+    """Processor time of one call, of all threads of this process, in seconds."""
+    begin = time.process_time()
+    function()
+    return time.process_time() - begin
+
+
 def ratio(of: np.ndarray, to: np.ndarray) -> float:
     """The median of one over the median of the other."""
     return float(np.median(of) / np.median(to))

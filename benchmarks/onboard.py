@@ -68,7 +68,7 @@ class ReasoningScenario(ManipulatorScenario):
         ]
 
 
-def loop_p99_beside_reasoner(cycles: int = 10_000, rounds: int = 5) -> Benchmark:
+def loop_p99_beside_reasoner(cycles: int = 6_000, rounds: int = 5) -> Benchmark:
     """Lateness of the 1 kHz loop at the 99th percentile, with a reasoner that decides all the time, over that without.
 
     The lateness is the time from a deadline to the end of its cycle. In turns, in the full loop with hub and machine.

@@ -62,7 +62,7 @@ def _efficiency(name: str, task: RolloutTask, rollouts: int, repeats: int) -> Be
     The goal is `GOAL`, or, where the machine itself does not give that much, `OF_CEILING` of what processes that share
     nothing reach beside it.
 
-    The runs on one core and on all take turns, one against two, and every executor has its turn in every repeat. Each
+    The runs on one core and on all take turns, one against three, and every executor has its turn in every repeat. Each
     is compared with the mean of the runs on one core before and after it, so that what else the machine does meets
     both. What the machine itself allows is measured in the same way: processes that do a fixed share of the rollouts
     each, without a word in between.
@@ -80,8 +80,8 @@ def _efficiency(name: str, task: RolloutTask, rollouts: int, repeats: int) -> Be
         alone = [seconds(lambda: serial(task, points))]
         for repeat in range(repeats):
             order = list(runs) if repeat % 2 == 0 else list(reversed(runs))
-            for pair in zip(order[::2], order[1::2], strict=True):
-                elapsed_by_kind = {kind: seconds(lambda kind=kind: runs[kind](task, points)) for kind in pair}
+            for kinds in zip(order[::3], order[1::3], order[2::3], strict=True):
+                elapsed_by_kind = {kind: seconds(lambda kind=kind: runs[kind](task, points)) for kind in kinds}
                 alone.append(seconds(lambda: serial(task, points)))
                 for kind, elapsed in elapsed_by_kind.items():
                     times.setdefault(kind, []).append(elapsed)

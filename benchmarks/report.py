@@ -44,7 +44,7 @@ BENCHMARKS: Registry = {
     "slow_part_misses": "benchmarks.slow_part:slow_part_misses",
     "loop_p99_beside_reasoner": "benchmarks.onboard:loop_p99_beside_reasoner",
     "recording_cost": "benchmarks.recording:recording_cost",
-    "replay_rtf": "benchmarks.recording:replay_rtf",
+    "replay_cost": "benchmarks.recording:replay_cost",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
     "log_replay": "benchmarks.compiled_testbed:log_replay",
     "calibration_time": "benchmarks.calibration:calibration_time",

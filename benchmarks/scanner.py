@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +14,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from benchmarks.measure import LOWER, Benchmark, interleaved_values, ratio, spread
+from benchmarks.measure import LOWER, Benchmark, interleaved_values, processor_time, ratio, spread
 from vtbdrake.components.ray_casting import RayCaster, body_surfaces
 from vtbdrake.components.rendering import RenderingError, check_rendering
 from vtbdrake.components.sensors import ErrorModel
@@ -96,8 +94,10 @@ def scanner_cost(repeats: int = 11) -> Benchmark:
             for group, origins, directions in calls:
                 group.run(origins, directions, output=True)
 
-    ours, bare = interleaved_values(lambda: _cpu(scan), lambda: _cpu(lambda: cast(moving)), repeats=repeats)
-    at_rest = np.median([_cpu(lambda: cast(resting)) for _ in range(repeats)])
+    ours, bare = interleaved_values(
+        lambda: processor_time(scan), lambda: processor_time(lambda: cast(moving)), repeats=repeats
+    )
+    at_rest = np.median([processor_time(lambda: cast(resting)) for _ in range(repeats)])
     count = len(rays) * SECONDS * CONFIG.frequency
     return Benchmark(
         name="scanner_cost",
@@ -173,11 +173,4 @@ def _depth_camera(made: Scene) -> str:
         query.RenderDepthImage(camera, frame, X_BC)
 
     render()
-    return f"Drake's depth camera {width * height / np.median([_cpu(render) for _ in range(11)]):.3g} pixels"
-
-
-def _cpu(function: Callable[[], Any]) -> float:
-    """Return the CPU time of one call, of all threads of this process, in s."""
-    begin = time.process_time()
-    function()
-    return time.process_time() - begin
+    return f"Drake's depth camera {width * height / np.median([processor_time(render) for _ in range(11)]):.3g} pixels"

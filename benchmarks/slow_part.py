@@ -52,7 +52,7 @@ class PerceivingScenario(ManipulatorScenario):
         return builder.Build()
 
 
-def slow_part_misses(cycles: int = 10_000, rounds: int = 10) -> Benchmark:
+def slow_part_misses(cycles: int = 6_000, rounds: int = 10) -> Benchmark:
     """Missed deadlines of the 1 kHz loop with a perception, n, and without, m: (n + 1) / (m + 1), for 10,000 cycles.
 
     The perception takes 50 ms of a processor every 100 ms. In turns, in the full loop with hub and machine.

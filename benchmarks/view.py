@@ -75,7 +75,7 @@ def _served(session: Session) -> Iterator[View]:
         yield running
 
 
-def view_cost(repeats: int = 25, horizon: float = 8.0) -> list[Benchmark]:
+def view_cost(repeats: int = 15, horizon: float = 8.0) -> list[Benchmark]:
     """A rollout of the space climber with its ten ghosts in a page, against the same rollout without any page.
 
     Both advance along the same grid, as fast as they can, in turns. Frames are drawn by the wall clock, and a client in
@@ -134,7 +134,7 @@ def _headless(testbed: VirtualTestbed, horizon: float, step: float) -> tuple[flo
     return (time.perf_counter() - begin) / seconds, (time.thread_time() - worked) / seconds
 
 
-def view_states(seconds: float = 10.0) -> list[Benchmark]:
+def view_states(seconds: float = 6.0) -> list[Benchmark]:
     """States that a client handles per second, of eleven robots that move in real time; beside it, their age.
 
     A state counts when the client has unpacked its last pose. Its age is the time since it was drawn. If there is a

@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 import lcm
 import numpy as np
 from drake import lcmt_scope
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from benchmarks.measure import LOWER, Benchmark
@@ -132,17 +133,32 @@ class Headset:
             leads = self._status()["leading"]
 
 
+class _NotMeasuredError(RuntimeError):
+    """The loop had latched, or ended: nobody led the robot any more."""
+
+
 @contextmanager
 def _loop(url: str) -> Iterator[None]:
-    """A machine process, and a process of the loop that controls it."""
+    """Start a machine process and a process of the loop that controls it, with real-time priority if it is granted.
+
+    Raises:
+        _NotMeasuredError: The loop had latched, or ended, when an error came.
+    """
     scenario = ["vtbdrake_diagrams.manipulator:ManipulatorScenario", "--field", "led_by_hand=true"]
-    command = [sys.executable, "-m", "vtbdrake", "run", *scenario, "--url", url, "--priority", "0"]
+    command = [sys.executable, "-m", "vtbdrake", "run", *scenario, "--url", url]
     with MachineProcess(QuickArm(), url):
         loop = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             with LiveClient(url, timeout=PATIENCE) as live:
                 live.get(["dps.impl.tip_pose"])
-            yield
+                try:
+                    yield
+                except (RuntimeError, TimeoutError, ConnectionClosed) as error:
+                    if loop.poll() is not None:
+                        raise _NotMeasuredError(f"the loop ended with exit code {loop.returncode}: {error}") from error
+                    if latched := live.status().latched:
+                        raise _NotMeasuredError(f"the loop has latched: {'; '.join(latched)}") from error
+                    raise
         finally:
             loop.send_signal(signal.SIGINT)
             loop.wait(PATIENCE)
@@ -152,15 +168,17 @@ def vr_pose_to_command() -> list[Benchmark]:
     """Time from a pose that a headset's page sends to its command u on the bus of the loop, and to that of a release.
 
     The page is a client without a browser; the server shows the loop, which controls a machine process. The loop takes
-    a command of the bus in its next period.
+    a command of the bus in its next period. If the loop latches on a busy computer, all is measured once more.
+
+    Raises:
+        _NotMeasuredError: The loop has latched both times.
     """
-    with ExitStack() as stack:
-        hub = stack.enter_context(Hub(port=0))
-        stack.enter_context(_loop(hub.url))
-        listener = Listener(hub.url)
-        stack.callback(listener.close)
-        delays = _delays(hub.url, listener)
-        releases = _releases(hub.url, listener)
+    try:
+        delays, releases = _measured()
+        again = ""
+    except _NotMeasuredError as error:
+        delays, releases = _measured()
+        again = f"measured once more, because {error}"
     p95 = float(np.percentile(delays, 95.0))
     worst = max(float(np.percentile(times, 95.0)) for times in releases.values())
     note = "; ".join(
@@ -176,6 +194,7 @@ def vr_pose_to_command() -> list[Benchmark]:
             better=LOWER,
             absolute="a hand that feels the robot lag",
             against=f"a pose every {1e3 / RATE:.0f} ms, at p95; the median is {1e3 * np.median(delays):.1f} ms",
+            note=again,
         ),
         Benchmark(
             name="vr_release_to_idle",
@@ -188,6 +207,16 @@ def vr_pose_to_command() -> list[Benchmark]:
             note=note,
         ),
     ]
+
+
+def _measured() -> tuple[list[float], dict[str, list[float]]]:
+    """Return what `_delays` and `_releases` return, of one loop."""
+    with ExitStack() as stack:
+        hub = stack.enter_context(Hub(port=0))
+        stack.enter_context(_loop(hub.url))
+        listener = Listener(hub.url)
+        stack.callback(listener.close)
+        return _delays(hub.url, listener), _releases(hub.url, listener)
 
 
 def _delays(url: str, listener: Listener) -> list[float]:
