@@ -24,6 +24,7 @@ from drake import lcmt_scope
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from benchmarks.loop_rig import HUB_PRIORITY, MACHINE_PRIORITY
 from benchmarks.measure import LOWER, Benchmark
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
@@ -139,14 +140,14 @@ class _NotMeasuredError(RuntimeError):
 
 @contextmanager
 def _loop(url: str) -> Iterator[None]:
-    """Start a machine process and a process of the loop that controls it, with real-time priority if it is granted.
+    """Start a machine process and a process of the loop that controls it, with real-time priority if that is granted.
 
     Raises:
         _NotMeasuredError: The loop had latched, or ended, when an error came.
     """
     scenario = ["vtbdrake_diagrams.manipulator:ManipulatorScenario", "--field", "led_by_hand=true"]
     command = [sys.executable, "-m", "vtbdrake", "run", *scenario, "--url", url]
-    with MachineProcess(QuickArm(), url):
+    with MachineProcess(QuickArm(), url, priority=MACHINE_PRIORITY):
         loop = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             with LiveClient(url, timeout=PATIENCE) as live:
@@ -212,7 +213,7 @@ def vr_pose_to_command() -> list[Benchmark]:
 def _measured() -> tuple[list[float], dict[str, list[float]]]:
     """Return what `_delays` and `_releases` return, of one loop."""
     with ExitStack() as stack:
-        hub = stack.enter_context(Hub(port=0))
+        hub = stack.enter_context(Hub(port=0, priority=HUB_PRIORITY))
         stack.enter_context(_loop(hub.url))
         listener = Listener(hub.url)
         stack.callback(listener.close)

@@ -4,19 +4,19 @@ import logging
 import os
 import queue
 import signal
-import sqlite3
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 
 import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster, get_task_stream
+from distributed.diagnostics.plugin import SchedulerPlugin
 
 from benchmarks.cluster import Waiting, cost
 from benchmarks.dask_cluster import ROOT, dask_cluster
@@ -260,17 +260,18 @@ def test_killed_study_on_many_slots_is_resumed(tmp_path):
         host="127.0.0.1",
         dashboard_address=None,
     ) as many:
+        plugin = _EndOfTask()
+        many.scheduler.add_plugin(plugin)
         command = [sys.executable, "-m", "tests.rollout.waiting_study", str(path), many.scheduler_address]
-        process = subprocess.Popen(command, cwd=ROOT)
-        # It is killed in the midst of its second batch.
-        while _recorded(path) < 1.5 * SLOTS:
-            assert process.poll() is None, "the study ended before it could be killed"
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
+            assert process.stdout.readline(), "the study ended before it could be killed"
+            # Its first batch is recorded: it is killed in the midst of its second one.
+            plugin.event.clear()
+            assert plugin.event.wait(60.0)
+            process.send_signal(signal.SIGKILL)
         with waiting_study(path) as study, Waiting(many.scheduler_address, duration=0.0) as executor:
             before = set(study.rollouts)
-            assert 1.5 * SLOTS <= len(before) < ROLLOUTS
+            assert SLOTS <= len(before) < ROLLOUTS
             study.run(rollouts=ROLLOUTS, executor=executor, progress=False)
             assert before < set(study.rollouts)
             resumed = _table(study)
@@ -282,15 +283,15 @@ def test_killed_study_on_many_slots_is_resumed(tmp_path):
     assert resumed == _table(whole)
 
 
-def _recorded(path):
-    """Return the number of rollouts that a study in another process has recorded."""
-    if not path.exists():
-        return 0
-    with closing(sqlite3.connect(path)) as connection:
-        try:
-            return connection.execute("SELECT count(*) FROM rollouts").fetchone()[0]
-        except sqlite3.OperationalError:
-            return 0
+class _EndOfTask(SchedulerPlugin):
+    """Sets its event whenever a task has ended."""
+
+    def __init__(self):
+        self.event = threading.Event()
+
+    def transition(self, key, start, finish, *args, **kwargs):
+        if finish == "memory":
+            self.event.set()
 
 
 def _table(study):

@@ -7,6 +7,7 @@ import sys
 from benchmarks.cluster import Waiting
 from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study
+from vtbdrake.optimization.records import Trial
 
 SLOTS, ROLLOUTS = 100, 500
 
@@ -17,9 +18,13 @@ def waiting_study(path: str | None = None) -> Study:
 
 
 def main(path: str, address: str) -> None:
-    """Run the study on the cluster of a scheduler."""
+    """Run the study on the cluster of a scheduler, and print the number of each trial that is recorded."""
     with waiting_study(path) as study, Waiting(address, duration=0.2) as executor:
-        study.run(rollouts=ROLLOUTS, executor=executor, progress=False)
+        study.run(rollouts=ROLLOUTS, executor=executor, progress=False, callbacks=[_print])
+
+
+def _print(_: Study, trial: Trial) -> None:
+    print(trial.number, flush=True)
 
 
 if __name__ == "__main__":
