@@ -172,9 +172,9 @@ def test_bad_times_and_poses_are_ignored_and_counted():
 def test_impossible_settings_are_refused():
     unit = unit_for(drive(3, ACCURATE, reach=18.0).map)
     for settings, message in (
-        ({"submap_length": 0.0}, "submap_length .* is positive, in m, not 0.0"),
-        ({"try_every": (2.0, -1.0)}, r"distance .* and a time .* at least 0, not \(2"),
-        ({"try_every": (2.0, np.nan)}, r"distance .* and a time .* at least 0, not \(2"),
+        ({"submap_length": 0.0}, "submap_length must be a finite number above 0 m, not 0.0"),
+        ({"try_every": (2.0, -1.0)}, r"try_every\[1\] must be a number of at least 0 m, s, not -1"),
+        ({"try_every": (2.0, np.nan)}, r"try_every\[1\] must be a number of at least 0 m, s, not nan"),
     ):
         with pytest.raises(ValueError, match=message):
             replace(unit, **settings)

@@ -183,7 +183,7 @@ def test_matchers_that_cannot_be_are_refused(values: dict[str, float], message: 
 
 
 def test_cameras_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ValueError, match="positive, not 300.0 pixels and -0.1 m"):
+    with pytest.raises(ValueError, match="StereoCamera.baseline must be a finite number above 0 m, not -0.1"):
         StereoCamera.of(INFO, baseline=-0.1)
     with pytest.raises(ValueError, match="square: .* not 300 and 310"):
         StereoCamera.of(CameraInfo(320, 240, 300.0, 310.0, 160.0, 120.0), baseline=0.3)

@@ -108,7 +108,7 @@ def test_trials_count_errors_in_pixels() -> None:
     ("fields", "message"),
     [
         ({"perception": "sonar"}, "perception must be one of scanner, stereo, not 'sonar'"),
-        ({"stereo": StereoConfig(baseline=0.0)}, "baseline .* positive"),
+        ({"stereo": StereoConfig(baseline=0.0)}, "baseline must be a finite number above 0 m"),
         ({"stereo": StereoConfig(largest_disparity=20)}, "multiple of 16 pixels, not 20"),
         ({"stereo": StereoConfig(fps=0.0)}, "stereo.fps must be a finite number above 0 Hz"),
         ({"stereo": StereoConfig(width=0)}, "stereo.width must be a whole number of at least 1 pixels, not 0"),

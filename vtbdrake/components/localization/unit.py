@@ -22,6 +22,7 @@ from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.components.localization.track_state import TrackState
 from vtbdrake.components.localization.tracking import Matches, Tracker
+from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import Codec
 from vtbdrake.state.codecs import codec_of
 
@@ -99,29 +100,30 @@ class LocalizationUnit:
         locator: The map, prepared for global localization.
         tracker: The filter, with the same map.
         drift: The drift of the odometry.
-        submap_length: The distance in m over which landmarks are gathered.
-        try_every: Distance (m) and time (s) between attempts of global localization, whichever comes first.
-        begins_with_submap: Whether tracking begins with all gathered landmarks instead of those of the last scan, for
-            sensors of which one sample shows too few for a pose. Their errors are then assumed to be independent.
 
     Raises:
-        ValueError: The length of the submap is not positive, or a distance or time between matches is negative.
+        ValueError: A setting is outside of its range.
     """
 
     locator: ConstellationMap
     tracker: Tracker
     drift: DriftModel = field(default_factory=DriftModel)
-    submap_length: float = 40.0
-    try_every: tuple[float, float] = (2.0, 2.0)
-    begins_with_submap: bool = False
+    submap_length: float = setting(40.0, "The distance over which landmarks are gathered.", unit="m", gt=0.0)
+    try_every: tuple[float, float] = setting(
+        (2.0, 2.0),
+        "Distance and time between attempts of global localization, whichever comes first.",
+        unit="m, s",
+        ge=0.0,
+        finite=False,
+    )
+    begins_with_submap: bool = setting(
+        False,
+        "Whether tracking begins with all gathered landmarks instead of those of the last scan, for sensors of which "
+        "one sample shows too few for a pose. Their errors are then assumed to be independent.",
+    )
 
     def __post_init__(self) -> None:
-        if not self.submap_length > 0.0:
-            raise ValueError(f"the submap_length of a localization unit is positive, in m, not {self.submap_length!r}")
-        if len(self.try_every) != 2 or not all(limit >= 0.0 for limit in self.try_every):
-            raise ValueError(
-                f"try_every of a localization unit is a distance (m) and a time (s), at least 0, not {self.try_every}"
-            )
+        check_settings(self)
 
     def start(self) -> UnitState:
         """Return the memory before the first scan."""

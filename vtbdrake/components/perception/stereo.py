@@ -31,31 +31,17 @@ class StereoCamera:
 
     The frame C is that of the left camera: x to the right, y down, z forward; the right one stands at [baseline, 0, 0]
     in C. Pixels count as in Drake's `CameraInfo`: the centre of the first one is at (0.5, 0.5).
-
-    Attributes:
-        width: Width of the images, in pixels.
-        height: Height of the images, in pixels.
-        focal_length: Focal length in pixels; pixels are square.
-        center_x: Position of the optical axis in the images, in pixels from their left edge.
-        center_y: The same, from their upper edge.
-        baseline: The distance of the cameras in m.
     """
 
-    width: int
-    height: int
-    focal_length: float
-    center_x: float
-    center_y: float
-    baseline: float
+    width: int = setting(doc="Width of the images.", unit="pixels", ge=1)
+    height: int = setting(doc="Height of the images.", unit="pixels", ge=1)
+    focal_length: float = setting(doc="Focal length; pixels are square.", unit="pixels", gt=0.0)
+    center_x: float = setting(doc="Position of the optical axis in the images, from their left edge.", unit="pixels")
+    center_y: float = setting(doc="The same, from their upper edge.", unit="pixels")
+    baseline: float = setting(doc="The distance of the cameras.", unit="m", gt=0.0)
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1:
-            raise ValueError(f"images have at least one pixel, not {self.width} x {self.height}")
-        if not (self.focal_length > 0.0 and self.baseline > 0.0):
-            raise ValueError(
-                f"focal length and baseline of a pair of cameras are positive, not {self.focal_length} pixels and "
-                f"{self.baseline} m"
-            )
+        check_settings(self)
 
     @classmethod
     def of(cls, info: CameraInfo, *, baseline: float) -> StereoCamera:
