@@ -35,6 +35,8 @@ def negative(_: float) -> float:
             "'stifness' of a plain type; did you mean stiffness?",
         ),
         (["variable", PENDULUM], "No such command 'variable'"),
+        (["view", PENDULUM, "--certificate", __file__], "--certificate and --key go with --tls"),
+        (["view", PENDULUM, "--key", __file__], "--certificate and --key go with --tls"),
         ([*ROLLOUT, "--set", "dps.gian=1"], "did you mean dps.gain"),
         ([*ROLLOUT, "--set", "dps.gain=[1,2]"], "has shape (4,)"),
         ([*ROLLOUT, "--set", "dps.gain=[1,2,3,NaN]"], "must be finite"),

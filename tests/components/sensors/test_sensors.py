@@ -61,7 +61,8 @@ def reading(sensor: SampledSensor, simulator: Simulator) -> np.ndarray:
     return sensor.get_output_port().Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
 
 
-def test_imu_that_resumes_goes_on_as_the_one_before() -> None:
+@pytest.mark.parametrize("w_WB", [[0.5, -1.0, 2.0], [0.0, 0.0, 0.0]])
+def test_imu_that_resumes_goes_on_as_the_one_before(w_WB: list[float]) -> None:
     builder, plant = free_body()
     plant.Finalize()
     imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
@@ -70,7 +71,7 @@ def test_imu_that_resumes_goes_on_as_the_one_before() -> None:
     plant.SetFreeBodySpatialVelocity(
         plant.GetMyContextFromRoot(running.get_mutable_context()),
         plant.GetBodyByName("body"),
-        SpatialVelocity([0.5, -1.0, 2.0], [1.0, 2.0, 3.0]),
+        SpatialVelocity(w_WB, [1.0, 2.0, 3.0]),
     )
     for now, end in ((0.204, 0.215), (0.23, 0.235)):  # Between two samples, and when the next one is due.
         running.AdvanceTo(now)
