@@ -3,11 +3,14 @@
 import os
 import select
 import signal
+import socket
 import time
 
 import numpy as np
+import pytest
 
-from vtbdrake.control.background_process import BackgroundProcess
+from tests.interruptions import hanging_fails
+from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 
 TIMEOUT = 60.0
 
@@ -62,6 +65,16 @@ def test_frames_return_whole_and_in_order():
         assert back == sent and worker.dropped == 0
     finally:
         assert worker.close() == 0
+
+
+def test_worker_waits_for_a_frame_as_long_as_it_says():
+    ours, theirs = socket.socketpair()
+    with ours, theirs, hanging_fails("a wait of 10 ms"):
+        connection = FrameConnection(ours)
+        with pytest.raises(TimeoutError, match=r"no frame arrived within 0\.01 s"):
+            connection.receive_frame(0.01)
+        FrameConnection(theirs).send_frame(b"late")
+        assert connection.receive_frame(0.01) == b"late"
 
 
 def test_close_sends_what_waits():

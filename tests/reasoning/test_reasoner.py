@@ -613,7 +613,7 @@ def test_a_senseless_budget_is_refused(arguments, message):
             "7 rollouts does not suffice for one candidate, which takes 8",
         ),
         ({"uncertainty": {"sim.sys.mass.discrete_state_0": 0.1}}, "samples=1 with .*one is a world by chance"),
-        ({"samples": 3}, "samples=3 with uncertainty=None.*of a certain one all are the same"),
+        ({"samples": 2}, "samples=2 with uncertainty=None.*of a certain one all are the same"),
         ({"decision": []}, "a reasoner decides something"),
         ({"decision": SWITCH}, "give decision as"),
         ({"decision": [Parameter("sim.sys.mass.discrete_state_0[0]", 0.0, 1.0)]}, "is neither"),

@@ -332,6 +332,7 @@ def test_removed_file_is_told(tmp_path: Path) -> None:
     cart_pole_problem().study(path).close()
     with view_study(path) as view, page(view) as socket:
         reader = Reader(socket).until("new", 0)
+        assert reader.status["message"] == ""
         path.unlink()
         while "has been removed or replaced" not in reader.status["message"]:
             reader.read()
