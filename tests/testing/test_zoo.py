@@ -64,7 +64,7 @@ MESSAGES = {
     "check_silence_ends_in_the_fallback": "nothing arrives on SPEED any more",
     "check_nan_ends_in_the_fallback": "the numbers on POSITION are NaN",
     "check_repeated_samples_end_in_the_fallback": "one message is repeated on SPEED",
-    "check_late_samples_end_in_the_fallback": "arrive 0.15 s late, and the DPS still commands: give the guards max_delay",
+    "check_late_samples_end_in_the_fallback": "arrive 0.15 s late, and the DPS still commands",
     "check_derivatives_are_right": "sim.sys.square: the derivative of y[0] by x[0] is 0 by AutoDiff",
 }
 
