@@ -7,7 +7,7 @@ spanner (GPL-3), which need ``laspy[lazrs]``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +39,8 @@ CLOUDS = {"pine plantation": "treels/pine_plot.laz", "ponderosa, TLS": "spanner/
 MOBILE = {"ponderosa, mobile": "spanner/MLS_Clip.laz"}
 """Clouds that were scanned while walking, whose points scatter more."""
 _NOISE, _MOBILE_NOISE = 0.02, 0.03
+ALONE = {"one pine": "treels/pine.laz"}
+"""Clouds of single trees, which had no part in the choice of the detector's constants."""
 SCANNER = Scanner(rows=32, columns=1800, elevation=np.radians(40.0))
 _EYE = 2.0
 _BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
@@ -176,26 +178,40 @@ class Detection:
     eye: Array
 
 
-def detections(cloud: Cloud, full: Array, partial: Array, *, noise: float, step: float) -> Iterator[Detection]:
-    """Yield the detector's results for scanners on a grid of places where there is room."""
+def grid(cloud: Cloud, step: float) -> Iterator[Array]:
+    """Yield the places (2,) of a grid in a cloud where there is room for a scanner."""
     low, high = cloud.points[:, :2].min(axis=0), cloud.points[:, :2].max(axis=0)
     obstacles = cKDTree(cloud.points[(cloud.heights > 0.3) & (cloud.heights < 2.5), :2])
+    for x in np.arange(low[0] + 1.0, high[0] - 0.5, step):
+        for y in np.arange(low[1] + 1.0, high[1] - 0.5, step):
+            if obstacles.query([x, y])[0] >= 0.6:
+                yield np.array([x, y])
+
+
+def around(stem: Array) -> Iterator[Array]:
+    """Yield places (2,) around a stem: twelve of them in each bin of distances."""
+    for low, high in pairwise(_BINS):
+        for azimuth in 2.0 * np.pi * np.arange(12) / 12.0:
+            yield stem[:2] + 0.5 * (max(low, 2.0) + high) * np.array([np.cos(azimuth), np.sin(azimuth)])
+
+
+def detections(
+    cloud: Cloud, full: Array, partial: Array, *, noise: float, places: Iterable[Array]
+) -> Iterator[Detection]:
+    """Yield the detector's results for scanners at these places (2,)."""
     detector = TrunkDetectorConfig(
         azimuth_step=2.0 * np.pi / SCANNER.columns,
         elevation_step=SCANNER.elevation / SCANNER.rows,
         range_noise=noise,
     )
-    for x in np.arange(low[0] + 1.0, high[0] - 0.5, step):
-        for y in np.arange(low[1] + 1.0, high[1] - 0.5, step):
-            if obstacles.query([x, y])[0] < 0.6:
-                continue
-            eye = np.array([x, y, cloud.ground(np.array([x, y])) + _EYE])
-            points = virtual_scan(cloud, eye, SCANNER)
-            trunks, outlined = (
-                detect_trunks(points - eye + [0.0, 0.0, _EYE], each, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
-                for each in (detector, replace(detector, outline=_OUTLINE))
-            )
-            yield _judged(points, eye, trunks, outlined, full, partial)
+    for place in places:
+        eye = np.array([*place, cloud.ground(place) + _EYE])
+        points = virtual_scan(cloud, eye, SCANNER)
+        trunks, outlined = (
+            detect_trunks(points - eye + [0.0, 0.0, _EYE], each, p_HoLo_H=np.array([0.0, 0.0, _EYE]))
+            for each in (detector, replace(detector, outline=_OUTLINE))
+        )
+        yield _judged(points, eye, trunks, outlined, full, partial)
 
 
 def _judged(
@@ -365,7 +381,15 @@ def cloud_results(folder: Path) -> Iterator[tuple[str, Array, list[Detection]]]:
             cloud = Cloud.read(folder / path)
             full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
             step = 2.0 if np.ptp(cloud.points[:, 0]) < 15.0 else 4.0
-            yield name, full, list(detections(cloud, full, partial, noise=noise, step=step))
+            yield name, full, list(detections(cloud, full, partial, noise=noise, places=grid(cloud, step)))
+
+
+def alone_results(folder: Path) -> Iterator[tuple[str, list[Detection]]]:
+    """Yield the name and the results of each cloud of a single tree."""
+    for name, path in ALONE.items():
+        cloud = Cloud.read(folder / path)
+        full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
+        yield name, list(detections(cloud, full, partial, noise=_NOISE, places=around(full[0])))
 
 
 @click.command()
@@ -374,7 +398,8 @@ def main(folder: Path) -> None:
     """Locate real scans on real maps, and detect trunks in real clouds, of FOLDER."""
     print(table(FIELD_HEADER, list(field_rows(folder))), "\n")
     results = list(cloud_results(folder))
-    print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, _, scans in results]), "\n")
+    alone = list(alone_results(folder))
+    print(table(CLOUD_HEADER, [cloud_row(name, scans) for name, *_, scans in [*results, *alone]]), "\n")
     rows = [row for name, full, scans in results for row in outline_rows(name, full, scans)]
     print(table(OUTLINE_HEADER, rows), "\n")
     print(table(CHAIN_HEADER, [chain_row(name, full, scans) for name, full, scans in results]))

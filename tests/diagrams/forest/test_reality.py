@@ -7,8 +7,10 @@ from tests.real import recordings
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake_diagrams.forest.reality import (
     airborne,
+    around,
     detections,
     disagreement,
+    grid,
     halves,
     petawawa,
     rioja_map,
@@ -62,8 +64,21 @@ def test_trunks_are_found_among_branches() -> None:
     cloud = Cloud.read(path)
     full, partial = rings(cloud), rings(cloud, arc=PARTIAL, fewest=8)
     assert len(full) == 15
-    results = list(detections(cloud, full, partial, noise=0.02, step=2.0))
+    results = list(detections(cloud, full, partial, noise=0.02, places=grid(cloud, 2.0)))
     right = np.concatenate([each.right for each in results])
     assert len(right) >= 30 and right.mean() > 0.8
     assert sum(len(each.false) for each in results) <= 1
     assert np.median(np.vstack([each.errors for each in results])[:, 0]) < 0.05
+
+
+@pytest.mark.slow
+def test_pine_that_had_no_part_in_the_constants_is_found_from_all_sides() -> None:
+    pytest.importorskip("laspy")
+    (path,) = recordings("treels/pine.laz")
+    cloud = Cloud.read(path)
+    full = rings(cloud)
+    assert len(full) == 1
+    results = list(detections(cloud, full, full, noise=0.02, places=list(around(full[0]))[::4]))
+    assert len(results) == 12
+    assert all(each.right.tolist() == [True] and not each.false.size and not each.beside.size for each in results)
+    assert np.abs(np.vstack([each.errors for each in results])).max() < 0.05
