@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, nan
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +30,9 @@ _log = logging.getLogger(__name__)
 
 # Innovations are called coloured, or a hold-out worse, beyond these; tests of significance reject any real model.
 COLOURED, WORSE = 0.2, 1.3
-_ITERATIONS, _CONVERGED = 25, 1e-3
-# The noise is fitted again, at the new parameters, until its logarithms change by less; so many rounds at most.
-_NOISE_CHANGE, _NOISE_ROUNDS = 0.1, 4
+# The last iteration moves the parameters by less than this share of their standard deviations.
+_ITERATIONS, _CONVERGED = 25, 0.1
+_NOISE_SEGMENTS = 12
 _BLOCK = 0.2  # s, of the sandwich estimator
 # A discrete plant steps by its own step, so that a position that is missing is a gap.
 _LONGEST = 1.5
@@ -198,18 +197,36 @@ def information(
     scenario: Scenario,
     logs: Log | Sequence[Log],
     parameters: Sequence[Parameter] = (),
-    **options: Any,
+    *,
+    inertias: Sequence[Inertia] = (),
+    position: str,
+    torque: str,
+    measured_torque: bool = False,
+    period: float | None = None,
+    segment: float = 1.0,
+    noise: Noise | None = None,
 ) -> Information:
     """Return what recordings, measured or simulated, can tell about parameters.
 
     It is that of the likeliest noise, or of the noise that is given, at the parameters that fit all segments best:
-    deviations by the model alone, without verdicts. The arguments are those of `calibrate`, but for ``holdout``.
+    deviations by the model alone, without verdicts. The arguments are those of `calibrate`.
 
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
     with _one_thread():
-        prepared = _Prepared(scenario, logs, parameters, **options)
+        prepared = _Prepared(
+            scenario,
+            logs,
+            parameters,
+            inertias=inertias,
+            position=position,
+            torque=torque,
+            measured_torque=measured_torque,
+            period=period,
+            segment=segment,
+            noise=noise,
+        )
         z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
         return prepared.information(noise, z)
 
@@ -235,13 +252,13 @@ class _Prepared:
         logs: Log | Sequence[Log],
         parameters: Sequence[Parameter],
         *,
-        inertias: Sequence[Inertia] = (),
+        inertias: Sequence[Inertia],
         position: str,
         torque: str,
-        measured_torque: bool = False,
-        period: float | None = None,
-        segment: float = 1.0,
-        noise: Noise | None = None,
+        measured_torque: bool,
+        period: float | None,
+        segment: float,
+        noise: Noise | None,
     ) -> None:
         logs = [logs] if isinstance(logs, Log) else list(logs)
         if not (parameters or inertias):
@@ -266,25 +283,23 @@ class _Prepared:
         for remark in self.remarks:
             _log.warning("%s", remark)
         self.segments = Segments(model, recordings, duration=segment)
-        self.z = fit.z
-        self._rounds = 1 if noise else _NOISE_ROUNDS
-        try:
-            guess = Noise.guess(recordings, fit.unexplained)
-            self.noise = noise or self.segments.likeliest_noise(self.z, guess)
-            self._first = self.information(self.noise, self.z)
-        except CalibrationError as error:
-            raise CalibrationError(". ".join([str(error), *self.doubts])) from error
+        self._some = Segments(model, recordings, duration=segment, most=_NOISE_SEGMENTS)
+        self._start = fit.z
+        self._noise = noise
+        self._guess = Noise.guess(recordings, fit.unexplained)
 
     def converged(self, used: NDArray[np.bool]) -> tuple[Array, Noise]:
-        """Return the parameters that fit the segments best, and the likeliest noise."""
-        z, noise = self.z, self.noise
-        for _ in range(self._rounds - 1):
-            # Until then, the noise holds the errors of the start, too.
-            z = _gauss_newton(self.segments, noise, z, used)
-            noise, before = self.segments.likeliest_noise(z, noise), noise
-            if noise.change(before) < _NOISE_CHANGE:
-                break
-        return _gauss_newton(self.segments, noise, z, used), noise
+        """Return the parameters that fit the chosen segments best, and the likeliest noise.
+
+        The noise is that of some segments, beside the parameters that fit these best.
+        """
+        try:
+            z, noise = self._start, self._noise
+            if noise is None:
+                z, noise = _gauss_newton(self._some, z, self._guess, fits_noise=True)
+            return _gauss_newton(self.segments, z, noise, used)
+        except CalibrationError as error:
+            raise CalibrationError(". ".join([str(error), *self.doubts])) from error
 
     def information(self, noise: Noise, z: Array) -> Information:
         """Return what the recordings tell with this noise, at these parameters."""
@@ -297,9 +312,6 @@ class _Prepared:
         Raises:
             CalibrationError: A parameter changes nothing.
         """
-        scalars = set(self.model.names[: self.model.scalars])
-        if nothing := [name for name in self._first.nothing if name in scalars]:
-            raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
         held_back = kept_back(self.segments.count, holdout)
         z, noise = self.converged(~held_back)
         return _result(scenario, self, noise, z, held_back)
@@ -313,20 +325,38 @@ def kept_back(count: int, share: float) -> NDArray[np.bool]:
     return held_back
 
 
-def _gauss_newton(segments: Segments, noise: Noise, z: Array, used: NDArray[np.bool]) -> Array:
-    """Return the parameters that minimize the whitened innovations, for this noise."""
+def _gauss_newton(
+    segments: Segments,
+    z: Array,
+    noise: Noise,
+    used: NDArray[np.bool] | slice = slice(None),
+    *,
+    fits_noise: bool = False,
+) -> tuple[Array, Noise]:
+    """Return the parameters that minimize the whitened innovations of the used segments, and the noise.
+
+    Args:
+        segments: The segments, whose trajectories become the filtered ones.
+        z: The parameters to begin with.
+        noise: The noise, or where to begin.
+        used: The segments that count.
+        fits_noise: Take the likeliest noise at the parameters of each iteration.
+    """
     model = segments.model
     for _ in range(_ITERATIONS):
-        innovations = segments.innovations(noise, segments.linearized(z))
+        linearized = segments.linearized(z)
+        if fits_noise:
+            noise = segments.likeliest_noise(linearized, noise)
+        innovations = segments.innovations(noise, linearized)
         segments.trajectory = innovations.states
         J = innovations.slopes[:, used].reshape(-1, len(z)) * model.scales
+        gradient = J.T @ innovations.white[:, used].ravel()
         # Innovations are measured - expected: their derivatives have the other sign than the step.
-        step = bounded_step(model, z, J.T @ J, J.T @ innovations.white[:, used].ravel())
-        moved = np.clip(z - step, model.lower, model.upper) - z
+        moved = np.clip(z - bounded_step(model, z, J.T @ J, gradient), model.lower, model.upper) - z
         z = z + moved
-        if np.max(abs(moved) / model.scales) < _CONVERGED:
+        if -gradient @ (moved / model.scales) < _CONVERGED**2:
             break
-    return z
+    return z, noise
 
 
 def _result(
@@ -338,6 +368,8 @@ def _result(
     fit, holdout = (_rms(white[:, part]) for part in (used, held_back))
     J = innovations.slopes[:, used].reshape(-1, len(z))
     info = information_of(J, model.names, model.scales)
+    if nothing := [name for name in info.nothing if name in model.names[: model.scalars]]:
+        raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
     sandwich = _sandwich(segments, innovations, used, info)
     gradient = (J * model.scales).T @ white[:, used].ravel()
     bounds = _Bounds(model, z, gradient, info, np.diag(sandwich))

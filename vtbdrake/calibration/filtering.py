@@ -17,11 +17,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import ceil, inf
 from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
-import scipy.optimize
+import scipy.linalg
 import scipy.signal
 from numpy.typing import NDArray
 
@@ -35,7 +36,9 @@ from vtbdrake.recording.table_reader import GAP
 _ON_GRID = 0.05
 # The least number of samples, and the number of samples of a local polynomial of third order.
 _FEWEST, _SMOOTHED = 50, 15
-_NOISE_SEGMENTS = 12
+# Of the search for the likeliest noise: its iterations, the least gain of log L that is worth another, and the largest
+# change of a logarithm in one.
+_SCORINGS, _GAIN, _FARTHEST = 30, 0.1, 2.0
 # Commands with less jitter than this share of their period come by a clock.
 _REGULAR = 0.2
 _LEAST = 1e-9  # of a deviation, in rad or m
@@ -138,10 +141,30 @@ class Noise:
         measurement = np.sqrt(np.mean(differences**2, axis=0) / 70.0)
         return cls(np.maximum(measurement, _LEAST), np.maximum(np.std(unexplained, axis=0), 1e-6), 0.05)
 
-    def change(self, before: Noise) -> float:
-        """Return the largest change of the logarithm of a deviation."""
-        deviations = [np.concatenate([noise.measurement, noise.torque]) for noise in (self, before)]
-        return float(np.max(abs(np.log(deviations[0] / deviations[1]))))
+    @property
+    def logs(self) -> Array:
+        """Return the logarithms of all numbers in their order, (2 nq + 1,)."""
+        return np.log([*self.measurement, *self.torque, self.correlation_time])
+
+    @classmethod
+    def of_logs(cls, logs: Array) -> Noise:
+        """Return the noise of logarithms; the inverse of `logs`."""
+        n = len(logs) // 2
+        return cls(np.exp(logs[:n]), np.exp(logs[n : 2 * n]), float(np.exp(logs[-1])))
+
+
+class Likelihood(NamedTuple):
+    """The likelihood L of a noise; derivatives are those by its `Noise.logs`.
+
+    Attributes:
+        log: log L, but for a constant.
+        gradient: Of log L, (2 nq + 1,).
+        information: What the recordings tell, (2 nq + 1, 2 nq + 1).
+    """
+
+    log: float
+    gradient: Array
+    information: Array
 
 
 class Linearization(NamedTuple):
@@ -166,13 +189,11 @@ class Innovations(NamedTuple):
     Attributes:
         white: (N, W, nq), of unit variance.
         slopes: By the parameters, (N, W, nq, nz).
-        log_determinant: Sum of the logarithms of the determinants of their covariances.
         states: The filtered states, (N + 1, W, 2 nq).
     """
 
     white: Array
     slopes: Array
-    log_determinant: float
     states: Array
 
 
@@ -198,22 +219,22 @@ def stale(commands: Series, times: Array) -> NDArray[np.bool]:
     return np.asarray(times - commands.times[np.maximum(newest, 0)] > GAP * period)
 
 
-class _Update(NamedTuple):
-    """What the filter has done with a measurement, for W segments.
+class _Pass(NamedTuple):
+    """The filter along W segments of N steps.
 
     Attributes:
-        gain: Kalman gain, (W, 3 nq, nq).
-        inverse: L^-1 of the covariance L L' of the innovations, (W, nq, nq).
-        white: The whitened innovations, (W, nq).
-        mean: The state after it, relative to the trajectory, (W, 3 nq).
-        P: Its covariance, (W, 3 nq, 3 nq).
+        rest: Measured - expected positions, and their derivatives by the parameters, (N, W, nq, 1 + nz).
+        whitening: L^-1 of their covariance L L', (N, W, nq, nq).
+        gain: Kalman gain, (N, W, 3 nq, nq).
+        means: The state after the measurement, relative to the trajectory, (N, W, 3 nq).
+        shared: Covariance of the state before the measurement with the disturbances, (N, W, 3 nq, nq).
     """
 
+    rest: Array
+    whitening: Array
     gain: Array
-    inverse: Array
-    white: Array
-    mean: Array
-    P: Array
+    means: Array
+    shared: Array
 
 
 class Segments:
@@ -223,6 +244,7 @@ class Segments:
         model: The model.
         recordings: The recordings, with the same period.
         duration: Of a segment, in s.
+        most: About the largest number of segments: then some all over the recordings are taken.
 
     Attributes:
         model: The model.
@@ -232,7 +254,9 @@ class Segments:
         trajectory: The trajectory x, (N + 1, W, 2 nq).
     """
 
-    def __init__(self, model: JointModel, recordings: Sequence[JointRecording], *, duration: float) -> None:
+    def __init__(
+        self, model: JointModel, recordings: Sequence[JointRecording], *, duration: float, most: int | None = None
+    ) -> None:
         self.model = model
         self.period = float(np.median([recording.period for recording in recordings]))
         for recording in recordings:
@@ -252,11 +276,12 @@ class Segments:
         shortest = min(len(recording.times) for recording in recordings) - 1
         self.steps = min(max(round(duration / self.period), _FEWEST), shortest)
         self._recordings = tuple(recordings)
-        self._pieces = [
+        pieces = [
             (i, slice(k, k + self.steps + 1))
             for i, recording in enumerate(recordings)
             for k in range(0, len(recording.times) - self.steps, self.steps)
         ]
+        self._pieces = pieces[:: ceil(len(pieces) / (most or len(pieces)))]
         self.count = len(self._pieces)
         smoothed = [np.hstack(recording.smoothed()[:2]) for recording in recordings]
         self.trajectory = np.stack([smoothed[i][span] for i, span in self._pieces], axis=1)
@@ -304,56 +329,47 @@ class Segments:
             slopes[..., index] += np.einsum("twij,twj->twi", by_m, by[:, :, k])
         return Linearization(A, by_m @ self.model.selection.T, following[..., 0] - self.trajectory[1:], slopes.copy())
 
-    def innovations(
-        self,
-        noise: Noise,
-        model: Linearization,
-        *,
-        selection: slice = slice(None),
-        updates: list[_Update] | None = None,
-    ) -> Innovations:
-        """Return the innovations of the chosen segments; each update is appended to ``updates``, if that is given."""
+    def innovations(self, noise: Noise, model: Linearization) -> Innovations:
+        """Return the innovations of all segments."""
+        passed = self._filtered(noise, model)
+        white = passed.whitening @ passed.rest
+        states = self.trajectory.copy()
+        states[1:] += passed.means[:, :, : states.shape[2]]
+        return Innovations(white[..., 0], white[..., 1:], states)
+
+    def _filtered(self, noise: Noise, model: Linearization) -> _Pass:
         n = self.model.nq
-        A, B, defects, slopes = (part[:, selection] for part in model)
-        trajectory, q = self.trajectory[:, selection], self._q[:, selection]
+        A, B, defects, slopes = model
         N, W, nz = len(A), A.shape[1], slopes.shape[3]
         F, Q, P = self._start(noise, W)
         variance = noise.measurement**2
         # The state, relative to the trajectory, and its derivatives by the parameters, side by side.
         X = np.zeros((W, 3 * n, 1 + nz))
-        white, by_z = np.empty((N, W, n)), np.empty((N, W, n, nz))
-        states = np.empty((N + 1, W, 2 * n))
-        states[0] = trajectory[0]
-        log_determinant = 0.0
+        rest, means, whitening = np.zeros((N, W, n, 1 + nz)), np.empty((N, W, 3 * n)), np.empty((N, W, n, n))
+        rest[..., 0] = (self._q - self.trajectory[:, :, :n])[1:]
+        gain, shared = np.empty((N, W, 3 * n, n)), np.empty((N, W, 3 * n, n))
         for k in range(N):
             F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
             X = F @ X
             X[:, : 2 * n, 0] += defects[k]
             X[:, : 2 * n, 1:] += slopes[k]
             P = F @ P @ F.mT + Q
+            shared[k] = P[:, :, 2 * n :]
             try:
-                L = np.linalg.cholesky(P[:, :n, :n] + np.diag(variance))
+                inverse = whitening[k] = np.linalg.inv(np.linalg.cholesky(P[:, :n, :n] + np.diag(variance)))
             except np.linalg.LinAlgError:
                 raise CalibrationError(
                     "the model runs away from the recordings within a step, for the parameters that fit their torques "
                     "best: another machine, other units, or ranges of the parameters that are too wide"
                 ) from None
-            inverse = np.linalg.inv(L)
-            # Of the innovations: measured - expected.
-            rest = -X[:, :n]
-            rest[:, :, 0] += q[k + 1] - trajectory[k + 1, :, :n]
-            innovation = inverse @ rest
-            gain = P[:, :, :n] @ inverse.mT @ inverse
-            X += gain @ rest
+            K = gain[k] = P[:, :, :n] @ inverse.mT @ inverse
+            rest[k] -= X[:, :n]
+            X += K @ rest[k]
+            means[k] = X[:, :, 0]
             # Joseph's form: P stays positive, also where positions are all but exact.
-            P -= gain @ P[:, :n]
-            P += (gain * variance - P[:, :, :n]) @ gain.mT
-            white[k], by_z[k] = innovation[:, :, 0], innovation[:, :, 1:]
-            log_determinant += 2.0 * float(np.log(np.einsum("wii->wi", L)).sum())
-            states[k + 1] = trajectory[k + 1] + X[:, : 2 * n, 0]
-            if updates is not None:
-                updates.append(_Update(gain, inverse, white[k], X[:, :, 0].copy(), P.copy()))
-        return Innovations(white, by_z, log_determinant, states)
+            P -= K @ P[:, :n]
+            P += (K * variance - P[:, :, :n]) @ K.mT
+        return _Pass(rest, whitening, gain, means, shared)
 
     def _start(self, noise: Noise, count: int) -> tuple[Array, Array, Array]:
         """Return the transition F (W, ...) but for A and B, its noise Q and the covariance P (W, ...) at the start."""
@@ -366,72 +382,102 @@ class Segments:
         variances = [noise.measurement**2, (noise.measurement / self.period) ** 2, noise.torque**2]
         return F, Q, np.tile(np.diag(np.concatenate(variances)), (count, 1, 1))
 
-    def unlikelihood(
-        self, noise: Noise, model: Linearization, *, selection: slice = slice(None)
-    ) -> tuple[float, Array]:
-        """Return -2 log of the likelihood but for a constant, and its gradient (2 nq + 1,).
+    def likelihood(self, noise: Noise, model: Linearization) -> Likelihood:
+        """Return the likelihood of a noise.
 
-        The gradient is that by the logarithms of the noise's deviations of measurement and torque, and of its
-        correlation time: one pass backwards gives the derivatives r and (r r' - N) / 2 of the likelihood by means and
-        covariances (S. J. Koopman and N. Shephard, "Exact score for time series models in state space form",
-        Biometrika 79, 1992).
+        One pass backwards gives the derivatives r and (r r' - M) / 2 of log L by means and covariances (S. J. Koopman
+        and N. Shephard, "Exact score for time series models in state space form", Biometrika 79, 1992). With V the
+        covariance of all positions, e their deviation from the mean, and V_i the derivative of V by a number of the
+        noise, the filter whitens V_i V^-1 e, too. The products of these columns are twice the average of the
+        observed and the expected information (A. R. Gilmour, R. Thompson and B. R. Cullis, "Average information
+        REML", Biometrics 51, 1995).
         """
-        n, updates = self.model.nq, list[_Update]()
+        n = self.model.nq
         model = model._replace(slopes=model.slopes[..., :0])
-        innovations = self.innovations(noise, model, selection=selection, updates=updates)
-        A, B = model.A[:, selection], model.B[:, selection]
-        F, _, P_start = self._start(noise, A.shape[1])
-        r, N = np.zeros(F.shape[:2]), np.zeros_like(F)
-        by_R, by_Q, by_decay = np.zeros(n), np.zeros(n), 0.0
-        start = _Update(*(np.empty(0),) * 3, np.zeros(F.shape[:2]), P_start)
-        for k in range(len(A) - 1, -1, -1):
-            gain, inverse, white, _, _ = updates[k]
-            information = inverse.mT @ inverse
-            score = np.einsum("wji,wj->wi", inverse, white)
-            u = score - np.einsum("wji,wj->wi", gain, r)
-            by_R += 0.5 * (u**2 - np.einsum("wii->wi", information + gain.mT @ N @ gain)).sum(axis=0)
-            # Before the measurement.
-            r[:, :n] += u
-            N[:, :n] -= gain.mT @ N
-            N[:, :, :n] -= N @ gain
-            N[:, :n, :n] += information
-            slope = r[:, 2 * n :, np.newaxis] * r[:, np.newaxis] - N[:, 2 * n :]
-            by_Q += 0.5 * np.einsum("wii->i", slope[:, :, 2 * n :])
-            # Before the step.
+        rest, whitening, gain, means, shared = self._filtered(noise, model)
+        information = whitening.mT @ whitening
+        score = information @ rest
+        A, B = model.A, model.B
+        N, W = A.shape[:2]
+        F, _, _ = self._start(noise, W)
+        r, M = np.zeros((W, 3 * n, 1)), np.zeros_like(F)
+        # Those by each measurement, and by each state before it.
+        u, D = np.empty_like(score), np.empty_like(information)
+        r_before, M_before = np.empty((N, W, 3 * n, 1)), np.empty((N, W, 3 * n, n))
+        for k in range(N - 1, -1, -1):
+            K = gain[k]
+            KM = K.mT @ M
+            u[k] = score[k] - K.mT @ r
+            D[k] = information[k] + KM @ K
+            r[:, :n] += u[k]
+            M[:, :n] -= KM
+            M[:, :, :n] -= M @ K
+            M[:, :n, :n] += information[k]
+            r_before[k], M_before[k] = r, M[:, :, 2 * n :]
             F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
-            before = updates[k - 1] if k else start
-            by_decay += np.einsum("wi,wi->", r[:, 2 * n :], before.mean[:, 2 * n :])
-            by_decay += np.einsum("wij,wji->", slope, F @ before.P[:, :, 2 * n :])
-            r, N = np.einsum("wji,wj->wi", F, r), F.mT @ N @ F
-        by_start = 0.5 * (r**2 - np.einsum("wii->wi", N)).sum(axis=0)
-        decay, torque = np.exp(-self.period / noise.correlation_time), noise.torque**2
-        by_decay -= 2.0 * decay * float(torque @ by_Q)
+            r, M = F.mT @ r, F.mT @ M @ F
+        # Of log L by the variances of measurement, start and what drives the disturbances.
+        by_R, by_start = (
+            0.5 * (vector[..., 0] ** 2 - np.einsum("...ii->...i", matrix)).reshape(-1, vector.shape[-2]).sum(axis=0)
+            for vector, matrix in ((u, D), (r, M))
+        )
+        slope = r_before @ r_before[:, :, 2 * n :].mT - M_before
+        by_Q = 0.5 * np.einsum("kwii->i", slope[:, :, 2 * n :])
+        decay, variance, torque = np.exp(-self.period / noise.correlation_time), noise.measurement**2, noise.torque**2
+        # The covariance before the measurement holds decay times that by which the slope is multiplied, and Q.
+        by_decay = decay * np.einsum("kwi,kwi->", r_before[1:, :, 2 * n :, 0], means[:-1, :, 2 * n :])
+        by_decay += np.einsum("kwij,kwij->", slope, shared) - 2.0 * float(torque @ by_Q)
         gradient = np.concatenate(
             [
-                2.0 * noise.measurement**2 * (by_R + by_start[:n] + by_start[n : 2 * n] / self.period**2),
+                2.0 * variance * (by_R + by_start[:n] + by_start[n : 2 * n] / self.period**2),
                 2.0 * torque * ((1.0 - decay**2) * by_Q + by_start[2 * n :]),
-                [by_decay * decay * self.period / noise.correlation_time],
+                [by_decay * self.period / noise.correlation_time],
             ]
         )
-        return float((innovations.white**2).sum()) + innovations.log_determinant, -2.0 * gradient
+        # V_i V^-1 e: positions and velocities at the start, disturbances in each step, and errors of measurement.
+        joints = np.arange(n)
+        X, columns = np.zeros((W, 3 * n, 2 * n + 1)), np.zeros((N, W, n, 2 * n + 1))
+        X[:, joints, joints] = -2.0 * variance * r[:, :n, 0]
+        X[:, n + joints, joints] = -2.0 * variance * r[:, n : 2 * n, 0] / self.period**2
+        columns[..., joints, joints] = 2.0 * variance * u[..., 0]
+        lags = scipy.linalg.toeplitz(np.arange(N)) * self.period / noise.correlation_time
+        forces = torque * (B.mT @ r_before[:, :, : 2 * n])[..., 0]
+        by_torque = 2.0 * np.tensordot(np.exp(-lags), forces, 1)
+        by_time = np.tensordot(lags * np.exp(-lags), forces, 1)
+        for k in range(N):
+            F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
+            X = F @ X
+            X[:, : 2 * n, n : 2 * n] -= B[k] * by_torque[k, :, np.newaxis]
+            X[:, : 2 * n, 2 * n :] -= B[k] @ by_time[k, :, :, np.newaxis]
+            columns[k] -= X[:, :n]
+            X += gain[k] @ columns[k]
+        white = (whitening @ columns).reshape(-1, 2 * n + 1)
+        log = float(np.log(np.einsum("kwii->kwi", whitening)).sum() - 0.5 * (rest * score).sum())
+        return Likelihood(log, gradient, 0.5 * white.T @ white)
 
-    def likeliest_noise(self, z: Array, guess: Noise) -> Noise:
-        """Return the noise of the largest likelihood, in some segments all over the recordings."""
+    def likeliest_noise(self, model: Linearization, guess: Noise) -> Noise:
+        """Return the noise of the largest likelihood, by Fisher scoring (with the average information)."""
         n = self.model.nq
-        selection = slice(0, None, max(self.count // _NOISE_SEGMENTS, 1))
-        model = self.linearized(z)
-
-        def noise_of(logs: Array) -> Noise:
-            return Noise(np.exp(logs[:n]), np.exp(logs[n : 2 * n]), float(np.exp(logs[-1])))
-
-        def unlikelihood(logs: Array) -> tuple[float, Array]:
-            return self.unlikelihood(noise_of(logs), model, selection=selection)
-
-        start = np.log([*guess.measurement, *guess.torque, guess.correlation_time])
-        widths = np.array([3.0] * n + [6.0] * n)
-        bounds = [(max(s - w, np.log(_LEAST)), s + w) for s, w in zip(start[:-1], widths, strict=True)]
         # Correlated for a period at least, for a segment at most.
-        bounds.append((np.log(self.period), np.log(self.period * self.steps)))
-        options = {"maxiter": 15}
-        fit = scipy.optimize.minimize(unlikelihood, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-        return noise_of(fit.x)
+        lower = np.log([_LEAST] * (2 * n) + [self.period])
+        upper = np.array([inf] * (2 * n) + [np.log(self.period * self.steps)])
+        logs = np.clip(guess.logs, lower, upper)
+        best = self.likelihood(Noise.of_logs(logs), model)
+        for _ in range(_SCORINGS):
+            g = best.gradient
+            free = ~(((logs <= lower) & (g < 0.0)) | ((logs >= upper) & (g > 0.0)))
+            step = np.zeros(2 * n + 1)
+            # A number that the recordings hardly tell moves little: as if it were known to a factor of e.
+            H = best.information[np.ix_(free, free)] + np.eye(free.sum())
+            step[free] = np.linalg.solve(H, g[free])
+            step = np.clip(logs + step / max(1.0, abs(step).max() / _FARTHEST), lower, upper) - logs
+            if g @ step < _GAIN:
+                break
+            trial = self.likelihood(Noise.of_logs(logs + step), model)
+            while trial.log < best.log:
+                step = 0.5 * step
+                if g @ step < _GAIN:
+                    return Noise.of_logs(logs)
+                trial = self.likelihood(Noise.of_logs(logs + step), model)
+            logs, best = logs + step, trial
+        return Noise.of_logs(logs)
