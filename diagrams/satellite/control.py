@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import hypot
+from types import SimpleNamespace
 
+import casadi
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
-from vtbdrake.components.perception.estimate import cross_matrix, rotation_vector
+from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state import AddressedSystem, Quantity
-from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
-from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
+from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative, gripper_errors
 from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Guidance, Mode, stopping_speed
 
 # Share of their opening from which on the fingers release the bar.
@@ -111,13 +113,15 @@ class ArmController(AddressedSystem):
         self._settings = self.declare_parameters(
             **{name: Quantity(value, unit, (0.0, most)) for name, (value, unit, most) in settings.items()}
         )
+        self._following = _following(tuple(settings))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         T = self._period
         p, memory = self._settings.view(context), self._memory.mutable(state)
-        guidance = Guidance.of(self._guidance.Eval(context))
-        relative, measured = Relative.of(self._relative.Eval(context)), self._joints.Eval(context)
+        instructions = self._guidance.Eval(context)
+        guidance = Guidance.of(instructions)
+        relative, measured = Relative(self._relative.Eval(context)), self._joints.Eval(context)
         command, q, before = self._command.array(context), measured[:ARM_JOINTS], memory.joint_rate_command.copy()
         mode = guidance.mode
         if mode == Mode.ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
@@ -128,8 +132,8 @@ class ArmController(AddressedSystem):
             else:
                 rates = (self._stowed - command[:ARM_JOINTS]).clip(-0.5 * p.joint_rate, 0.5 * p.joint_rate)
         elif guidance.follows:
-            twist = self._twist(relative, guidance, p)
-            rates = self._rates.value((q, twist, [p.posture_gain, p.damping])).copy()
+            settings = self._settings.array(context)
+            rates = self._following.value((relative.vector, instructions, settings, q)).copy()
         elif mode in (Mode.RETREAT, Mode.HOLD, Mode.ABORT):
             rates = before * np.exp(-T / max(p.brake_time, T))
         else:
@@ -172,24 +176,24 @@ class ArmController(AddressedSystem):
         has = unchanged + share * change
         return before + share * (rates - before), has, (has - had) / self._period
 
-    @staticmethod
-    def _twist(relative: Relative, guidance: Guidance, p: NamedView) -> Array:
-        """Return V_BG as it should be, [angular; linear] in B."""
-        axis = relative.R_BH[:, 2]
-        offset = -guidance.distance * axis
-        R_BD = guidance.turned(relative.R_BH)
-        e_p = relative.p_BH + offset - relative.p_BG
-        e_R = rotation_vector(R_BD @ relative.R_BG.T)
-        v_BD = relative.v_BH + cross_matrix(relative.w_BH) @ offset - guidance.rate * axis
-        distance = hypot(*e_p.tolist())
-        speed = stopping_speed(distance, gain=p.position_gain, acceleration=p.acceleration)
-        v = min(p.speed, speed) * e_p / max(distance, 1e-9)
-        return np.concatenate((relative.w_BH + _limited(p.orientation_gain * e_R, p.turn_rate), v_BD + v))
 
-
-def _limited(vector: Array, length: float) -> Array:
-    norm = hypot(*vector.tolist())
-    return vector if norm <= length else vector * (length / norm)
+@lru_cache
+def _following(settings: tuple[str, ...]) -> Kernel:
+    """Return the rates of the joints while the gripper follows, as a kernel of (relative, guidance, settings, q)."""
+    relative, guidance = casadi.SX.sym("relative", RELATIVE), casadi.SX.sym("guidance", GUIDANCE)
+    values, q = casadi.SX.sym("settings", len(settings)), casadi.SX.sym("q", ARM_JOINTS)
+    p = SimpleNamespace(**dict(zip(settings, casadi.vertsplit(values), strict=True)))
+    _, _, distance, rate, _, flip = casadi.vertsplit(guidance)
+    axis, w_BH, v_BH = relative[4:11:3], relative[14:17], relative[17:20]
+    e_p, e_R = gripper_errors(relative, distance, flip)
+    v_BD = v_BH - casadi.cross(w_BH, distance * axis) - rate * axis
+    length = casadi.norm_2(e_p)
+    speed = casadi.fmin(p.speed, stopping_speed(length, gain=p.position_gain, acceleration=p.acceleration))
+    turn = p.orientation_gain * e_R
+    turn *= casadi.fmin(1, p.turn_rate / casadi.fmax(casadi.norm_2(turn), 1e-9))
+    V_BG = casadi.vertcat(w_BH + turn, v_BD + speed * e_p / casadi.fmax(length, 1e-9))
+    rates = joint_rates().expression([q, V_BG, casadi.vertcat(p.posture_gain, p.damping)])
+    return Kernel("following", [relative, guidance, values, q], casadi.densify(rates), compile=False)
 
 
 class AttitudeController(AddressedSystem):

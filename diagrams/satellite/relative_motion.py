@@ -11,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.casadi_system.rotations import rotation_vector
 from vtbdrake.state import AddressedSystem
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target
 from vtbdrake_diagrams.satellite.estimation import BASE, rotated, turned
@@ -28,27 +29,82 @@ class Relative:
     """The grapple fixture H and the gripper G, seen from the base B; all in B.
 
     Attributes:
-        age: Age of the newest estimate of the target, in s.
-        valid: Whether the target is tracked.
-        R_BH, p_BH: Orientation (3, 3) and position (3,) in m of the fixture.
-        w_BH, v_BH: Its angular velocity (rad/s) and the velocity of its origin (m/s) against the base, (3,) each.
-        R_BG, p_BG: Orientation (3, 3) and position (3,) in m of the gripper.
+        vector: All numbers, shape (`RELATIVE`,).
     """
 
-    age: float
-    valid: bool
-    R_BH: Array
-    p_BH: Array
-    w_BH: Array
-    v_BH: Array
-    R_BG: Array
-    p_BG: Array
+    vector: Array
 
-    @staticmethod
-    def of(x: Array) -> Relative:
-        """Return what is in a vector of shape (`RELATIVE`,)."""
-        R_BH, R_BG = x[2:11].reshape(3, 3), x[20:29].reshape(3, 3)
-        return Relative(float(x[0]), x[1] > 0.5, R_BH, x[11:14], x[14:17], x[17:20], R_BG, x[29:32])
+    @property
+    def age(self) -> float:
+        """The age of the newest estimate of the target, in s."""
+        return self.vector.item(0)
+
+    @property
+    def valid(self) -> bool:
+        """Whether the target is tracked."""
+        return self.vector.item(1) > 0.5
+
+    @property
+    def R_BH(self) -> Array:
+        """The orientation of the fixture, (3, 3)."""
+        return self.vector[2:11].reshape(3, 3)
+
+    @property
+    def p_BH(self) -> Array:
+        """The position of the fixture, (3,) in m."""
+        return self.vector[11:14]
+
+    @property
+    def w_BH(self) -> Array:
+        """The angular velocity of the fixture against the base, (3,) in rad/s."""
+        return self.vector[14:17]
+
+    @property
+    def v_BH(self) -> Array:
+        """The velocity of the fixture's origin against the base, (3,) in m/s."""
+        return self.vector[17:20]
+
+    @property
+    def R_BG(self) -> Array:
+        """The orientation of the gripper, (3, 3)."""
+        return self.vector[20:29].reshape(3, 3)
+
+    @property
+    def p_BG(self) -> Array:
+        """The position of the gripper, (3,) in m."""
+        return self.vector[29:32]
+
+    def errors(self, distance: float, flip: float) -> tuple[float, float]:
+        """Return by how far (m) and by which angle (rad) the gripper is off the place D before the fixture.
+
+        Args:
+            distance: From D to the fixture, along its z axis, in m.
+            flip: 1 if the gripper is to be turned by pi about that axis, else 0.
+        """
+        length, angle = _lengths().value((self.vector, np.array([distance, flip]))).tolist()
+        return length, angle
+
+
+def gripper_errors(relative: casadi.SX, distance: casadi.SX, flip: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+    """Return the errors of the gripper's position (m) and orientation (rotation vector, rad), in B.
+
+    Args:
+        relative: The numbers of a `Relative`.
+        distance: As in `Relative.errors`.
+        flip: As in `Relative.errors`.
+    """
+    R_BH, R_BG = (casadi.reshape(numbers, 3, 3).T for numbers in (relative[2:11], relative[20:29]))
+    turn = casadi.if_else(flip > 0.5, -1, 1)
+    R_BD = casadi.horzcat(turn * R_BH[:, 0], turn * R_BH[:, 1], R_BH[:, 2])
+    return relative[11:14] - distance * R_BH[:, 2] - relative[29:32], rotation_vector(R_BD @ R_BG.T)
+
+
+@lru_cache
+def _lengths() -> Kernel:
+    """Return the lengths of the `gripper_errors` as a kernel of (relative, [distance, flip])."""
+    relative, place = casadi.SX.sym("relative", RELATIVE), casadi.SX.sym("place", 2)
+    lengths = (casadi.norm_2(error) for error in gripper_errors(relative, place[0], place[1]))
+    return Kernel("gripper_errors", [relative, place], casadi.vertcat(*lengths), compile=False)
 
 
 class RelativeMotion(AddressedSystem):
@@ -73,6 +129,7 @@ class RelativeMotion(AddressedSystem):
         super().__init__()
         self._period = period
         self._kernel = _relative(period)
+        _lengths()  # Made before threads use it: CasADi's expressions are not for several threads.
         self._base = self.DeclareVectorInputPort("base", BASE)
         self._target = self.DeclareVectorInputPort("target", 13)
         self._status = self.DeclareVectorInputPort("status", 4)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from math import exp, hypot
+from typing import Any
 
+import casadi
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
-from vtbdrake.components.perception.estimate import rotation_vector
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
@@ -67,7 +68,6 @@ GO, STAY, STOP = 1.0, 0.0, -1.0
 
 # Time constant of the low-pass filter of the arm's positions, in s.
 _SMOOTHING = 0.5
-_HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 GUIDANCE = 6
 """Size of a `Guidance` as a vector."""
@@ -93,10 +93,6 @@ class Guidance:
     opening: float
     flip: bool
 
-    def turned(self, R_BH: Array) -> Array:
-        """Return R_BD, the orientation that the gripper is to have at a fixture of the orientation R_BH."""
-        return R_BH * _HALF_TURN if self.flip else R_BH
-
     @staticmethod
     def of(vector: Array) -> Guidance:
         """Return the guidance that is in a vector of shape (`GUIDANCE`,)."""
@@ -104,18 +100,19 @@ class Guidance:
         return Guidance(mode, follows > 0.5, distance, rate, opening, flip > 0.5)
 
 
-def stopping_speed(distance: float, *, gain: float, acceleration: float) -> float:
+def stopping_speed(distance: Any, *, gain: Any, acceleration: Any) -> Any:
     r"""Return the speed at a distance from the goal from which the brakes still stop there.
 
     It is gain d up to d = a / gain^2, and beyond that sqrt(2 a (d - a / (2 gain^2))): a constant deceleration a.
 
     Args:
-        distance: The distance d, not negative.
+        distance: The distance d, not negative; numbers, or expressions of CasADi.
         gain: The rate at which the distance shrinks near the goal, in 1/s.
         acceleration: The deceleration a.
     """
-    knee = acceleration / max(gain**2, 1e-12)
-    return gain * distance if distance <= knee else float(np.sqrt(2.0 * acceleration * (distance - 0.5 * knee)))
+    knee = acceleration / casadi.fmax(gain**2, 1e-12)
+    near = casadi.fmin(distance, knee)
+    return casadi.sqrt((gain * near) ** 2 + 2.0 * acceleration * (distance - near))
 
 
 def _all_below(values: Array, limit: float) -> bool:
@@ -236,7 +233,7 @@ class Supervisor(AddressedSystem):
         T = self._period
         p, last, memory = self._settings.view(context), self._instructions.view(context), self._memory.view(context)
         mode = last.mode
-        relative = Relative.of(self._relative.Eval(context))
+        relative = Relative(self._relative.Eval(context))
         joints = self._joints.Eval(context)
         arm, fingers = joints[:ARM_JOINTS], joints[ARM_JOINTS:]
         behind = arm - self._smooth.array(context)
@@ -294,7 +291,7 @@ class Supervisor(AddressedSystem):
     def _steer(self, step: _Step, relative: Relative, rate: float, p: NamedView) -> None:
         """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
         T = self._period
-        error, angle = self._errors(relative, step.distance, step.flip)
+        error, angle = relative.errors(step.distance, step.flip)
         close = error < p.position_tolerance and angle < p.orientation_tolerance
         lasts = self._lasts(step, close)
         if step.mode == Mode.APPROACH:
@@ -342,10 +339,3 @@ class Supervisor(AddressedSystem):
         wrist = relative.p_BH - self._wrist * relative.R_BH[:, 2]
         far = hypot(*(wrist - self._shoulder).tolist()) > p.reach
         return far or relative.R_BH[0, 2] < np.cos(p.largest_angle)
-
-    def _errors(self, relative: Relative, distance: float, flip: float) -> tuple[float, float]:
-        """Return by how far (m) and by which angle (rad) the gripper is off."""
-        R_BD = Guidance(0.0, True, distance, 0.0, 0.0, flip > 0.5).turned(relative.R_BH)
-        offset = relative.p_BH - distance * relative.R_BH[:, 2] - relative.p_BG
-        turn = rotation_vector(R_BD @ relative.R_BG.T)
-        return hypot(*offset.tolist()), hypot(*turn.tolist())

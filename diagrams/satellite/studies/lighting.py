@@ -201,7 +201,7 @@ def bar_error(record: Mapping[str, Any]) -> float:
     """
     base, target, relative = (record[address][-1] for address in RECORDED)
     X_BT = pose_from_array(base).InvertAndCompose(pose_from_array(target))
-    return float(np.linalg.norm(X_BT @ Target().X_TH.translation() - Relative.of(relative).p_BH))
+    return float(np.linalg.norm(X_BT @ Target().X_TH.translation() - Relative(relative).p_BH))
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
@@ -53,7 +55,7 @@ def test_agrees_with_the_plant() -> None:
     }
     for name, value in values.items():
         system.GetInputPort(name).FixValue(own, value)
-    seen = Relative.of(system.get_output_port().Eval(own))
+    seen = Relative(system.get_output_port().Eval(own))
     # Move the plant's base on by a small step, as Drake integrates it.
     steps = 1000
     plant.SetPositionsAndVelocities(later, np.concatenate((q, v)))
@@ -88,3 +90,18 @@ def test_joint_rates_give_the_velocity() -> None:
     columns = [plant.GetJointByName(name).velocity_start() for name in JOINT_NAMES[:7]]
     J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, G, np.zeros(3), B, B)[:, columns]
     np.testing.assert_allclose(J @ joint_rates().value((q, wanted, [0.3, 0.0])), wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("flip", [0.0, 1.0])
+def test_errors_of_the_gripper_are_those_of_its_pose(flip: float) -> None:
+    X_BH, X_HD = RigidTransform(RollPitchYaw(0.4, -0.7, 1.9), [1.9, 0.1, -0.2]), RigidTransform([0.0, 0.0, -0.25])
+    if flip:
+        X_HD = X_HD @ RigidTransform(RotationMatrix.MakeZRotation(np.pi))
+    X_DG = RigidTransform(RollPitchYaw(0.02, -0.1, 0.05), [0.01, -0.02, 0.03])
+    X_BG = X_BH @ X_HD @ X_DG
+    poses = [(X.rotation().matrix().ravel(), X.translation()) for X in (X_BH, X_BG)]
+    relative = np.concatenate([[0.0, 1.0], *poses[0], np.zeros(6), *poses[1]])
+    angle = X_DG.rotation().ToAngleAxis().angle()
+    assert Relative(relative).errors(0.25, flip) == pytest.approx(
+        (np.linalg.norm(X_DG.translation()), angle), abs=1e-12
+    )

@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.casadi_system.rotations import exponential, quaternion, roll_pitch_yaw
 from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
     PoseEstimate,
@@ -244,8 +245,8 @@ def _turned() -> Kernel:
     f = _Flight()
     (_, R_start, _, w_start, _, _), (R, w, A, B), h = f.start(), f.end(), f.conditions[1]
     L, eye = f.inertia(R_start) @ w_start, casadi.SX.eye(3)
-    K = f.inertia(_exponential(0.5 * h * w) @ R, inverse=True)  # in the middle of the step
-    R = _exponential(h * (K @ L)) @ R
+    K = f.inertia(exponential(0.5 * h * w) @ R, inverse=True)  # in the middle of the step
+    R = exponential(h * (K @ L)) @ R
     M = h * K @ casadi.skew(L)
     E = eye + M + M @ M @ (eye / 2 + M / 6)
     B = E @ B + h * (eye + M / 2 + M @ M / 6) @ K
@@ -279,45 +280,12 @@ def _present() -> Kernel:
     """Return what `MotionModel.present` returns."""
     f = _Flight()
     (_, _, _, _, v, P), (R, w, _, _), p, dt = f.start(), f.end(), f.position(), f.duration()
-    q = _quaternion(R)
     variances, shared = casadi.diag(P), casadi.diag(P[:6, 6:])
     pose = variances[:6] + 2 * dt * shared + dt**2 * variances[6:]
     deviations = [
         casadi.sqrt((casadi.sum1(pose[3 * k : 3 * k + 3]) + f.conditions[2 + k] * dt**3) / 3) for k in range(2)
     ]
-    return f.kernel("present", q, p, w, v, p, _roll_pitch_yaw(q, R), *deviations)
-
-
-def _exponential(theta: casadi.SX) -> casadi.SX:
-    """Return exp([θ]×), as `rotation_matrix` does."""
-    angle = casadi.fmax(casadi.norm_2(theta), 1e-150)
-    K = casadi.skew(theta)
-    return casadi.SX.eye(3) + casadi.sin(angle) / angle * K + 2 * (casadi.sin(angle / 2) / angle) ** 2 * K @ K
-
-
-def _quaternion(R: casadi.SX) -> casadi.SX:
-    """Return the unit quaternion (w, x, y, z) of R, by the largest of its numbers; w is not negative."""
-    trace = casadi.trace(R)
-    # Rows of 4 q q', each in proportion to q.
-    squares = [1 + trace, *(1 + 2 * R[k, k] - trace for k in range(3))]
-    spin = casadi.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
-    rows = [casadi.vertcat(squares[0], spin)]
-    for k in range(3):
-        rows.append(casadi.vertcat(spin[k], *(squares[1 + k] if j == k else R[j, k] + R[k, j] for j in range(3))))
-    row, largest = rows[0], squares[0]
-    for other, square in zip(rows[1:], squares[1:], strict=True):
-        row, largest = casadi.if_else(square > largest, other, row), casadi.fmax(largest, square)
-    return casadi.if_else(row[0] < 0, -row, row) / casadi.norm_2(row)
-
-
-def _roll_pitch_yaw(q: casadi.SX, R: casadi.SX) -> casadi.SX:
-    """Return the angles of R as Drake's RollPitchYaw does, exact also where the pitch is near a right angle."""
-    w, x, y, z = casadi.vertsplit(q)
-    pitch = casadi.atan2(-R[2, 0], casadi.sqrt((R[0, 0] ** 2 + R[1, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2) / 2))
-    half_sum, half_difference = casadi.atan2(x + z, w - y), casadi.atan2(z - x, w + y)
-    angles = casadi.vertcat(half_sum - half_difference, half_sum + half_difference)
-    angles -= 2 * np.pi * casadi.sign(angles) * (casadi.fabs(angles) > np.pi)
-    return casadi.vertcat(angles[0], pitch, angles[1])
+    return f.kernel("present", quaternion(R), p, w, v, p, roll_pitch_yaw(R), *deviations)
 
 
 def _matrix(numbers: casadi.SX) -> casadi.SX:
