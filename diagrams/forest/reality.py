@@ -16,12 +16,12 @@ from typing import Any
 import click
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment, minimize_scalar
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
 from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
-from vtbdrake.components.estimation import chi_square_quantile, squared_distances
+from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotation
@@ -220,7 +220,7 @@ def _judged(
     shown = np.array([_is_shown(points, eye, stem) for stem in full], dtype=bool)
     places = trunks.positions + eye[:2]
     apart = np.linalg.norm(full[:, None, :2] - places[None], axis=2)
-    stem, detection = linear_sum_assignment(np.minimum(apart, 1.0))
+    stem, detection = one_to_one(1.0 - apart)
     near = apart[stem, detection] < _RIGHT
     stem, detection = stem[near], detection[near]
     right = np.zeros(len(full), dtype=bool)

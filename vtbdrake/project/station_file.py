@@ -23,7 +23,6 @@ class StationArm:
     """An arm of a station: a model with an `IiwaDriver`."""
 
     name: str
-    takes_positions: bool  # else it takes torques on top of its gravity compensation
     home: tuple[float, ...]  # rad
     away: tuple[float, ...]  # another posture, for examples
 
@@ -75,13 +74,13 @@ def read_station(source: str) -> StationFile:
     plant = builder.plant
     assert plant is not None
     arms = []
-    for name, driver in drivers.items():
+    for name in drivers:
         _check_identifier(name, source)
         limits = station.joint_limits(name)
         home = np.clip(plant.GetDefaultPositions(plant.GetModelInstanceByName(name)), limits.lower, limits.upper)
         end = np.where(limits.upper - home > home - limits.lower, limits.upper, limits.lower)
         away = home + np.sign(end - home) * np.minimum(0.15 * np.abs(end - home), 0.2)
-        arms.append(StationArm(name, "position" in driver.control_mode, _rounded(home), _rounded(away)))
+        arms.append(StationArm(name, _rounded(home), _rounded(away)))
     grippers = {}
     for name, driver in station.model_drivers.items():
         if isinstance(driver, SchunkWsgDriver):
