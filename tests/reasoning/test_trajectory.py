@@ -144,6 +144,7 @@ def test_it_expands_into_parameters_of_its_plan() -> None:
     plan = Trajectory("dps.plan", 2, 1.0, "linear", size=2, lower=[-1.0, -2.0], upper=3.0)
     expected = [Parameter(f"dps.plan[{k}]", lower, 3.0) for k, lower in enumerate([-1.0, -2.0, -1.0, -2.0], 1)]
     assert list(plan.parameters) == expected
+    assert plan.begin_address == "dps.plan[0]"
     np.testing.assert_array_equal(plan.plan([[1.0, 2.0], [3.0, 0.0]], 7.5), [7.5, 1.0, 2.0, 3.0, 0.0])
 
 

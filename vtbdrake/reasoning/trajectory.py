@@ -106,6 +106,11 @@ class Trajectory:
         ranges = self._limits[:2].T.tolist() * self.spline.knots
         return tuple(Parameter(f"{self.address}[{1 + k}]", *ends) for k, ends in enumerate(ranges))
 
+    @property
+    def begin_address(self) -> str:
+        """Return the address of t_begin."""
+        return f"{self.address}[0]"
+
     @cached_property
     def _has_only_range(self) -> bool:
         """Return whether neither rate nor acceleration is limited."""
