@@ -88,6 +88,23 @@ def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, al
     assert all(results[i].identical(expected[i]) for i in (0, 2, 3, 4, 5))
 
 
+def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, tmp_path, caplog):
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+    points = [{SHOULDER: 0.01 * i, GAIN: 0.0} for i in range(24)]
+    with SerialExecutor() as serial:
+        expected = dict(serial.run(task, points))
+    points[5][GAIN] = KILL
+    with ProcessExecutor(1) as executor:
+        results, most = _watched(executor, task, points)
+    assert most > 5
+    (record,) = caplog.records
+    assert record.getMessage().startswith("rollout 5 is tried again")
+    assert len(results) == 24
+    assert all(results[i].identical(expected[i]) for i in range(24) if i != 5)
+
+
 def test_rollouts_that_kill_their_workers_have_two_tries_each(always, tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()

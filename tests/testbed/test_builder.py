@@ -251,6 +251,8 @@ def test_a_rule_sets_several_variables(by):
 
 
 def test_a_rule_has_a_value_for_each_of_its_targets():
+    with pytest.raises(ValueError, match="at least one variable"):
+        _believing([])
     testbed = _believing([f"sim.sense.y.value[{k}]" for k in range(2)], by=lambda estimate: estimate[:1]).build()
     with pytest.raises(ValueError, match="has 1 values for 2 targets"):
         testbed.start_from_belief(testbed.default_context())

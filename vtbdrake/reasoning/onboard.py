@@ -178,7 +178,10 @@ class OnboardReasoner(SlowPart):
         """Return the equations of the part of a mental copy; see `VirtualTestbed.compiled`."""
         # Imported here: without it, a reasoner needs no CasADi.
         from vtbdrake.compiled.components import CandidateEquations
+        from vtbdrake.compiled.equations import refusal
 
+        if type(self) is not OnboardReasoner:
+            raise refusal(self, "may do something else than an OnboardReasoner, from which it is derived")
         return CandidateEquations(self, context, varied)
 
     @property

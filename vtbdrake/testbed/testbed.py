@@ -54,6 +54,8 @@ class BeliefRule:
     period: float | None = None
 
     def __post_init__(self) -> None:
+        if not self.targets:
+            raise ValueError("a belief sets at least one variable of the simulated world, but no target is given")
         if not 0.0 <= as_number(f"the age of the belief about {self.target}", self.age) < inf:
             raise ValueError(f"the age of the belief about {self.target} is a time of at least 0 s, not {self.age!r}")
         if self.by is not None and not callable(self.by):
