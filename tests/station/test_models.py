@@ -56,6 +56,7 @@ def test_measured_values_are_plausible_as_fast_and_strong_as_a_gripper_is() -> N
     assert (velocity.lower, velocity.upper) == (-10.0, 10.0)
     # A force has no sign; ten times that of both fingers is impossible.
     assert (force.lower, force.upper) == (0.0, 10.0 * 160.0)
+    assert {velocity.max_age, force.max_age, sense["wsg_position_measured"].max_age} == {10 * 0.05}  # ten messages
 
 
 def test_commands_have_the_limits_of_the_models_file() -> None:

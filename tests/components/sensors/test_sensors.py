@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddContactMaterial,
@@ -85,6 +86,26 @@ def test_imu_that_resumes_goes_on_as_the_one_before(w_WB: list[float]) -> None:
         for simulator in (running, resumed):
             simulator.AdvanceTo(end)
         np.testing.assert_allclose(reading(imu, resumed), reading(imu, running), atol=2e-3)
+
+
+@pytest.mark.parametrize("k", range(12))
+def test_imu_turns_alike_in_all_orientations(k: int) -> None:
+    """Half a turn about axes between two others: of the orientation's quaternion, two entries are large."""
+    builder, plant = free_body()
+    plant.Finalize()
+    imu = Imu(plant, plant.GetFrameByName("F"), period=PERIOD)
+    simulator = Simulator(add(builder, plant, imu))
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    axis = np.roll([0.9239, 0.3827 * (-1.0) ** k, 0.0], k // 2)[:: 1 if k < 6 else -1]
+    R_WF, w_W = RotationMatrix(AngleAxis(np.pi, axis / np.linalg.norm(axis))), np.array([0.02, -0.01, 0.03])
+    body = plant.GetBodyByName("body")
+    plant.SetFreeBodyPose(context, body, RigidTransform(R_WF @ X_BF.rotation().inverse(), [0.0, 0.0, 0.0]))
+    plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity(w_W, [0.0, 0.0, 0.0]))
+    simulator.AdvanceTo(2.5 * PERIOD)
+    measured = reading(imu, simulator)
+    np.testing.assert_allclose(measured[:3], R_WF.matrix().T @ w_W, atol=1e-6)
+    # The centre of the ball falls, and the sensor turns about it, as slowly.
+    assert np.abs(measured[3:]).max() < 2e-3
 
 
 def arm(*, angle: float, rate: float = 0.0, discrete: bool = False) -> tuple[DiagramBuilder, MultibodyPlant]:

@@ -71,9 +71,11 @@ def test_status_tells_switches_ages_and_faults(hub: Hub) -> None:
         rig.bridge.sensors = lambda now: {}
         rig.until(lambda: bool(rig.runtime.guards.latched))
         latched = [fault.reason for fault in rig.runtime.guards.latched]
+        for reason in ("one more", "and one more"):
+            rig.runtime.guards.latch(reason, rig.runtime.clock.now(), {})
         status = rig.during(asked, hub.url, "status")
         assert status.latched == latched
-        assert latched[0] in [reason for reason, _ in status.faults]
+        assert [reason for reason, _ in status.faults[:3]] == ["and one more", "one more", latched[-1]]
         assert all(age >= 0.0 for _, age in status.faults)
         assert max(status.ages.values()) > 2 * PERIOD
 
