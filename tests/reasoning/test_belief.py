@@ -354,6 +354,23 @@ def test_an_estimate_past_a_stop_is_clipped_or_refused(tracked):
         to_start.start(Belief.of(testbed, context))
 
 
+@dataclass
+class WeighedScenario(TrackedScenario):
+    """The estimate of the angle is taken for the mass of the arm, too, which has a lower bound alone."""
+
+    def add_world(self, builder):
+        super().add_world(builder)
+        builder.believe(ARM_MASS, of=["dps.angle"])
+
+
+def test_an_estimate_beyond_a_bound_without_an_opposite_one_is_refused():
+    testbed = WeighedScenario().build()
+    context = testbed.default_context()
+    testbed.write(context, {"dps.angle": -0.01})
+    with pytest.raises(BeliefError, match=r"mass is -0.01 kg, .* must lie in \[0, inf\]"):
+        BeliefToStart(testbed).start(Belief.of(testbed, context))
+
+
 def test_an_old_belief_is_refused(tracked):
     testbed, context, mental = tracked
     belief, to_start = Belief.of(testbed, context), BeliefToStart(mental, max_age=0.1)
