@@ -14,7 +14,7 @@ from vtbdrake.calibration import JointModel, JointRecording, Noise, calibrate, i
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.calibration.filtering import Likelihood, Segments
 from vtbdrake.calibration.fisher import information_of
-from vtbdrake.calibration.inverse_dynamics import UNDETERMINED, directions_of
+from vtbdrake.calibration.inverse_dynamics import directions_of
 from vtbdrake.optimization import Parameter
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 
@@ -201,11 +201,10 @@ def test_interval_at_a_bound_is_the_profile_of_the_likelihood() -> None:
     assert f"{DRIVES}.viscous" in VISCOUS
 
 
-def test_direction_is_determined_to_a_part_of_its_scale() -> None:
-    """Information is the inverse of a variance: a deviation of 0.95 of the limit is determined, one of 1.05 is not."""
-    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    H = turn @ np.diag((UNDETERMINED * np.array([1.05, 0.95])) ** -2.0) @ turn.T
+def test_direction_is_determined_to_half_of_its_scale() -> None:
+    turn, deviations = np.array([[0.6, -0.8], [0.8, 0.6]]), np.array([0.51, 0.49])
+    H = turn @ np.diag(deviations**-2.0) @ turn.T
     values, directions, is_determined = directions_of(H)
     assert is_determined.tolist() == [False, True]
-    assert values == pytest.approx((UNDETERMINED * np.array([1.05, 0.95])) ** -2.0)
+    assert values == pytest.approx(deviations**-2.0)
     assert np.abs(directions) == pytest.approx(np.abs(turn))

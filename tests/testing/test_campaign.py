@@ -97,6 +97,7 @@ def test_a_campaign_counts_what_its_rollouts_do(tmp_path: Path) -> None:
     run_campaign(path)
     reported = results(path)
     assert not reported["met"] and reported["complete"] and reported["seeds"] == [3, 10]
+    assert reported["conditions"] == STATED["conditions"]
     numbers = {(r["condition"], r["seed"]): r["values"] for r in reported["rollouts"]}
     assert len(numbers) == 24
     cells = {(cell["condition"], cell["criterion"]): cell for cell in reported["cells"]}
