@@ -161,6 +161,12 @@ def test_derivatives_of_the_innovations_are_those_of_differences() -> None:
         ({"log": "two"}, "position has 2 entries, the model 1: other joints?"),
         ({"log": "short"}, "20 positions with a torque are too few"),
         ({"log": "other"}, "are no multiple of the plant's time step"),
+        (
+            {"noise": Noise(np.zeros(1), np.ones(1), 0.05)},
+            "positive deviations of the positions, .*measurement=array.*0",
+        ),
+        ({"noise": Noise(np.ones(2), np.ones(2), 0.05)}, "for each of 1 joints"),
+        ({"noise": Noise(np.ones(1), np.ones(1), -0.05)}, "correlation time, .*correlation_time=-0.05"),
     ],
 )
 def test_what_does_not_fit_is_refused(change: dict[str, object], message: str) -> None:

@@ -80,6 +80,21 @@ def test_columns_in_another_order_unit_or_sign_are_refused(
         of_double_pendulum(with_columns(log, change))
 
 
+def test_positions_and_torques_that_are_exchanged_are_refused() -> None:
+    with pytest.raises(CalibrationError, match="with positions and torques exchanged"):
+        calibrated(with_columns(pendulum_log(), lambda q, u: (u, q)))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e9, "ns")])
+def test_times_in_another_unit_are_refused(factor: float, unit: str) -> None:
+    log = pendulum_log()
+    sides = (
+        {name: Series(factor * each.times, each.values) for name, each in side.items()} for side in (log.sense, log.act)
+    )
+    with pytest.raises(CalibrationError, match=f"with times that are {unit}"):
+        calibrated(Log(log.source, *sides))
+
+
 def test_double_pendulum_as_it_is_recorded_is_accepted() -> None:
     result = of_double_pendulum(double_pendulum_log())
     assert result.accepted and not result.remarks, result

@@ -270,6 +270,8 @@ class _Prepared:
                 raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
         self.testbed = scenario.build()
         self.model = model = JointModel(self.testbed, parameters, inertias, measured_torque=measured_torque)
+        if noise is not None:
+            noise.check(model.nq)
         self.logs = {log.source: log.digest for log in logs}
         whole = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
         longest = _LONGEST if model.step_size > 0.0 else GAP

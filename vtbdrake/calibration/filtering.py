@@ -141,6 +141,17 @@ class Noise:
         measurement = np.sqrt(np.mean(differences**2, axis=0) / 70.0)
         return cls(np.maximum(measurement, _LEAST), np.maximum(np.std(unexplained, axis=0), 1e-6), 0.05)
 
+    def check(self, joints: int) -> None:
+        """Refuse a noise that no recording of so many joints can have."""
+        sizes = {np.shape(self.measurement), np.shape(self.torque)}
+        if sizes != {(joints,)} or not (
+            np.min(self.measurement) > 0.0 and np.min(self.torque) >= 0.0 and 0.0 < self.correlation_time < inf
+        ):
+            raise CalibrationError(
+                f"a noise has, for each of {joints} joints, positive deviations of the positions, none below 0 of the "
+                f"torques, and a positive correlation time, not {self}"
+            )
+
     @property
     def logs(self) -> Array:
         """Return the logarithms of all numbers in their order, (2 nq + 1,)."""

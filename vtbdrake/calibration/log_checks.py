@@ -234,6 +234,10 @@ def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording
         yield "the other sign of all positions", of(by_q=-1.0)
     for factor, text in ((1e-3, "1000 times too large"), (1e3, "1000 times too small")):
         yield f"torques that are {text}", of(by_u=factor)
+    for factor, text in ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")):
+        yield f"times that are {text}", _in_seconds(factor)
+    if model.nu == model.nq:
+        yield "positions and torques exchanged", lambda each: replace(each, q=each.u, u=each.q)
     if model.nq <= _MOST_SWAPPED:
         for pair in combinations(range(model.nq), 2):
             yield f"positions {pair[0]} and {pair[1]} exchanged", of(q=_exchanged(model.nq, *pair))
@@ -241,6 +245,10 @@ def _readings(model: JointModel) -> Iterator[tuple[str, Callable[[JointRecording
                 order = _exchanged(model.nq, *pair)
                 yield f"torques {pair[0]} and {pair[1]} exchanged", of(u=order)
                 yield f"joints {pair[0]} and {pair[1]} exchanged", of(q=order, u=order)
+
+
+def _in_seconds(unit: float) -> Callable[[JointRecording], JointRecording]:
+    return lambda each: replace(each, times=unit * each.times)
 
 
 def _exchanged(size: int, i: int, j: int) -> list[int]:
