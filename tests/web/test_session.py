@@ -145,6 +145,9 @@ def test_other_branch_goes_on_with_its_own_changes() -> None:
                 session.write({MASS: 0.4})  # in what becomes the other branch
             session.advance(2)
             frame(session, lambda shown, k=k: shown.history[1] == 2 * (k + 1) * STEP)
+        session.seek(-1.0)  # The oldest state is the one that is nearest.
+        session.wait_for_frame(session.latest.number, PATIENCE)
+        assert session.latest.time == 0.0
         session.seek(10 * STEP)
         assert frame(session, lambda shown: shown.time == 10 * STEP).comparison is None
         session.write({ANGLE: 1.0})
