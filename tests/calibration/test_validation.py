@@ -105,6 +105,8 @@ def test_verdict_names_what_is_exceeded() -> None:
     still = judged(np.full(TIMES.size, 0.1))  # What cannot be computed is no success.
     assert [reason.split()[0] for reason in still.signals["q"].beyond] == ["rmse", "largest", "delay", "magnitude"]
     assert str(late).startswith("run.csv: beyond tolerances\n")
+    course, _ = late.plot().axes  # One signal: its course, and the residuals beside it.
+    assert [text.get_text() for text in course.get_legend().get_texts()] == ["recorded", "simulated"]
 
 
 @needs_chromium

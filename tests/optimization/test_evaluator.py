@@ -254,6 +254,13 @@ def test_one_failed_simulation_leaves_a_point_without_value():
     assert evaluations[a].failed and not evaluations[a].feasible
 
 
+def test_racing_drops_failed_points_before_there_is_a_best_one():
+    points = [(0.1,), (0.2,)]
+    table = {(a, c): outcome(0.2) if c else outcome(np.nan, end="failed") for a in points for c in range(40)}
+    evaluations, rollouts = evaluated(problem(40, "worst"), table, [points], racing=True)
+    assert all(evaluations[a].failed for a in points) and rollouts < 20
+
+
 def test_equal_points_are_evaluated_once():
     a = (0.25,)
     runs: list = []

@@ -57,7 +57,7 @@ def test_poses_values_and_switches_are_those_of_the_loop(hub: Hub) -> None:
 def test_layers_of_a_loop_are_those_that_poses_tell(hub: Hub) -> None:
     with LoopSession(SatelliteScenario(), hub.url) as session:
         assert dict(session.layers) == {"cameras": "camera frusta"}
-        assert session.cameras == ()
+        assert session.cameras == () and session.latest.history == (0.0, 0.0)
         with pytest.raises(LayerError, match="no layer 'forces'"):
             session.show("me", ["forces"])
         session.show("me", ["cameras"])
