@@ -21,7 +21,7 @@ from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 from vtbdrake_diagrams.manipulator.studies.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
 
-SECONDS = 20.0
+SECONDS = 60.0
 """The duration of the recording, in seconds."""
 WINDOW = 200
 """Steps of a rollout of MuJoCo's: longer ones run away from the recording."""
