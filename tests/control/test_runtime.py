@@ -2,12 +2,14 @@
 
 import signal
 import threading
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, PassThrough
 
-from tests.control.scripted import PERIOD, ScriptedBridge, ServoScenario
+from tests.control.scripted import PERIOD, ScriptedBridge, Servo, ServoScenario
 from vtbdrake.child_process import ending_signals
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import FallbackController, Silence, Zero
@@ -411,6 +413,46 @@ def test_discontinuous_command_is_refused():
     runtime.switch("real")
     runtime.run(cycles=1)
     assert np.abs(sent(bridge)[0]).max() <= 2.0 * PERIOD * (1 + 1e-9), "it departs from what is measured"
+
+
+@dataclass
+class LitScenario(ServoScenario):
+    """The servo with a lamp, whose commands may jump."""
+
+    def interface(self):
+        interface = super().interface()
+        return replace(interface, act=[Signal("lamp", size=1, unit="V", idle=0.0), *interface.act])
+
+    def make_dps(self):
+        dps = DiagramBuilder()
+        servo = dps.AddNamedSystem("servo", Servo())
+        for name in ("position", "speed", "target"):
+            dps.ExportInput(servo.GetInputPort(name), name)
+        dps.ExportOutput(servo.GetOutputPort("velocity"), "velocity")
+        dps.ExportOutput(dps.AddNamedSystem("lamp", ConstantVectorSource([12.0])).get_output_port(), "lamp")
+        return dps.Build()
+
+    def add_world(self, builder):
+        builder.sim_actuator("lamp", builder.add("act", "lamp", PassThrough(1)).get_input_port())
+        axes = builder.add("sys", "axes", ConstantVectorSource([0.05, 0.0]))
+        builder.sim_sensor("position", axes.get_output_port())
+        builder.sim_sensor("speed", builder.add("sys", "rest", ConstantVectorSource([0.0, 0.0])).get_output_port())
+        builder.sim_actuator("velocity", builder.add("act", "drives", PassThrough(2)).get_input_port())
+
+
+def test_signal_after_one_that_may_jump_is_compared():
+    scenario, clock = LitScenario(), SimulatedClock()
+    testbed = scenario.build()
+    bridge = ScriptedBridge(scenario.interface(), clock, still)
+    continuity = {"lamp": None, "velocity": ("speed", 0.1)}
+    runtime = Runtime(testbed, bridge, period=PERIOD, clock=clock, continuity=continuity)
+    testbed.write(runtime.context, {"u.target": TARGET})
+    runtime.cycle()
+    with pytest.raises(SwitchRefusedError, match="velocity.* away from speed"):
+        runtime.switch("real")
+    runtime.switch(act={"lamp": "real"})
+    runtime.cycle()
+    assert bridge.sent[-1][1] == {"lamp": [12.0]}
 
 
 def test_largest_difference_may_differ_by_entry():
