@@ -417,11 +417,11 @@ def test_discontinuous_command_is_refused():
 
 @dataclass
 class LitScenario(ServoScenario):
-    """The servo with a lamp, whose commands may jump."""
+    """The servo with two lamps."""
 
     def interface(self):
         interface = super().interface()
-        return replace(interface, act=[Signal("lamp", size=1, unit="V", idle=0.0), *interface.act])
+        return replace(interface, act=[Signal("lamp", size=2, unit="V", idle=0.0), *interface.act])
 
     def make_dps(self):
         dps = DiagramBuilder()
@@ -429,30 +429,44 @@ class LitScenario(ServoScenario):
         for name in ("position", "speed", "target"):
             dps.ExportInput(servo.GetInputPort(name), name)
         dps.ExportOutput(servo.GetOutputPort("velocity"), "velocity")
-        dps.ExportOutput(dps.AddNamedSystem("lamp", ConstantVectorSource([12.0])).get_output_port(), "lamp")
+        dps.ExportOutput(dps.AddNamedSystem("lamp", ConstantVectorSource([12.0, 5.0])).get_output_port(), "lamp")
         return dps.Build()
 
     def add_world(self, builder):
-        builder.sim_actuator("lamp", builder.add("act", "lamp", PassThrough(1)).get_input_port())
+        builder.sim_actuator("lamp", builder.add("act", "lamp", PassThrough(2)).get_input_port())
         axes = builder.add("sys", "axes", ConstantVectorSource([0.05, 0.0]))
         builder.sim_sensor("position", axes.get_output_port())
         builder.sim_sensor("speed", builder.add("sys", "rest", ConstantVectorSource([0.0, 0.0])).get_output_port())
         builder.sim_actuator("velocity", builder.add("act", "drives", PassThrough(2)).get_input_port())
 
 
-def test_signal_after_one_that_may_jump_is_compared():
+def lit(*, sensors, continuity):
     scenario, clock = LitScenario(), SimulatedClock()
     testbed = scenario.build()
-    bridge = ScriptedBridge(scenario.interface(), clock, still)
-    continuity = {"lamp": None, "velocity": ("speed", 0.1)}
+    bridge = ScriptedBridge(scenario.interface(), clock, sensors)
     runtime = Runtime(testbed, bridge, period=PERIOD, clock=clock, continuity=continuity)
     testbed.write(runtime.context, {"u.target": TARGET})
     runtime.cycle()
+    return runtime, bridge
+
+
+def test_all_signals_that_depart_from_nothing_are_named():
+    runtime, _ = lit(
+        sensors=lambda t: {"position": [0.05, 0.0]}, continuity={"lamp": ("speed", 1.0), "velocity": ("speed", 0.1)}
+    )
+    reasons = "; ".join(runtime.prepare("real").reasons)
+    for name in ("lamp", "velocity"):
+        assert f"the actuator command {name} departs from speed, which has never been measured" in reasons
+
+
+def test_signal_after_one_that_may_jump_is_compared():
+    runtime, bridge = lit(sensors=still, continuity={"lamp": None, "velocity": ("speed", 0.1)})
     with pytest.raises(SwitchRefusedError, match="velocity.* away from speed"):
         runtime.switch("real")
     runtime.switch(act={"lamp": "real"})
     runtime.cycle()
-    assert bridge.sent[-1][1] == {"lamp": [12.0]}
+    (command,) = bridge.sent[-1][1].items()
+    assert command[0] == "lamp" and command[1].tolist() == [12.0, 5.0]
 
 
 def test_largest_difference_may_differ_by_entry():
