@@ -1,12 +1,13 @@
 """The runtime's loop in lock-step with a simulated clock: what is stepped, sent, missed, refused and survived."""
 
+import re
 import signal
 import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough
 
 from tests.control.scripted import PERIOD, ScriptedBridge, Servo, ServoScenario
@@ -415,9 +416,22 @@ def test_discontinuous_command_is_refused():
     assert np.abs(sent(bridge)[0]).max() <= 2.0 * PERIOD * (1 + 1e-9), "it departs from what is measured"
 
 
+class Broken(LeafSystem):
+    """A system whose output cannot be computed."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("y", 2, self._calc)
+
+    def _calc(self, context, output):
+        raise RuntimeError("no light")
+
+
 @dataclass
 class LitScenario(ServoScenario):
     """The servo with two lamps."""
+
+    broken: bool = False
 
     def interface(self):
         interface = super().interface()
@@ -429,7 +443,8 @@ class LitScenario(ServoScenario):
         for name in ("position", "speed", "target"):
             dps.ExportInput(servo.GetInputPort(name), name)
         dps.ExportOutput(servo.GetOutputPort("velocity"), "velocity")
-        dps.ExportOutput(dps.AddNamedSystem("lamp", ConstantVectorSource([12.0, 5.0])).get_output_port(), "lamp")
+        lamp = Broken() if self.broken else ConstantVectorSource([12.0, 5.0])
+        dps.ExportOutput(dps.AddNamedSystem("lamp", lamp).get_output_port(), "lamp")
         return dps.Build()
 
     def add_world(self, builder):
@@ -440,8 +455,8 @@ class LitScenario(ServoScenario):
         builder.sim_actuator("velocity", builder.add("act", "drives", PassThrough(2)).get_input_port())
 
 
-def lit(*, sensors, continuity):
-    scenario, clock = LitScenario(), SimulatedClock()
+def lit(*, sensors, continuity, broken=False):
+    scenario, clock = LitScenario(broken=broken), SimulatedClock()
     testbed = scenario.build()
     bridge = ScriptedBridge(scenario.interface(), clock, sensors)
     runtime = Runtime(testbed, bridge, period=PERIOD, clock=clock, continuity=continuity)
@@ -457,6 +472,12 @@ def test_all_signals_that_depart_from_nothing_are_named():
     reasons = "; ".join(runtime.prepare("real").reasons)
     for name in ("lamp", "velocity"):
         assert f"the actuator command {name} departs from speed, which has never been measured" in reasons
+
+
+def test_signal_after_one_that_cannot_be_computed_is_compared():
+    runtime, _ = lit(sensors=still, continuity={"lamp": ("speed", 1.0), "velocity": ("speed", 0.1)}, broken=True)
+    reasons = "; ".join(runtime.prepare("real").reasons)
+    assert re.search("lamp cannot be computed: RuntimeError: no light.*; the actuator command velocity", reasons)
 
 
 def test_signal_after_one_that_may_jump_is_compared():
