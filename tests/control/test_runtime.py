@@ -480,6 +480,14 @@ def test_signal_after_one_that_cannot_be_computed_is_compared():
     assert re.search("lamp cannot be computed: RuntimeError: no light.*; the actuator command velocity", reasons)
 
 
+def test_difference_that_is_just_allowed_is_no_jump():
+    for limit, reasons in (([12.0, 5.0], 0), ([12.0, 4.9], 1)):
+        runtime, _ = lit(sensors=still, continuity={"lamp": ("speed", limit)})
+        preparation = runtime.prepare(act={"lamp": "real"})
+        assert len(preparation.reasons) == reasons
+    assert re.search(r"lamp\[1\] is 5 away from speed\[1\]; 4.9 is allowed", preparation.reasons[0])
+
+
 def test_signal_after_one_that_may_jump_is_compared():
     runtime, bridge = lit(sensors=still, continuity={"lamp": None, "velocity": ("speed", 0.1)})
     with pytest.raises(SwitchRefusedError, match="velocity.* away from speed"):
