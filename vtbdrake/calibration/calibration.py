@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.arrays import Array
-from vtbdrake.calibration.filtering import Innovations, JointRecording, Noise, Segments
+from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
 from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.log_checks import check_log, check_torques
 from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError, Inertia, JointModel
-from vtbdrake.calibration.posterior import PHYSICAL, body_function
+from vtbdrake.calibration.posterior import PHYSICAL, body_function, sandwich_covariance
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log
 from vtbdrake.recording.table_reader import GAP
@@ -33,7 +33,6 @@ COLOURED, WORSE = 0.2, 1.3
 # The last iteration moves the parameters by less than this share of their standard deviations.
 _ITERATIONS, _CONVERGED = 25, 0.1
 _NOISE_SEGMENTS = 12
-_BLOCK = 0.2  # s, of the sandwich estimator
 # A discrete plant steps by its own step, so that a position that is missing is a gap.
 _LONGEST = 1.5
 # An interval of 95 %, in deviations, and its deviance; how far beyond a bound the optimum lies when it is doubted.
@@ -372,7 +371,7 @@ def _result(
     info = information_of(J, model.names, model.scales)
     if nothing := [name for name in info.nothing if name in model.names[: model.scalars]]:
         raise CalibrationError(f"these change nothing in the recordings: {', '.join(nothing)}; leave them out")
-    sandwich = _sandwich(segments, innovations, used, info)
+    sandwich = sandwich_covariance(innovations, used, segments.period, info)
     gradient = (J * model.scales).T @ white[:, used].ravel()
     bounds = _Bounds(model, z, gradient, info, np.diag(sandwich))
     correlation = _autocorrelation(white[:, used])
@@ -442,24 +441,6 @@ def calibrated_scenario(
 
 def _rms(white: Array) -> float:
     return float(np.sqrt(np.mean(white**2))) if white.size else nan
-
-
-def _sandwich(segments: Segments, innovations: Innovations, used: NDArray[np.bool], info: Information) -> Array:
-    """Return the covariance of the scaled parameters, from scores of blocks that are long against correlations."""
-    length = max(round(_BLOCK / segments.period), 10)
-    spans = [slice(k, k + length) for k in range(0, segments.steps - length + 1, length)]
-    scores = np.array(
-        [
-            np.einsum("twij,twi->wj", innovations.slopes[span][:, used], innovations.white[span][:, used])
-            for span in spans
-        ]
-    ).reshape(-1, len(info.names))
-    scores = scores * info.scales
-    inverse = info.covariance
-    sandwich = inverse @ (scores.T @ scores) @ inverse
-    # Never less than what the noise alone leaves: few blocks make a sandwich too small now and then.
-    larger = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
-    return np.asarray(sandwich * np.outer(larger, larger))
 
 
 def _start_is_as_good(segments: Segments, noise: Noise, white: Array, held_back: NDArray[np.bool]) -> bool:
