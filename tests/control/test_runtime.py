@@ -506,6 +506,14 @@ def test_largest_difference_may_differ_by_entry():
     assert "velocity[1] is 0.5 away from speed[1]; 0.4 is allowed" in refusal(runtime)
 
 
+def test_entry_that_exceeds_its_limit_most_is_named():
+    runtime, _, _ = make(continuity={"velocity": ("speed", [0.7, 0.1])})
+    runtime.cycle()
+    runtime.switch("shadow")
+    runtime.run(cycles=3)
+    assert "velocity[1] is 0.5 away from speed[1]; 0.1 is allowed" in refusal(runtime)
+
+
 def test_largest_difference_is_what_the_rate_allows_in_a_period_by_default():
     runtime, bridge, _ = make(rate=600.0, continuity={"velocity": "speed"})
     runtime.cycle()
