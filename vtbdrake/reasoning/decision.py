@@ -94,7 +94,9 @@ class Candidate:
     def spread(self) -> float:
         """Return the standard deviation of the quality over the samples; 0 for one sample."""
         values = [rollout.value for rollout in self.rollouts]
-        return float(np.std(values)) if len(values) > 1 else values[0] - values[0] if values else nan
+        if len(values) > 1:
+            return float(np.std(values))
+        return 0.0 if values and isfinite(values[0]) else nan
 
     @property
     def has_trajectory(self) -> bool:
