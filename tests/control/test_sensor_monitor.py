@@ -118,17 +118,19 @@ def test_true_samples_among_false_ones_are_accepted() -> None:
 
 @pytest.mark.parametrize(("swing", "accepted"), [(0.0, True), (0.5, False)])
 def test_steady_level_after_jump_can_be_accepted(swing: float, accepted: bool) -> None:
-    monitor = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01)
-    monitor.fault_at(0.0, received(np.zeros(2), 0.0, 1))
+    monitor, begin = SensorMonitor(signal(rate=1.0), jump_tolerance=0.01), 10.0
+    monitor.fault_at(begin, received(np.zeros(2), begin, 1))
     for k in range(2, 100):
-        monitor.fault_at(0.001 * k, received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k))
+        now = begin + 0.001 * k
+        monitor.fault_at(now, received(np.full(2, 5.0 + swing * (k % 2)), now, k))
     monitor.accept_steady()
     assert monitor.value.tolist() == [0.0, 0.0], "not yet"
     for k in range(100, 104):
-        last = received(np.full(2, 5.0 + swing * (k % 2)), 0.001 * k, k)
-        monitor.fault_at(0.001 * k, last)
+        now = begin + 0.001 * k
+        last = received(np.full(2, 5.0 + swing * (k % 2)), now, k)
+        monitor.fault_at(now, last)
     monitor.accept_steady()
-    assert (kind(monitor, 0.103, last) is None) == accepted
+    assert (kind(monitor, now, last) is None) == accepted
 
 
 def test_longer_silence_allows_a_larger_change() -> None:
@@ -161,6 +163,30 @@ def test_value_checked_against_other_bounds_is_checked_again() -> None:
     sample = ReceivedSignal(value=np.full(2, 1.5), arrived=0.0, count=1, bounds=Bounds(wide))
     assert kind(SensorMonitor(narrow), 0.0, sample) == "implausible"
     assert kind(SensorMonitor(wide), 0.0, sample) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"), [({"jump_tolerance": 0.01}, "jump"), ({"max_delay": 0.02}, "stale"), ({}, None)]
+)
+def test_jump_and_delay_are_noticed_in_values_that_the_bridge_has_checked(
+    options: dict[str, float], expected: str | None
+) -> None:
+    limited = signal(rate=1.0, upper=2.0)
+    monitor, bounds = SensorMonitor(limited, **options), Bounds(limited)
+    faults = []
+    for count, (position, sent, arrived) in enumerate([(0.0, 0.0, 0.0), (0.0, 0.01, 0.01), (1.0, 0.02, 0.06)]):
+        sample = ReceivedSignal(value=np.full(2, position), sent=sent, arrived=arrived, count=count + 1, bounds=bounds)
+        faults.append(kind(monitor, arrived, sample))
+    assert faults == [None, None, expected]
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [(np.zeros(3), "has the shape (3,) instead of (2,)"), (np.array([0.0, 2.0]), "leaves its limits: [0.0, 2.0]")],
+)
+def test_size_and_limits_are_told_apart(value: np.ndarray, reason: str) -> None:
+    fault = SensorMonitor(signal(upper=1.0)).fault_at(0.0, received(value))
+    assert fault.reason == f"sensor signal encoders {reason}"
 
 
 def delays(*samples: tuple[float, float], max_delay: float = 0.02) -> list[str | None]:
