@@ -62,8 +62,8 @@ def arm(*, actuated: tuple[int, ...] = (1, 0)) -> MultibodyPlant:
         # A positive angle lifts the link.
         joints.append(plant.AddJoint(RevoluteJoint(f"joint{i}", elbow, link.body_frame(), [0.0, -1.0, 0.0])))
         parent, offset = link.body_frame(), LENGTHS[i]
-    for i in actuated:
-        plant.AddJointActuator(f"actuator{i}", joints[i])
+    for number, i in enumerate(actuated):
+        plant.AddJointActuator(f"actuator{number}", joints[i])
     plant.Finalize()
     return plant
 
@@ -89,6 +89,10 @@ def test_weight_is_carried_at_the_last_accepted_position() -> None:
 def test_plant_whose_weight_cannot_be_carried_is_rejected() -> None:
     with pytest.raises(ValueError, match="2 positions and 1 actuators cannot be carried"):
         CarryWeight(arm(actuated=(1,)), "joint_state")
+    with pytest.raises(ValueError, match="2 positions and 2 actuators cannot be carried"):
+        CarryWeight(arm(actuated=(1, 1)), "joint_state")  # Both on one joint.
+    with pytest.raises(ValueError, match="with 0 entries of 'nothing'"):
+        chain(CarryWeight(arm(), "nothing"), TORQUE, interface=INTERFACE)
     with pytest.raises(ValueError, match="4 entries of 'joint_state'"):
         chain(CarryWeight(arm(), "joint_state"), TORQUE, interface=INTERFACE)
 
@@ -142,6 +146,14 @@ def test_cyclic_chain_ends() -> None:
 def test_brake_that_does_not_fit_is_rejected(brake: Brake) -> None:
     with pytest.raises(ValueError, match="the brake of joint_torque"):
         chain(brake, TORQUE, interface=INTERFACE)
+    with pytest.raises(ValueError, match="the brake of joint_torque"):
+        chain(CarryWeight(arm(), "joint_state", entries=slice(0, 2), brake=brake), TORQUE, interface=INTERFACE)
+
+
+def test_weight_is_carried_without_a_brake_or_with_one_that_fits() -> None:
+    for brake in (None, Brake("joint_state", gain=0.0, entries=slice(2, 4))):
+        carry = CarryWeight(arm(), "joint_state", entries=slice(0, 2), brake=brake)
+        assert [type(fallback) for fallback in chain(carry, TORQUE, interface=INTERFACE)] == [CarryWeight, Silence]
 
 
 def test_abstract_signal_has_no_zero() -> None:
