@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import threading
@@ -161,7 +160,7 @@ def _loop(url: str) -> Iterator[None]:
                         raise _NotMeasuredError(f"the loop has latched: {'; '.join(latched)}") from error
                     raise
         finally:
-            loop.send_signal(signal.SIGINT)
+            loop.terminate()  # Where Ctrl-C is ignored, as in the background of a shell, SIGTERM still ends it.
             loop.wait(PATIENCE)
 
 
