@@ -4,10 +4,25 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+Handler = Callable[[int, FrameType | None], Any]
+
+
+def _handlers() -> dict[int, Handler]:
+    """Return the handlers of SIGINT and SIGTERM, of those that have one; none outside the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    return {number: handler for number, handler in handlers.items() if callable(handler)}
+
+
+def _set(handlers: Mapping[int, Handler]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 class Interruptible:
@@ -22,16 +37,12 @@ class Interruptible:
     """
 
     def __init__(self) -> None:
-        self._handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+        self._handlers: dict[int, Handler] = {}
         self._raised: BaseException | None = None
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                handler = signal.getsignal(number)
-                if callable(handler):
-                    self._handlers[number] = handler
-                    signal.signal(number, self._handle)
+        self._handlers = _handlers()
+        _set(dict.fromkeys(self._handlers, self._handle))
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -40,12 +51,8 @@ class Interruptible:
         except BaseException as error:
             self._raised = error
             # At once: this may be raised at the end of the block, before `__exit__` restores the handlers.
-            self._restore()
+            _set(self._handlers)
             raise
-
-    def _restore(self) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
 
     def raise_interrupt(self) -> None:
         """Raise the exception of the signal handler, if any; long operations call this from time to time."""
@@ -55,7 +62,7 @@ class Interruptible:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._restore()
+        _set(self._handlers)
         if error is not self._raised:
             self.raise_interrupt()
 
@@ -66,18 +73,12 @@ def interrupts_postponed() -> Iterator[list[int]]:
 
     Yields the numbers of the signals that have come. Nothing happens outside the main thread.
     """
-    handlers: dict[int, Any] = {}
-    arrived: list[int] = []
+    handlers, arrived = _handlers(), list[int]()
     try:
-        if threading.current_thread() is threading.main_thread():
-            for which in (signal.SIGINT, signal.SIGTERM):
-                if callable(handler := signal.getsignal(which)):
-                    handlers[which] = handler
-                    signal.signal(which, lambda number, frame: arrived.append(number))
+        _set(dict.fromkeys(handlers, lambda number, _: arrived.append(number)))
         yield arrived
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        _set(handlers)
         if arrived:
             signal.raise_signal(arrived[0])
 
