@@ -21,6 +21,7 @@ import casadi
 import numpy as np
 
 from vtbdrake.components.casadi_system import clamp
+from vtbdrake.components.casadi_system.rotations import rotation_matrix
 from vtbdrake_diagrams.manipulator.arm import JOINTS
 from vtbdrake_diagrams.manipulator.dynamics import ArmDynamics, Expression
 
@@ -96,7 +97,7 @@ def lead(
     quaternion = hand[1:5]
     norm = casadi.norm_2(quaternion)
     leads = engaged * (hand[0] > 0.5) * (norm > 0.5)
-    R = _rotation(quaternion / casadi.fmax(norm, 0.5))
+    R = rotation_matrix(quaternion / casadi.fmax(norm, 0.5))
     turns = [casadi.cross(tip.R[:, k], R[:, k]) for k in range(3)]
     error = casadi.vertcat((turns[0] + turns[1] + turns[2]) / 2, hand[5:8] - tip.p)
     parts = []
@@ -139,9 +140,3 @@ def _limited(value: Expression, most: Expression) -> Expression:
     """Return a vector in the direction of ``value`` that is no longer than ``most``."""
     length = casadi.norm_2(value)
     return value * casadi.fmin(1, most / casadi.fmax(length, 1e-12))
-
-
-def _rotation(q: Expression) -> Expression:
-    """Return the rotation matrix of a unit quaternion [w, x, y, z]."""
-    w, v = q[0], q[1:4]
-    return (w**2 - casadi.dot(v, v)) * casadi.SX.eye(3) + 2 * v @ v.T + 2 * w * casadi.skew(v)

@@ -13,6 +13,12 @@ def exponential(theta: casadi.SX) -> casadi.SX:
     return casadi.SX.eye(3) + casadi.sin(angle) / angle * K + 2 * (casadi.sin(angle / 2) / angle) ** 2 * K @ K
 
 
+def rotation_matrix(q: casadi.SX) -> casadi.SX:
+    """Return R (3, 3) of a unit quaternion (4, 1)."""
+    w, v = q[0], q[1:4]
+    return (w**2 - casadi.dot(v, v)) * casadi.SX.eye(3) + 2 * v @ v.T + 2 * w * casadi.skew(v)
+
+
 def quaternion(R: casadi.SX) -> casadi.SX:
     """Return the unit quaternion (4, 1) of R (3, 3), by way of its largest number; w is not negative."""
     trace = casadi.trace(R)
@@ -35,7 +41,7 @@ def rotation_vector(R: casadi.SX) -> casadi.SX:
     return 2 * casadi.atan2(sine, q[0]) / sine * q[1:]
 
 
-def roll_pitch_yaw(R: casadi.SX) -> casadi.SX:
+def roll_pitch_yaw_angles(R: casadi.SX) -> casadi.SX:
     """Return the angles (3, 1) of R (3, 3) as Drake's RollPitchYaw does, exact also where the pitch is near π / 2."""
     w, x, y, z = casadi.vertsplit(quaternion(R))
     pitch = casadi.atan2(-R[2, 0], casadi.sqrt((R[0, 0] ** 2 + R[1, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2) / 2))

@@ -18,7 +18,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
-from vtbdrake.components.casadi_system.rotations import exponential, quaternion, roll_pitch_yaw
+from vtbdrake.components.casadi_system.rotations import exponential, quaternion, roll_pitch_yaw_angles
 from vtbdrake.components.estimation import kalman_update
 from vtbdrake.components.perception.estimate import (
     PoseEstimate,
@@ -285,7 +285,7 @@ def _present() -> Kernel:
     deviations = [
         casadi.sqrt((casadi.sum1(pose[3 * k : 3 * k + 3]) + f.conditions[2 + k] * dt**3) / 3) for k in range(2)
     ]
-    return f.kernel("present", quaternion(R), p, w, v, p, roll_pitch_yaw(R), *deviations)
+    return f.kernel("present", quaternion(R), p, w, v, p, roll_pitch_yaw_angles(R), *deviations)
 
 
 def _matrix(numbers: casadi.SX) -> casadi.SX:
