@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.compiled.rollouts import CompiledBatch
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutTask, SerialExecutor
+from vtbdrake.rollout.executor import Parameters
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
@@ -49,17 +52,22 @@ def compiled(scenario: Scenario, **options) -> CompiledRollouts:
     return scenario.build().compiled(**{**arguments, **options})
 
 
+def assert_equals_drake(batch: CompiledBatch, task: RolloutTask, points: Sequence[Parameters]) -> None:
+    """Check the recorded outputs of all rollouts, which are valid."""
+    with SerialExecutor() as executor:
+        for i, result in executor.run(task, points):
+            for address in task.record:
+                np.testing.assert_allclose(batch.outputs[address][i], result.record[address], rtol=1e-11, atol=1e-11)
+    assert batch.valid.all()
+
+
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_equals_rollouts_in_drake(name: str) -> None:
     scenario = SCENARIOS[name]
     batch = compiled(scenario, parameters=[MASS])({"u.plan": plans(3), MASS: [0.8, 1.0, 1.3]})
     points = [{"u.plan": plan, MASS: mass} for plan, mass in zip(plans(3), (0.8, 1.0, 1.3), strict=True)]
     task = RolloutTask(scenario, HORIZON, sample_period=SAMPLE_PERIOD, record=OUTPUTS)
-    with SerialExecutor() as executor:
-        for i, result in executor.run(task, points):
-            for address in OUTPUTS:
-                np.testing.assert_allclose(batch.outputs[address][i], result.record[address], rtol=1e-11, atol=1e-11)
-    assert batch.valid.all()
+    assert_equals_drake(batch, task, points)
 
 
 def test_noise_is_that_of_the_time_at_which_a_rollout_begins() -> None:
@@ -201,11 +209,7 @@ def test_a_reasoner_on_board_shows_its_candidate(decides_at: float | None) -> No
     batch = compiled(scenario, outputs=outputs)({candidate: plans(2), **point})
     points = [{candidate: plan, **point} for plan in plans(2)]
     task = RolloutTask(scenario, HORIZON, sample_period=SAMPLE_PERIOD, record=outputs)
-    with SerialExecutor() as executor:
-        for i, result in executor.run(task, points):
-            for address in outputs:
-                np.testing.assert_allclose(batch.outputs[address][i], result.record[address], rtol=1e-11, atol=1e-11)
-    assert batch.valid.all()
+    assert_equals_drake(batch, task, points)
     assert batch.outputs["dps.planner.valid"].any() == (decides_at is not None)
 
 

@@ -25,6 +25,14 @@ def always(monkeypatch):
     monkeypatch.setattr(worker_processes, "_BRIEF", inf)
 
 
+@pytest.fixture
+def treacherous(tmp_path):
+    """A task whose points may have a worker killed, or hang, once."""
+    fuse = tmp_path / "fuse"
+    fuse.touch()
+    return RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+
+
 def _watched(executor, task, points):
     """The results, by index, and the most rollouts that a worker had at a time."""
     results, most = {}, 0
@@ -70,16 +78,13 @@ def test_what_would_fill_the_socket_is_not_given_ahead(always):
 
 
 @pytest.mark.parametrize(("how", "time_limit"), [(KILL, inf), (HANG, 2.0)])
-def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, always, tmp_path, caplog):
-    fuse = tmp_path / "fuse"
-    fuse.touch()
-    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, always, treacherous, caplog):
     points = [{SHOULDER: 0.1 * i, GAIN: 0.0} for i in range(6)]
     with SerialExecutor() as serial:
-        expected = dict(serial.run(task, points))
+        expected = dict(serial.run(treacherous, points))
     points[1][GAIN] = how
     with ProcessExecutor(1, time_limit=time_limit) as executor:
-        results, most = _watched(executor, task, points)
+        results, most = _watched(executor, treacherous, points)
     assert most == 2
     # One try too many, its own, and none of the one behind it.
     (record,) = caplog.records
@@ -88,16 +93,13 @@ def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, al
     assert all(results[i].identical(expected[i]) for i in (0, 2, 3, 4, 5))
 
 
-def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, tmp_path, caplog):
-    fuse = tmp_path / "fuse"
-    fuse.touch()
-    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, treacherous, caplog):
     points = [{SHOULDER: 0.01 * i, GAIN: 0.0} for i in range(24)]
     with SerialExecutor() as serial:
-        expected = dict(serial.run(task, points))
+        expected = dict(serial.run(treacherous, points))
     points[5][GAIN] = KILL
     with ProcessExecutor(1) as executor:
-        results, most = _watched(executor, task, points)
+        results, most = _watched(executor, treacherous, points)
     assert most > 5
     (record,) = caplog.records
     assert record.getMessage().startswith("rollout 5 is tried again")
@@ -105,13 +107,10 @@ def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, tmp_path,
     assert all(results[i].identical(expected[i]) for i in range(24) if i != 5)
 
 
-def test_rollouts_that_kill_their_workers_have_two_tries_each(always, tmp_path):
-    fuse = tmp_path / "fuse"
-    fuse.touch()
-    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(abs, SHOULDER))
+def test_rollouts_that_kill_their_workers_have_two_tries_each(always, treacherous):
     points = [{GAIN: gain} for gain in (0.0, -KILL, -KILL, 0.0)]
     with ProcessExecutor(1) as executor:
-        results, most = _watched(executor, task, points)
+        results, most = _watched(executor, treacherous, points)
     assert most == 2
     assert [results[i].failed for i in range(4)] == [False, True, True, False]
     assert all(results[i].message.count("died (exit code -9)") == 2 for i in (1, 2))

@@ -6,7 +6,6 @@ import queue
 import signal
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +15,6 @@ import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster, get_task_stream
-from distributed.diagnostics.plugin import SchedulerPlugin
 
 from benchmarks.cluster import Waiting, cost
 from benchmarks.dask_cluster import ROOT, dask_cluster
@@ -260,18 +258,15 @@ def test_killed_study_on_many_slots_is_resumed(tmp_path):
         host="127.0.0.1",
         dashboard_address=None,
     ) as many:
-        plugin = _EndOfTask()
-        many.scheduler.add_plugin(plugin)
         command = [sys.executable, "-m", "tests.rollout.waiting_study", str(path), many.scheduler_address]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
-            assert process.stdout.readline(), "the study ended before it could be killed"
-            # Its first batch is recorded: it is killed in the midst of its second one.
-            plugin.event.clear()
-            assert plugin.event.wait(60.0)
+            # It is killed in the midst of its second batch.
+            for _ in range(round(1.5 * SLOTS)):
+                assert process.stdout.readline(), "the study ended before it could be killed"
             process.send_signal(signal.SIGKILL)
         with waiting_study(path) as study, Waiting(many.scheduler_address, duration=0.0) as executor:
             before = set(study.rollouts)
-            assert SLOTS <= len(before) < ROLLOUTS
+            assert 1.5 * SLOTS <= len(before) < ROLLOUTS
             study.run(rollouts=ROLLOUTS, executor=executor, progress=False)
             assert before < set(study.rollouts)
             resumed = _table(study)
@@ -281,17 +276,6 @@ def test_killed_study_on_many_slots_is_resumed(tmp_path):
     )
     assert len(whole) == ROLLOUTS
     assert resumed == _table(whole)
-
-
-class _EndOfTask(SchedulerPlugin):
-    """Sets its event whenever a task has ended."""
-
-    def __init__(self):
-        self.event = threading.Event()
-
-    def transition(self, key, start, finish, *args, **kwargs):
-        if finish == "memory":
-            self.event.set()
 
 
 def _table(study):

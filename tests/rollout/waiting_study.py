@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 from benchmarks.cluster import Waiting
 from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study
-from vtbdrake.optimization.records import Trial
+from vtbdrake.rollout import RolloutResult
 
 SLOTS, ROLLOUTS = 100, 500
 
@@ -17,14 +19,19 @@ def waiting_study(path: str | None = None) -> Study:
     return pendulum_problem().study(path, solver="cmaes", seed=3, parallel=SLOTS)
 
 
+class _Telling(Waiting):
+    """Prints a line for each rollout that is recorded: a study asks for the next one afterwards."""
+
+    def run(self, *args: Any, **options: Any) -> Iterator[tuple[int, RolloutResult]]:
+        for result in super().run(*args, **options):
+            yield result
+            print("recorded", flush=True)
+
+
 def main(path: str, address: str) -> None:
-    """Run the study on the cluster of a scheduler, and print the number of each trial that is recorded."""
-    with waiting_study(path) as study, Waiting(address, duration=0.2) as executor:
-        study.run(rollouts=ROLLOUTS, executor=executor, progress=False, callbacks=[_print])
-
-
-def _print(_: Study, trial: Trial) -> None:
-    print(trial.number, flush=True)
+    """Run the study on the cluster of a scheduler."""
+    with waiting_study(path) as study, _Telling(address, duration=0.2) as executor:
+        study.run(rollouts=ROLLOUTS, executor=executor, progress=False)
 
 
 if __name__ == "__main__":
