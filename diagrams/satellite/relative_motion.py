@@ -36,42 +36,42 @@ class Relative:
 
     @property
     def age(self) -> float:
-        """The age of the newest estimate of the target, in s."""
+        """Return the age of the newest estimate of the target, in s."""
         return self.vector.item(0)
 
     @property
     def valid(self) -> bool:
-        """Whether the target is tracked."""
+        """Return whether the target is tracked."""
         return self.vector.item(1) > 0.5
 
     @property
     def R_BH(self) -> Array:
-        """The orientation of the fixture, (3, 3)."""
+        """Return the orientation of the fixture, (3, 3)."""
         return self.vector[2:11].reshape(3, 3)
 
     @property
     def p_BH(self) -> Array:
-        """The position of the fixture, (3,) in m."""
+        """Return the position of the fixture, (3,) in m."""
         return self.vector[11:14]
 
     @property
     def w_BH(self) -> Array:
-        """The angular velocity of the fixture against the base, (3,) in rad/s."""
+        """Return the angular velocity of the fixture against the base, (3,) in rad/s."""
         return self.vector[14:17]
 
     @property
     def v_BH(self) -> Array:
-        """The velocity of the fixture's origin against the base, (3,) in m/s."""
+        """Return the velocity of the fixture's origin against the base, (3,) in m/s."""
         return self.vector[17:20]
 
     @property
     def R_BG(self) -> Array:
-        """The orientation of the gripper, (3, 3)."""
+        """Return the orientation of the gripper, (3, 3)."""
         return self.vector[20:29].reshape(3, 3)
 
     @property
     def p_BG(self) -> Array:
-        """The position of the gripper, (3,) in m."""
+        """Return the position of the gripper, (3,) in m."""
         return self.vector[29:32]
 
     def errors(self, distance: float, flip: float) -> tuple[float, float]:

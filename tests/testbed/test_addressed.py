@@ -1,4 +1,4 @@
-"""What threads share while they make testbeds."""
+"""Threads take turns in making testbeds."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""What a calibration leaves unknown: the covariance of the numbers that were fitted, and samples of them."""
+"""The uncertainty of a calibration: the covariance of the numbers that were fitted, and samples of them."""
 
 from __future__ import annotations
 
