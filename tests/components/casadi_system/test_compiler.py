@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import casadi
@@ -132,12 +133,29 @@ def test_a_compiler_that_fails_leaves_nothing_behind(cache, monkeypatch):
     np.testing.assert_allclose(_eval(CasadiSystem(_function(), compile=True), np.zeros(3), np.ones(3))[3], 1.0)
 
 
-def test_a_damaged_library_is_compiled_again(cache):
-    # In another process: here, a library that is loaded is not read again.
+def _without_the_end(contents: bytes, size: int) -> bytes:
+    return contents[:size]
+
+
+def _with_zeros(contents: bytes, start: int) -> bytes:
+    return contents[:start] + bytes(400) + contents[start + 400 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "place"),
+    [(_without_the_end, size) for size in (0, 10, 500, 1000, 5000, 10_000)] + [(_with_zeros, 100), (_with_zeros, 5000)],
+)
+def test_a_damaged_library_is_compiled_again(cache, damage, place):
+    # In other processes: the loader of a library that lacks a part ends its process.
     script = "import tests.components.casadi_system.test_compiler as t\nt.CasadiSystem(t._function(), compile=True)"
-    subprocess.run([sys.executable, "-c", script], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    run = partial(
+        subprocess.run, [sys.executable, "-c", script], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    run()
     (library,) = (cache / "cache").rglob("*.so")
-    library.write_bytes(library.read_bytes()[:500])
+    library.write_bytes(damage(library.read_bytes(), place))
+    run()
+    assert _runs(cache) == 2
     machine, interpreted = CasadiSystem(_function(), compile=True), CasadiSystem(_function())
     x, u = np.arange(3.0), np.ones(3)
     np.testing.assert_array_equal(_eval(machine, x, u), _eval(interpreted, x, u))

@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 # Products and sums are rounded one by one, as the interpreted function does it.
 _FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
 _ONE_AT_A_TIME = threading.Lock()
+_DIGEST_SIZE = hashlib.sha256().digest_size
 
 
 class CompilerError(RuntimeError):
@@ -33,7 +34,7 @@ def compiled(function: casadi.Function) -> casadi.Function:
     """Return the same function as machine code.
 
     The library is kept in `cache_folder` under a digest of its C code and of how it was compiled: a function is
-    compiled once per machine. Processes may do so at the same time.
+    compiled once per machine. Processes may do so at the same time. A damaged library is compiled again.
 
     Raises:
         ValueError: The function has no C code, such as a `casadi.Callback`.
@@ -49,15 +50,17 @@ def compiled(function: casadi.Function) -> casadi.Function:
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
     command = _command()
-    recipe = "\n".join((source, *command, platform.system(), platform.machine()))
+    recipe = "\n".join((source, *command, platform.system(), platform.machine(), "with its digest"))
     library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
     with _ONE_AT_A_TIME:
-        if not library.exists():
+        if not _is_whole(library):
+            if library.exists():
+                _log.warning("%s is damaged, and compiled again", library)
             compile_library(source, library)
         try:
             return casadi.external(function.name(), str(library))
         except RuntimeError as error:
-            _log.warning("%s is damaged, and compiled again: %s", library, str(error).splitlines()[-1])
+            _log.warning("%s cannot be loaded, and is compiled again: %s", library, str(error).splitlines()[-1])
             library.unlink(missing_ok=True)
             compile_library(source, library)
     try:
@@ -80,12 +83,28 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vtbdrake" / "casadi"
 
 
+def _is_whole(library: Path) -> bool:
+    """Return whether a library ends with the digest of the rest.
+
+    The loader does not notice that a part is missing: it ends the process, by SIGBUS or SIGSEGV.
+    """
+    try:
+        contents = library.read_bytes()
+    except FileNotFoundError:
+        return False
+    return contents[-_DIGEST_SIZE:] == _digest(contents[:-_DIGEST_SIZE])
+
+
+def _digest(contents: bytes) -> bytes:
+    return hashlib.sha256(contents).digest()
+
+
 def _command() -> tuple[str, ...]:
     return (*shlex.split(os.environ.get("CC") or "cc"), *_FLAGS)
 
 
 def compile_library(source: str, library: Path) -> None:
-    """Compile C code to a shared library, which is written whole or not at all.
+    """Compile C code to a shared library, which is written whole or not at all, and ends with its digest.
 
     Raises:
         CompilerError: The compiler is missing or fails.
@@ -104,3 +123,5 @@ def compile_library(source: str, library: Path) -> None:
         result = subprocess.run([*command, str(c_file), "-o", str(partial), "-lm"], capture_output=True, text=True)
         if result.returncode:
             raise CompilerError(f"{shlex.join(command)} failed ({result.returncode}): {result.stderr.strip()}")
+        contents = partial.read_bytes()
+        partial.write_bytes(contents + _digest(contents))
