@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.common.value import Value
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Sine, ZeroOrderHold
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain, Sine, ZeroOrderHold
 
-from vtbdrake.compiled import CompiledRollouts
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.compiled.check import TOLERANCE, compare
 from vtbdrake.state.systems import collect
 
 BOX = SpatialInertia.SolidBoxWithMass(1.5, 0.2, 0.3, 0.4)
 
 
-def rollouts_of(diagram: Diagram, outputs: tuple[str, ...] = (), **values: float) -> CompiledRollouts:
+def rollouts_of(
+    diagram: Diagram, outputs: tuple[str, ...] = (), parameters: tuple[str, ...] = (), **values: float
+) -> CompiledRollouts:
     context = diagram.CreateDefaultContext()
     for name, value in values.items():
         plant = diagram.GetSubsystemByName("plant")
@@ -28,6 +32,7 @@ def rollouts_of(diagram: Diagram, outputs: tuple[str, ...] = (), **values: float
         horizon=0.3,
         sample_period=0.05,
         outputs=outputs,
+        parameters=parameters,
         compile=False,
     )
 
@@ -102,3 +107,72 @@ def test_a_rollout_that_reaches_a_stop_is_not_valid() -> None:
     builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
     batch = rollouts_of(builder.Build())({"force.value": [[0.1, 0.0], [5.0, 0.0]]})
     assert batch.valid.tolist() == [True, False]
+
+
+# CasADi's names of arguments have no room for these letters.
+@pytest.mark.parametrize("names", [("left", "right"), ("左", "右")])
+def test_two_copies_of_a_robot(names: tuple[str, str]) -> None:
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    for name in names:
+        instance = plant.AddModelInstance(name)
+        link = plant.AddRigidBody("link", instance, BOX)
+        plant.AddJointActuator(
+            "motor", plant.AddJoint(RevoluteJoint("hinge", plant.world_frame(), link.body_frame(), [0, 0, 1]))
+        )
+    plant.Finalize()
+    builder.AddNamedSystem("plant", plant)
+    torque = builder.AddNamedSystem("torque", ConstantVectorSource([1.0, -2.0]))
+    builder.Connect(torque.get_output_port(), plant.get_actuation_input_port())
+    masses = tuple(f"plant.{name}.link.mass" for name in names)
+    rollouts = rollouts_of(builder.Build(), ("plant.state",), masses)
+    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    turned = [rollouts({masses[0]: m, masses[1]: 1.5}).outputs["plant.state"][0, -1] for m in (1.5, 3.0)]
+    np.testing.assert_allclose(turned[0] / turned[1], [2.0, 1.0, 2.0, 1.0])
+
+
+def test_a_plant_without_positions() -> None:
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    plant.WeldFrames(plant.world_frame(), plant.AddRigidBody("table", BOX).body_frame())
+    plant.Finalize()
+    builder.AddNamedSystem("plant", plant)
+    batch = rollouts_of(builder.Build(), ("plant.state",))()
+    assert batch.outputs["plant.state"].shape == (1, 7, 0)
+    assert batch.valid.all()
+
+
+def pushed_cart() -> tuple[DiagramBuilder, MultibodyPlant, Value]:
+    """Return the builder of two carts, and a force on the left one."""
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    two_carts(plant)
+    builder.AddNamedSystem("plant", plant)
+    force = ExternallyAppliedSpatialForce()
+    force.body_index = plant.GetBodyByName("cart", plant.GetModelInstanceByName("left")).index()
+    force.F_Bq_W = SpatialForce(tau=np.zeros(3), f=[3.0, 0.0, 0.0])
+    return builder, plant, Value([force])
+
+
+def test_a_constant_force_acts_on_a_body() -> None:
+    builder, plant, value = pushed_cart()
+    source = builder.AddNamedSystem("push", ConstantValueSource(value))
+    builder.Connect(source.get_output_port(), plant.get_applied_spatial_force_input_port())
+    rollouts = rollouts_of(builder.Build(), ("plant.state",))
+    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    np.testing.assert_allclose(rollouts().outputs["plant.state"][0, -1, 2:], [0.3 * 3.0 / 1.5, 0.0], rtol=1e-12)
+
+
+def test_a_force_that_is_fixed_at_a_port_is_refused() -> None:
+    builder, plant, value = pushed_cart()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant.get_applied_spatial_force_input_port().FixValue(plant.GetMyContextFromRoot(context), value)
+    with pytest.raises(UnsupportedTestbedError, match="plant: a value is fixed at the abstract input port applied_sp"):
+        CompiledRollouts(diagram, collect(diagram), context, horizon=0.1, sample_period=0.1, compile=False, check=False)
+
+
+def test_a_port_that_is_not_compiled_is_named() -> None:
+    builder, _, _ = pushed_cart()
+    with pytest.raises(UnsupportedTestbedError, match="^plant: MultibodyPlant has the output port net_actuation"):
+        rollouts_of(builder.Build(), ("plant.net_actuation",))

@@ -7,7 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from pydrake.symbolic import Expression, Variable, uninterpreted_function
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus, LeafSystem, System
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    EventStatus,
+    LeafSystem,
+    LeafSystem_,
+    System,
+)
 from pydrake.systems.primitives import (
     Adder,
     ConstantVectorSource,
@@ -17,6 +25,7 @@ from pydrake.systems.primitives import (
     TrajectorySource,
     ZeroOrderHold,
 )
+from pydrake.systems.scalar_conversion import TemplateSystem
 from pydrake.trajectories import PiecewisePolynomial
 
 from vtbdrake.compiled import (
@@ -176,6 +185,47 @@ def test_what_may_end_a_simulation_is_named() -> None:
         compiled(alone(Watchdog()))
 
 
+@TemplateSystem.define("Counter_")
+def Counter_(T: type) -> type:
+    """Count in a way of its own, which Drake converts to symbolic expressions; ``periods`` are those of its updates."""
+
+    class Impl(LeafSystem_[T]):
+        def _construct(self, periods=(), per_step=False, most=np.inf, converter=None) -> None:
+            LeafSystem_[T].__init__(self, converter=converter)
+            self.arguments = periods, per_step, most
+            self.DeclareStateOutputPort("x", self.DeclareDiscreteState(1))
+            for period in periods:
+                self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self.update)
+            if per_step:
+                self.DeclarePerStepDiscreteUpdateEvent(self.update)
+            self.DeclarePerStepPublishEvent(self.watch)
+
+        def _construct_copy(self, other, converter=None) -> None:
+            Impl._construct(self, *other.arguments, converter=converter)
+
+        def update(self, context, state) -> None:
+            state.get_mutable_vector().SetFromVector(context.get_discrete_state_vector().CopyToVector() + 1.0)
+
+        def watch(self, context) -> EventStatus:
+            if context.get_discrete_state_vector()[0] >= self.arguments[2]:
+                return EventStatus.ReachedTermination(self, "that is enough")
+            return EventStatus.DidNothing()
+
+    return Impl
+
+
+@pytest.mark.parametrize("events", [{"periods": (0.1, 0.3)}, {"per_step": True}, {}])
+def test_state_that_is_updated_otherwise_is_named(events: dict) -> None:
+    with pytest.raises(UnsupportedTestbedError, match="part0: Counter has other state than that of one periodic"):
+        compiled(alone(Counter_[float](**events)), check=False)
+
+
+def test_an_end_of_the_simulation_is_noticed() -> None:
+    assert compiled(alone(Counter_[float](periods=(0.1,))), ("part0.x",))().outputs["part0.x"][0, -1] == 10.0
+    with pytest.raises(CompiledDifferenceError, match="ends its simulation, which is not compiled: .*that is enough"):
+        compiled(alone(Counter_[float](periods=(0.1,), most=3.0)))
+
+
 class OwnSquares(Squares):
     def compiled_equations(self, context: Context, varied: frozenset[str]) -> Equations:
         return SquaresEquations(self, context, varied)
@@ -230,3 +280,22 @@ def test_sums_of_what_is_compiled_need_no_state() -> None:
     builder.Connect(source.get_output_port(), adder.get_input_port(1))
     rollouts = compiled(builder.Build(), outputs=("sum.sum",))
     np.testing.assert_array_equal(rollouts({"source.value": [[2.0], [3.0]]}).outputs["sum.sum"][:, -1, 0], [4.0, 6.0])
+
+
+def test_ports_of_systems_with_dots_in_their_names() -> None:
+    builder = DiagramBuilder()
+    inner = DiagramBuilder()
+    inner.ExportOutput(inner.AddNamedSystem("x.y", ConstantVectorSource([2.0])).get_output_port(), "out")
+    builder.AddNamedSystem("sim.sense", inner.Build())
+    outputs = compiled(builder.Build(), outputs=("sim.sense.out", "sim.sense.x.y.y0"))().outputs
+    assert [values[0, -1, 0] for values in outputs.values()] == [2.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [("a", "part0.value takes numbers, not 'a'"), (np.empty((0, 1)), "there are no values of part0.value")],
+)
+def test_values_that_are_none_are_named(value: object, reason: str) -> None:
+    rollouts = compiled(alone(ConstantVectorSource([1.0]), ZeroOrderHold(0.1, 1)))
+    with pytest.raises(ValueError, match=reason):
+        rollouts({"part0.value": value})

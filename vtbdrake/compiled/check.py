@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
 from vtbdrake.arrays import Array
@@ -60,7 +60,12 @@ def compare(rollouts: CompiledRollouts, begin: Context, *, updates: int = _MOST_
     z, sample, largest = walker.read(begin), 0, 0.0
     for instant in rollouts.schedule_at(begin.get_time())[:updates]:
         if instant.time > begin.get_time():  # Else, the updates of the first instant would happen.
-            simulator.AdvanceTo(instant.time)
+            status = simulator.AdvanceTo(instant.time)
+            if status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime:
+                raise CompiledDifferenceError(
+                    f"the Diagram ends its simulation, which is not compiled: {status.FormatMessage()}; keep this "
+                    "testbed in Drake"
+                )
         state = simulator.get_context()
         if rollouts.is_beyond(z):
             break  # The plant feels a joint stop.

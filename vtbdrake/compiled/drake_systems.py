@@ -41,6 +41,11 @@ class SymbolicEquations(Equations):
             raise self._unwritten()
         # A converted context: some systems have values beside the numeric groups.
         self._symbolic, self._context = symbolic, symbolic.CreateDefaultContext()
+        sizes = [context.get_discrete_state(i).size() for i in range(context.num_discrete_state_groups())]
+        if (self.timing is None and any(sizes)) or context.num_abstract_states():
+            raise refusal(system, f"has other state than that of one periodic discrete update: {REMEDY}")
+        if system.GetWitnessFunctions(context):
+            raise refusal(system, f"has witness functions: {REMEDY}")
         self._variables: dict[str, list[Variable]] = {}
         c = self._context
         c.SetTime(DrakeExpression(self._new("time", 1)[0]))
@@ -56,6 +61,8 @@ class SymbolicEquations(Equations):
             parameter.SetFromVector(_expressions(self._new(f"parameter {i}", parameter.size())))
 
     def output(self, port: str, at: At) -> Expression:
+        if self.system.GetOutputPort(port).get_data_type() != PortDataType.kVectorValued:
+            raise refusal(self.system, f"has the abstract output port {port}: {REMEDY}")
         try:
             value = self._symbolic.GetOutputPort(port).Eval(self._context)
         except RuntimeError as error:
@@ -177,6 +184,13 @@ class PortSwitchEquations(Equations):
 
     def output(self, port: str, at: At) -> Expression:
         return at.input(int(at.input(0)))
+
+
+class ConstantValueEquations(Equations):
+    """Drake's ConstantValueSource, whose abstract value is compiled in."""
+
+    def output(self, port: str, at: At) -> Expression:
+        return self.system.GetOutputPort(port).Eval(self.system.CreateDefaultContext())
 
 
 class TrajectoryEquations(Equations):

@@ -22,6 +22,10 @@ class UnsupportedTestbedError(ValueError):
     """A part of a Diagram cannot be compiled."""
 
 
+class RefusedSystemError(UnsupportedTestbedError):
+    """A system cannot be compiled, whose address is not known where this is raised."""
+
+
 @dataclass(frozen=True)
 class Timing:
     """When a system is updated: at offset, offset + period, ..., in seconds.
@@ -167,9 +171,9 @@ def unique_timing(system: System) -> Timing | None:
     return None if attribute is None else Timing(attribute.period_sec(), attribute.offset_sec())
 
 
-def refusal(system: System, why: str) -> UnsupportedTestbedError:
+def refusal(system: System, why: str) -> RefusedSystemError:
     """Return the error that a system cannot be compiled."""
-    return UnsupportedTestbedError(f"{class_name(system)} {why}")
+    return RefusedSystemError(f"{class_name(system)} {why}")
 
 
 def zeros(size: int) -> Expression:

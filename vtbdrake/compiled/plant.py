@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import casadi
 import numpy as np
-from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
+from pydrake.multibody.plant import DiscreteContactSolver, ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
@@ -75,7 +75,8 @@ class PlantEquations(Equations):
     def _motion(self, at: At) -> tuple[Expression, Expression, Expression]:
         """Return q, v and vdot of the present step, in terms of the model's inputs."""
         model = self._model
-        q, v = at.state(0)[: model.nq], at.state(0)[model.nq :]
+        # Columns, also of a plant without positions.
+        q, v = casadi.vertsplit(at.state(0), [0, model.nq, model.nq + model.nv])
         period = self._plant.time_step()
         vdot = at.shared("vdot", lambda: model.acceleration(q, v, self._torque(at), period=period))
         return q, v, vdot
@@ -105,7 +106,7 @@ class PlantEquations(Equations):
     def _applied(self, at: At) -> list[AppliedForce]:
         """Return the forces in the world that act on bodies."""
         port = "applied_spatial_force"
-        return list(at.input(port)) if at.is_connected(port) else []
+        return [_force(force) for force in at.input(port)] if at.is_connected(port) else []
 
     def _torque(self, at: At) -> Expression:
         """Return the generalized force of everything that is connected to the plant."""
@@ -130,6 +131,13 @@ class PlantEquations(Equations):
                 starts = [self._plant.get_joint_actuator(index).input_start() for index in indices]
                 u[starts] = at.input(port)
         return u
+
+
+def _force(force: AppliedForce | ExternallyAppliedSpatialForce) -> AppliedForce:
+    if isinstance(force, AppliedForce):
+        return force
+    F_Bq_W = force.F_Bq_W.get_coeffs()
+    return AppliedForce(int(force.body_index), casadi.DM(force.p_BoBq_B), casadi.DM(F_Bq_W))
 
 
 def _inputs(plant: MultibodyPlant) -> Iterator[Variable]:

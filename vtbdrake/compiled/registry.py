@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, System
-from pydrake.systems.primitives import PortSwitch, TrajectorySource
+from pydrake.systems.primitives import ConstantValueSource, PortSwitch, TrajectorySource
 
 from vtbdrake.compiled.components import (
     BoardEquations,
@@ -15,7 +15,12 @@ from vtbdrake.compiled.components import (
     JointTorqueEquations,
     SplineEquations,
 )
-from vtbdrake.compiled.drake_systems import PortSwitchEquations, SymbolicEquations, TrajectoryEquations
+from vtbdrake.compiled.drake_systems import (
+    ConstantValueEquations,
+    PortSwitchEquations,
+    SymbolicEquations,
+    TrajectoryEquations,
+)
 from vtbdrake.compiled.equations import REMEDY, Equations, refusal
 from vtbdrake.compiled.plant import PlantEquations
 from vtbdrake.components.actuators import JointDrives
@@ -27,6 +32,7 @@ from vtbdrake.testbed.switch import SwitchBoard
 
 EQUATIONS: dict[type, type[Equations]] = {
     CasadiSystem: CasadiEquations,
+    ConstantValueSource: ConstantValueEquations,
     JointDrives: DriveEquations,
     ForceTorqueSensor: ForceTorqueEquations,
     JointEncoders: JointSensorEquations,

@@ -167,13 +167,18 @@ class CompiledRollouts:
         count = 1
         for address, value in values.items():
             variable = self.walker.variables[address]
-            array = np.asarray(value, dtype=float)
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{address} takes numbers, not {value!r}") from error
             many = array.ndim == len(variable.shape) + 1
             if array.shape[many:] != variable.shape:
                 raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
             lower, upper = (np.asarray(bound, dtype=float) for bound in variable.bounds)
             if not (np.isfinite(array).all() and (array >= lower).all() and (array <= upper).all()):
                 raise ValueError(f"{address} is finite and lies in {variable.bounds_text()}")
+            if not array.size and many:
+                raise ValueError(f"there are no values of {address}: give one, or one for each of the rollouts")
             if many and count not in (1, len(array)):
                 raise ValueError(f"there are {len(array)} values of {address}, but {count} of others")
             count = len(array) if many else count

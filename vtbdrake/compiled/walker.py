@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +17,31 @@ from pydrake.systems.framework import (
     System,
 )
 
+from vtbdrake.argument_checks import suggestion
 from vtbdrake.arrays import Array
-from vtbdrake.compiled.equations import At, Draw, Equations, Expression, UnsupportedTestbedError
+from vtbdrake.compiled.equations import (
+    At,
+    Draw,
+    Equations,
+    Expression,
+    RefusedSystemError,
+    UnsupportedTestbedError,
+    zeros,
+)
 from vtbdrake.compiled.registry import equations_of
 from vtbdrake.state import AddressError, Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
 from vtbdrake.state.layout import StateLayout
-from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, read_group, write_group
+from vtbdrake.state.systems import (
+    class_name,
+    is_plant,
+    is_python,
+    is_scene_graph,
+    leaves,
+    output_ports,
+    read_group,
+    write_group,
+)
 from vtbdrake.state.variables import A, Place
 from vtbdrake.testbed.dependencies import connections, writer_of
 
@@ -110,6 +129,7 @@ class Walker:
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
         self._places: dict[str, slice] = {}
+        self._ports = output_ports(diagram)
         self._state = _indices(
             block.entries
             for block in self.blocks.values()
@@ -186,13 +206,16 @@ class Walker:
         """
         if address not in self._places:
             entries = self._lies(address)
+            if entries is None:
+                raise ValueError(f"{address} cannot be varied in the compiled testbed: {self._reason(address)}")
             for fixed, _, reason in self.fixed:
                 if fixed.start < entries.stop and entries.start < fixed.stop:
                     raise ValueError(f"{address} cannot be varied in the compiled testbed: {reason}")
             self._places[address] = entries
         return self._places[address]
 
-    def _lies(self, address: str) -> slice:
+    def _lies(self, address: str) -> slice | None:
+        """Return where a variable lies in z, if it does."""
         variable = self.variables[address]
         size = int(np.prod(variable.shape, dtype=int))
         if variable.place is not None:
@@ -204,7 +227,7 @@ class Walker:
             if block.kind == EXTRA and self._address(block) == base:
                 start = block.entries.start + int(entry.rstrip("]") or 0)
                 return slice(start, start + size)
-        raise ValueError(f"{address} cannot be varied in the compiled testbed: {self._reason(address)}")
+        return None
 
     def can_vary(self, address: str) -> bool:
         """Return whether a variable can be varied, see `place`."""
@@ -263,7 +286,10 @@ class Walker:
         if address == "time":
             return time
         if address in self.variables:
-            return z[self._lies(address)]
+            entries = self._lies(address)
+            if entries is None:
+                raise ValueError(f"{address} cannot be recorded in the compiled testbed: {self._reason(address)}")
+            return z[entries]
         system, port = self._port(address)
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
@@ -279,14 +305,10 @@ class Walker:
         return lambda context: port.Eval(context if system is self.diagram else system.GetMyContextFromRoot(context))
 
     def _port(self, address: str) -> tuple[System, OutputPort]:
-        path, _, name = address.rpartition(".")
-        system: System = self.diagram
-        try:
-            for part in path.split(".") if path else ():
-                system = system.GetSubsystemByName(part)
-            return system, system.GetOutputPort(name)
-        except (RuntimeError, AttributeError):
-            raise AddressError(f"there is no variable and no port {address!r}") from None
+        if address not in self._ports:
+            near = suggestion(address, [*self.variables, *self._ports])
+            raise AddressError(f"there is no variable and no port {address!r}{near}")
+        return self._ports[address]
 
     def source(self, path: str, number: int) -> tuple[str, str] | None:
         """Return (path, name) of the output port that is connected to an input port of a leaf system, if any."""
@@ -308,8 +330,13 @@ class Walker:
         system = self._systems[path]
         leaf_context = system.GetMyContextFromRoot(context)
         port = system.get_input_port(number)
-        if port.get_data_type() != PortDataType.kVectorValued or not port.HasValue(leaf_context):
+        if not port.HasValue(leaf_context):
             return None
+        if port.get_data_type() != PortDataType.kVectorValued:
+            raise UnsupportedTestbedError(
+                f"{path}: a value is fixed at the abstract input port {port.get_name()}, which is not compiled: "
+                "connect a ConstantValueSource"
+            )
         return np.array(port.Eval(leaf_context))
 
     # -- how it is done
@@ -330,6 +357,8 @@ class Walker:
         return next(address for address in candidates if address in self.variables)
 
     def _reason(self, address: str) -> str:
+        if self.variables[address].derived:
+            return "it is computed from others"
         base = address.partition("[")[0]
         for path, equations in self.equations.items():
             if name := self._within(path, base):
@@ -434,7 +463,9 @@ class Evaluation:
 
     def update(self, path: str) -> dict[int | str, Expression]:
         """Return what an update of the system at a path returns."""
-        return self.walker.equations[path].update(_Reading(self, path))
+        with _addressed(path):
+            following = self.walker.equations[path].update(_Reading(self, path))
+        return following
 
     def output(self, path: str, port: str) -> Expression:
         """Return the value of an output port of a leaf system.
@@ -450,9 +481,19 @@ class Evaluation:
             if path not in self.walker.equations:
                 raise UnsupportedTestbedError(f"{path}: {self.walker.uncovered[path]}")
             self._under_way.append(key)
-            self._values[key] = self.walker.equations[path].output(port, _Reading(self, path))
+            with _addressed(path):
+                self._values[key] = self.walker.equations[path].output(port, _Reading(self, path))
             self._under_way.pop()
         return self._values[key]
+
+
+@contextmanager
+def _addressed(path: str) -> Iterator[None]:
+    """Give the address of a system to the error that it cannot be compiled."""
+    try:
+        yield
+    except RefusedSystemError as refusal:
+        raise UnsupportedTestbedError(f"{path}: {refusal}") from None
 
 
 class _Reading(At):
@@ -500,7 +541,8 @@ class _Reading(At):
         return self._evaluation.w[next(e for path, n, _, e in draws if (path, n) == (self._path, name))]
 
     def _entries(self, kind: str, name: int | str) -> Expression:
-        return self._evaluation.z[self._evaluation.walker.blocks[self._path, kind, name].entries]
+        entries = self._evaluation.walker.blocks[self._path, kind, name].entries
+        return self._evaluation.z[entries] if entries.start < entries.stop else zeros(0)
 
     def _number(self, port: int | str) -> int:
         if isinstance(port, int):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, System
 from pydrake.systems.primitives import ConstantVectorSource
 
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE, PARAMETER, Element
@@ -40,6 +40,18 @@ def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
             yield from leaves(system, path=below)
         else:
             yield below, system
+
+
+def output_ports(system: System, *, path: str = "") -> dict[str, tuple[System, OutputPort]]:
+    """Return the output ports of a system and of all systems below it, with their systems, by dotted address."""
+    prefix = f"{path}." if path else ""
+    ports = {}
+    for i in range(system.num_output_ports()):
+        port = system.get_output_port(i)
+        ports[f"{prefix}{port.get_name()}"] = system, port
+    for below in system.GetSystems() if isinstance(system, Diagram) else ():
+        ports |= output_ports(below, path=f"{prefix}{below.get_name()}")
+    return ports
 
 
 class Group(NamedTuple):

@@ -19,7 +19,7 @@ from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Vari
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
 from vtbdrake.state.snapshot import StateCopier
-from vtbdrake.state.systems import is_plant, is_python, leaves
+from vtbdrake.state.systems import is_plant, is_python, leaves, output_ports
 from vtbdrake.state.variables import X, check_address
 from vtbdrake.testbed.dps_state import DpsReader
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
@@ -379,12 +379,7 @@ class AddressedDiagram:
 
     @cached_property
     def _ports(self) -> dict[str, tuple[System, OutputPort]]:
-        ports = {}
-        for path, system in [("", self.diagram), *_all_systems(self.diagram)]:
-            for i in range(system.num_output_ports()):
-                port = system.get_output_port(i)
-                ports[f"{path}.{port.get_name()}".lstrip(".")] = (system, port)
-        return ports
+        return output_ports(self.diagram)
 
     @cached_property
     def _inputs(self) -> dict[str, InputPort]:
@@ -468,16 +463,6 @@ def _sampling_part(diagram: Diagram) -> SlowPart | None:
             f"a DPS has at most one slow part that samples its state, not {len(sampling)}: {', '.join(sampling)}"
         )
     return next(iter(sampling.values()), None)
-
-
-def _all_systems(diagram: Diagram, path: str = "") -> list[tuple[str, System]]:
-    systems = []
-    for system in diagram.GetSystems():
-        below = f"{path}.{system.get_name()}".lstrip(".")
-        systems.append((below, system))
-        if isinstance(system, Diagram):
-            systems += _all_systems(system, below)
-    return systems
 
 
 def _port_reader(port: OutputPort, context_of: Callable[[Context], Context]) -> Callable[[Context], Any]:

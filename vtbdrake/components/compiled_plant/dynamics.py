@@ -146,6 +146,9 @@ class PlantDynamics:
     def function(self, name: str, arguments: Sequence[Expression], results: dict[str, Expression]) -> casadi.Function:
         """Return the function of x and u, and of the inputs, with common subexpressions eliminated."""
         names = ["x", "u", *(input_name(address) for address in self.inputs)]
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ValueError(f"the inputs need names of their own, but {', '.join(doubled)} is given more than once.")
         values = [casadi.densify(value) for value in results.values()]
         return casadi.Function(name, [*arguments, *self._symbols.values()], values, names, list(results), {"cse": True})
 

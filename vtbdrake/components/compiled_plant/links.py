@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, ForceElementIndex, Frame, Joint, ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ForceElementIndex,
+    Frame,
+    Joint,
+    JointIndex,
+    ModelInstanceIndex,
+    RigidBody,
+)
 from pydrake.systems.framework import Context
 
 from vtbdrake.state.multibody import bodies, element_address
@@ -253,10 +261,8 @@ class _Reader:
             if address not in self._symbols:
                 near = difflib.get_close_matches(address, self._offered, n=1, cutoff=0.0)
                 raise ValueError(f"{address!r} cannot be an input of this plant; did you mean {near[0]!r}?")
-        names = [input_name(address) for address in self._inputs]
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
-            raise ValueError(f"the inputs need names of their own, but {', '.join(doubled)} is given more than once.")
+            if self._inputs.count(address) > 1:
+                raise ValueError(f"the input {address} is given more than once.")
 
     def _address(self, element: Any) -> str:
         return element_address(self._plant, element, lambda instance: "")
@@ -270,16 +276,18 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
             yield f"the joint {joint.name()} is of type {joint.type_name()}"
         elif joint.is_locked(context):
             yield f"the joint {joint.name()} is locked"
-    drives: dict[str, list[str]] = {}
+    drives: dict[JointIndex, list[str]] = {}
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
         if actuator.has_controller():
             yield f"the actuator {actuator.name()} has a PD controller"
-        drives.setdefault(actuator.joint().name(), []).append(actuator.name())
-    for joint_name, names in drives.items():
+        # By index: joints of two model instances may have one name.
+        drives.setdefault(actuator.joint().index(), []).append(actuator.name())
+    for joint_index, names in drives.items():
         if len(names) > 1:
             # Drake sums their torques in a continuous plant, but takes those of the last in a discrete one; of their
             # reflected inertias it takes the last in both.
+            joint_name = plant.get_joint(joint_index).name()
             yield f"the joint {joint_name} has {len(names)} actuators ({', '.join(names)}): give it one"
     yield from _other_inputs(plant, context)
     if plant.num_constraints():
