@@ -85,6 +85,11 @@ def all_of(kind: Any, values: Any, *, name: str, form: str) -> tuple[Any, ...]:
     return entries
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, such as 1 recording or 2 recordings."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def suggestion(address: str, addresses: Iterable[str]) -> str:
     """Return the end of an error message that suggests addresses similar to ``address``."""
     addresses = list(dict.fromkeys(addresses))  # A variable and an output port may share an address.

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.satellite.supervisor import Mode
@@ -73,5 +74,5 @@ def film_strip(testbed: VirtualTestbed, times: Sequence[float]) -> Figure:
             axis.set_axis_off()
         count = int(testbed.read(context, "dps.env.markers.count"))
         column[0].set_title(f"{time:g} s: {mode}")
-        column[1].set_title(f"docking camera, {count} marker{'' if count == 1 else 's'}", fontsize="small")
+        column[1].set_title(f"docking camera, {counted(count, 'marker')}", fontsize="small")
     return figure

@@ -465,7 +465,7 @@ def test_a_design_is_cut_to_the_rest_of_the_budget():
             "one number per parameter, 2, not 3",
         ),
         ("grid", {}, "solver", {"solver": "LN_BOBYQA"}, "LN_BOBYQA varies continuous parameters, but .* CMA-ES can"),
-        ("CMA-ES", {}, "solver", {"solver": "QMC", "options": {"batch": 0}}, "a batch has at least one point"),
+        ("CMA-ES", {}, "solver", {"solver": "QMC", "options": {"batch": 0}}, "a batch has at least 1 point"),
     ],
 )
 def test_what_a_solver_cannot_search_is_refused_by_its_name(solver, options, kind, payload, message):

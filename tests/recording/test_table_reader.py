@@ -84,7 +84,7 @@ def test_what_is_left_out_is_said() -> None:
     assert log.remarks == (
         "the table: q: 1 of 6 rows are not whole",
         "the table: q: 1 of 5 times are repeated; the last row counts",
-        "the table: q: 1 gaps of more than 5 periods of 20 ms, the first from 0.03 to 0.5 s",
+        "the table: q: 1 gap of more than 5 periods of 20 ms, the first from 0.03 to 0.5 s",
         "the table: q: entries that never change: 1",
     )
 

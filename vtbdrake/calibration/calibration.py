@@ -12,6 +12,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
 from vtbdrake.calibration.fisher import Information, information_of
@@ -131,8 +132,9 @@ class Calibration:
 
     def _header(self) -> str:
         return (
-            f"{len(self.sources)} recordings, {self.segments} segments: innovations {self.fit:.3g} (hold-out "
-            f"{self.holdout:.3g}, 1 is expected), largest autocorrelation {self.correlation:.2g}"
+            f"{counted(len(self.sources), 'recording')}, {counted(self.segments, 'segment')}: innovations "
+            f"{self.fit:.3g} (hold-out {self.holdout:.3g}, 1 is expected), largest autocorrelation "
+            f"{self.correlation:.2g}"
         )
 
 

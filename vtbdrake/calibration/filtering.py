@@ -26,6 +26,7 @@ import scipy.linalg
 import scipy.signal
 from numpy.typing import NDArray
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.model import CalibrationError, JointModel
 from vtbdrake.components.casadi_system.compiler import compiled_if_possible
@@ -107,7 +108,8 @@ class JointRecording:
         spans = [slice(*pair) for pair in pairwise(ends) if pair[1] - pair[0] >= _FEWEST]
         if not spans:
             raise CalibrationError(
-                f"{self.source}: {cuts.size} gaps leave no {_FEWEST} positions in a row: the recording is too sparse"
+                f"{self.source}: {counted(cuts.size, 'gap')} leave no {_FEWEST} positions in a row: the recording "
+                "is too sparse"
             )
         return [replace(self, times=self.times[span], q=self.q[span], u=self.u[span]) for span in spans]
 

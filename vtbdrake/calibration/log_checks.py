@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording, stale
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
@@ -105,7 +106,7 @@ def _of_clock(label: str, series: Series) -> Iterator[str]:
     if gaps.any():
         first = int(np.flatnonzero(gaps)[0])
         yield (
-            f"{label} has {int(gaps.sum())} gaps, {steps[gaps].sum():.3g} s in all, the first at "
+            f"{label} has {counted(int(gaps.sum()), 'gap')}, {steps[gaps].sum():.3g} s in all, the first at "
             f"{series.times[first]:.6g} s; the recording is cut there"
         )
     if jitter > _UNEVEN * period:

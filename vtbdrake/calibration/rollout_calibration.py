@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.arrays import Array
 from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict, calibrated_scenario, kept_back
 from vtbdrake.calibration.fisher import Information
@@ -100,8 +101,8 @@ class RolloutCalibration(Calibration):
     def _header(self) -> str:
         outside = "" if self.outside is None else f", {self.outside:.0%} outside ({self.chance:.0%} by chance)"
         return (
-            f"{len(self.sources)} recordings, {self.segments} windows: loss {self.fit:.4g} (hold-out "
-            f"{self.holdout:.4g}){outside}; {self.rollouts} rollouts"
+            f"{counted(len(self.sources), 'recording')}, {counted(self.segments, 'window')}: loss {self.fit:.4g} "
+            f"(hold-out {self.holdout:.4g}){outside}; {self.rollouts} rollouts"
         )
 
 

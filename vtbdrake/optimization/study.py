@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_whole
+from vtbdrake.argument_checks import as_whole, counted
 from vtbdrake.closing import Closing
 from vtbdrake.failures import safe_text
 from vtbdrake.lazy import extra_module
@@ -161,7 +161,7 @@ class Study(Closing):
 
     def __repr__(self) -> str:
         where = "in memory" if self.path is None else str(self.path)
-        return f"Study({where}: {len(self)} rollouts, solver {self._meta['solver']})"
+        return f"Study({where}: {counted(len(self), 'rollout')}, solver {self._meta['solver']})"
 
     def _repr_html_(self) -> str:
         """Show the summary with the values so far in a notebook."""
@@ -672,9 +672,8 @@ class Study(Closing):
         messages = [outcome.message for outcome in self.rollouts.values() if outcome.failed]
         if not messages:
             return ""
-        count = "1 rollout" if len(messages) == 1 else f"{len(messages)} rollouts"
         first = "" if len(set(messages)) == 1 else ", the first"
-        return f"; {count} failed{first}: {messages[0]}"
+        return f"; {counted(len(messages), 'rollout')} failed{first}: {messages[0]}"
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Return columns by name, one entry per trial.
@@ -710,8 +709,8 @@ class Study(Closing):
         trials, outcomes = self.trials, self.rollouts
         methods = Counter(trial.method for trial in trials)
         lines = [
-            f"{len(trials)} points, {len(outcomes)} rollouts; solver {self._meta['solver']}, seed "
-            f"{self._meta['seed']}{self._width}: "
+            f"{counted(len(trials), 'point')}, {counted(len(outcomes), 'rollout')}; solver {self._meta['solver']}, "
+            f"seed {self._meta['seed']}{self._width}: "
             + ", ".join(f"{method} ({count})" for method, count in methods.items())
         ]
         for change in self._meta.get("changes", []):
@@ -724,7 +723,10 @@ class Study(Closing):
         dropped = sum(not trial.exact for trial in trials)
         if dropped:
             saved = len(trials) * len(self._meta["problem"]["conditions"]) - len(outcomes)
-            lines.append(f"racing dropped {dropped} points before all their conditions had run, {saved} rollouts less")
+            lines.append(
+                f"racing dropped {counted(dropped, 'point')} before all conditions had run, "
+                f"{counted(saved, 'rollout')} less"
+            )
         ends = Counter(outcome.end for outcome in outcomes.values())
         times = sorted(outcome.wall_time for outcome in outcomes.values() if outcome.wall_time == outcome.wall_time)
         if times:
@@ -743,7 +745,7 @@ class Study(Closing):
     def _result(self) -> str:
         """Return the best point, or the size of the Pareto front, in a line."""
         if len(self.directions) > 1:
-            return f"Pareto front of {len(self.pareto())} points"
+            return f"Pareto front of {counted(len(self.pareto()), 'point')}"
         try:
             best = self.best
         except ValueError as error:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_whole, check_plain
+from vtbdrake.argument_checks import all_of, as_whole, check_plain, counted
 from vtbdrake.lazy import extra_module
 from vtbdrake.optimization.parameter import Parameter, point_text
 from vtbdrake.optimization.records import RolloutKey
@@ -60,7 +60,7 @@ class Sweep:
     def __repr__(self) -> str:
         ranges = ", ".join(f"{p.address} in {p.range_text}" for p in self.parameters)
         interrupted = "" if self.complete else ", interrupted"
-        return f"Sweep({len(self)} rollouts over {ranges}{interrupted})"
+        return f"Sweep({counted(len(self), 'rollout')} over {ranges}{interrupted})"
 
     def _repr_html_(self) -> str:
         """Show a summary with a plot in a notebook."""

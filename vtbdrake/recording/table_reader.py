@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.argument_checks import suggestion
+from vtbdrake.argument_checks import counted, suggestion
 from vtbdrake.arrays import Array
 from vtbdrake.lazy import extra_module
 from vtbdrake.recording.log import Log, Series
@@ -164,8 +164,8 @@ def _series(label: str, times: Array, values: Array, remarks: list[str]) -> Seri
     if gaps.size:
         first = gaps[0]
         remarks.append(
-            f"{label}: {gaps.size} gaps of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first from "
-            f"{series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
+            f"{label}: {counted(gaps.size, 'gap')} of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first "
+            f"from {series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
         )
     still: list[int] = np.flatnonzero((series.values == series.values[0]).all(axis=0)).tolist()
     if still and len(series) > 1:

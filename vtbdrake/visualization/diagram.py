@@ -11,6 +11,7 @@ from pydrake.geometry import MeshcatVisualizer
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, System
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.testbed import Signal, VirtualTestbed
 from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
 
@@ -368,7 +369,7 @@ def _arrow_head(color: str) -> str:
 
 
 def _signals(wires: tuple[Wire, ...]) -> str:
-    return "1 signal" if len(wires) == 1 else f"{len(wires)} signals"
+    return counted(len(wires), "signal")
 
 
 def _cut(text: str, length: int) -> str:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vtbdrake.argument_checks import counted
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 
 # A point s^0: one value per parameter, in their order.
@@ -177,8 +178,7 @@ class Search:
             SolverError: The requested number is below ``least``.
         """
         if requested is not None and requested < least:
-            points = "one point" if least == 1 else f"{least} points"
-            raise SolverError(f"a batch has at least {points}, not {requested}")
+            raise SolverError(f"a batch has at least {counted(least, 'point')}, not {requested}")
         return max(usual, self.parallel or 1) if requested is None else requested
 
     def point(self, u: Any) -> Point:
