@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from math import inf
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -14,9 +15,20 @@ from vtbdrake.compiled.trace import traced
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
-from vtbdrake.rollout import Constraint, Cutoff, Pruning, Quality, RolloutResult, RolloutTask, SerialExecutor
+from vtbdrake.rollout import (
+    Constraint,
+    Cutoff,
+    Executor,
+    Pruning,
+    Quality,
+    RolloutResult,
+    RolloutTask,
+    SerialExecutor,
+    ThreadExecutor,
+    make_executor,
+)
 from vtbdrake.rollout.compiled import CompiledExecutor
-from vtbdrake.rollout.executor import run_rollouts
+from vtbdrake.rollout.executor import COMPILE_FROM, run_rollouts
 from vtbdrake.rollout.start import Start
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.cart_pole.decision import reasoning
@@ -286,3 +298,55 @@ def test_at_a_deadline_the_rest_of_the_rollouts_is_left_out() -> None:
         results = dict(executor.run(task, rollouts, cutoff=Cutoff(deadline=time.monotonic() + 0.2)))
     assert len(results) < len(rollouts)
     assert all(result.identical(expected[i % 20]) for i, result in results.items())
+
+
+def auto(rollouts: int) -> Executor:
+    return make_executor("auto", testbed=SCENARIO.build(), rollouts=rollouts, workers=2)
+
+
+def test_auto_compiles_the_testbed_of_many_rollouts() -> None:
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    few, many = (outcomes(task, points(3), auto(rollouts)) for rollouts in (COMPILE_FROM - 1, COMPILE_FROM))
+    assert {result.computed for result in few} == {"drake"} != {result.computed for result in many} == {"compiled"}
+    assert_same(many, few)
+
+
+@pytest.mark.parametrize(
+    ("options", "point", "reason"),
+    [
+        ({}, {"scenario.period": 0.02}, "each value of scenario.period would be compiled anew"),
+        ({"pruning": Pruning()}, {}, "compiled rollouts cannot do what pruning= asks for"),
+    ],
+)
+def test_auto_tells_once_why_nothing_is_compiled(
+    options: dict, point: dict, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    task = replace(RolloutTask(SCENARIO, 0.1, Quality(height, "plant.state")), **options)
+    with caplog.at_level("INFO"), auto(COMPILE_FROM) as executor:
+        results = [result for _ in range(2) for _, result in executor.run(task, [point, point])]
+    assert [result.computed for result in results] == 4 * ["drake"]
+    assert caplog.text.count("rollouts are simulated in Drake: ") == 1 and reason in caplog.text
+
+
+def test_what_is_not_compiled_runs_in_the_executor_that_is_given() -> None:
+    testbed = SCENARIO.build()
+    heavy, usual = testbed.default_context(), testbed.default_context()
+    testbed.write(heavy, {MASS: 1.3})
+    starts = [Start.of(testbed, context) for context in (heavy, usual, heavy, usual)]
+    task = RolloutTask(SCENARIO, 0.4, Quality(height, "plant.state"))
+    rollouts = [{PLAN: point[PLAN]} for point in points(4)]
+    with SerialExecutor() as serial, CompiledExecutor(compile=False, drake=ThreadExecutor(2)) as compiled:
+        expected = [result for _, result in serial.run(task, rollouts, start=starts)]
+        results = [result for _, result in sorted(compiled.run(task, rollouts, start=starts), key=itemgetter(0))]
+    assert_same(results, expected)
+    assert [result.computed for result in results] == 2 * ["drake", "compiled"]
+
+
+def test_more_rollouts_than_one_call_makes() -> None:
+    task = RolloutTask(SCENARIO, 0.05, Quality(height, "plant.state"))
+    rollouts = points(50)
+    with CompiledExecutor(compile=False) as executor:
+        expected = dict(executor.run(task, rollouts))
+        results = dict(executor.run(task, rollouts * 50))
+    assert len(results) == 2500
+    assert all(result.identical(expected[i % 50]) for i, result in results.items())

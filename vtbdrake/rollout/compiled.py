@@ -14,13 +14,13 @@ import numpy as np
 from vtbdrake.compiled import CompiledBatch, CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
 from vtbdrake.lru import LruDict
-from vtbdrake.rollout.executor import Executor, Parameters, checked_workers
+from vtbdrake.rollout.executor import Executor, Parameters, SerialExecutor, checked_workers
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.quality import Measure, QualityError, exceeds, read_quality
-from vtbdrake.rollout.runner import CancelledError, values_key
+from vtbdrake.rollout.runner import values_key
 from vtbdrake.rollout.start import Start, StartContext, StartError, Starts, start_of_each
 from vtbdrake.rollout.task import HORIZON, THRESHOLD, RolloutResult, RolloutTask
-from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Runners, Testbeds, split
+from vtbdrake.rollout.testbeds import FIELD, MAX_TESTBEDS, Testbeds, split
 from vtbdrake.state.variables import A
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.interrupt import Interruptible
@@ -28,6 +28,9 @@ from vtbdrake.testbed.interrupt import Interruptible
 _log = logging.getLogger(__name__)
 
 COMPILED = "compiled"
+
+# As many rollouts are computed in one call. Between calls, Ctrl-C is noticed and results come back.
+_BATCH = 1024
 
 
 class CompiledExecutor(Executor):
@@ -43,6 +46,8 @@ class CompiledExecutor(Executor):
         workers: Number of threads; by default the number of cores.
         max_testbeds: Number of testbeds that are kept, for points with different scenario fields.
         compile: Whether to make machine code; None: if there is a C compiler.
+        drake: Runs the rollouts that the compiled testbed cannot make, and is closed with this executor; by default
+            they run in this thread.
     """
 
     def __init__(
@@ -52,9 +57,10 @@ class CompiledExecutor(Executor):
         workers: int | None = None,
         max_testbeds: int = MAX_TESTBEDS,
         compile: bool | None = None,
+        drake: Executor | None = None,
     ) -> None:
         self._testbeds = Testbeds(testbed, max_testbeds=max_testbeds)
-        self._runners = Runners(self._testbeds)
+        self._drake = SerialExecutor(testbed, max_testbeds=max_testbeds) if drake is None else drake
         self._workers = checked_workers(workers)
         self._compile = compile
         self._compiled: LruDict[Hashable, _CompiledTask] = LruDict(max_testbeds)
@@ -73,22 +79,25 @@ class CompiledExecutor(Executor):
         for indices in _by_fields(points):
             compiled = self._of(task, [points[i] for i in indices])
             while indices:
-                count = len(indices) if cutoff is None else compiled.affordable(cutoff)
+                count = _BATCH if cutoff is None else min(_BATCH, compiled.affordable(cutoff))
                 batch, indices = indices[:count], indices[count:]
                 if not batch:
                     return
                 results = compiled.run([points[i] for i in batch], [starts[i] for i in batch])
+                left = []
                 for i, result in zip(batch, results, strict=True):
                     if result is None:
-                        try:
-                            result = self._runners.run(task, points[i], start=starts[i], cutoff=cutoff)
-                        except CancelledError:
-                            return
-                    yield i, result
+                        left.append(i)
+                    else:
+                        yield i, result
+                if left:
+                    begin = None if start is None else [each for i in left if (each := starts[i])]
+                    for k, result in self._drake.run(task, [points[i] for i in left], start=begin, cutoff=cutoff):
+                        yield left[k], result
 
     def close(self) -> None:
         self._compiled.clear()
-        self._runners.clear()
+        self._drake.close()
 
     def prepare(self, task: RolloutTask, points: Sequence[Parameters]) -> None:
         """Compile the testbed of a task, for points like these; the errors are those of `run`."""
@@ -107,6 +116,49 @@ class CompiledExecutor(Executor):
                 compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
             self._compiled.add(key, compiled)
         return compiled
+
+
+class AutoExecutor(Executor):
+    """Rollouts in the compiled testbed, if that is possible; otherwise in Drake.
+
+    The log tells why a testbed is not compiled, and ``RolloutResult.computed`` how a rollout was made. The choice does
+    not depend on how long rollouts take, so that a study that is repeated is computed as before. Rollouts are in Drake
+    where a field of the scenario is varied: each of its values would be compiled anew.
+
+    Args:
+        testbed: A testbed to use for tasks of its scenario; others are built.
+        drake: Runs the rollouts in Drake, and is closed with this executor.
+        workers: Number of threads of compiled rollouts; by default the number of cores.
+    """
+
+    def __init__(self, testbed: VirtualTestbed, drake: Executor, *, workers: int | None = None) -> None:
+        self._compiled = CompiledExecutor(testbed, workers=workers, drake=drake)
+        self._drake = drake
+        self._refused: RolloutTask | None = None
+
+    def run(
+        self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
+    ) -> Iterator[tuple[int, RolloutResult]]:
+        executor = self._compiled if points and self._compiles(task, points) else self._drake
+        yield from executor.run(task, points, start=start, cutoff=cutoff)
+
+    def _compiles(self, task: RolloutTask, points: Sequence[Parameters]) -> bool:
+        """Return whether the testbed of a task is compiled; what was refused once is not tried again."""
+        if task is self._refused:
+            return False
+        fields = sorted(address for address in frozenset().union(*points) if address.startswith(FIELD))
+        try:
+            if fields:
+                raise UnsupportedTestbedError(f"each value of {fields[0]} would be compiled anew")
+            self._compiled.prepare(task, points)
+        except (ValueError, ArithmeticError) as error:
+            self._refused = task
+            _log.info("rollouts are simulated in Drake: %s", error)
+            return False
+        return True
+
+    def close(self) -> None:
+        self._compiled.close()
 
 
 class _CompiledTask:

@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 # A thread whose rollout has not stopped after so many seconds is not waited for any more.
 GRACE = 10.0
 
+# Of so many rollouts, ``auto`` compiles their testbed, which takes some seconds.
+COMPILE_FROM = 200
+
 NAMES = ("auto", "serial", "threads", "processes", "dask", "compiled")
 
 
@@ -283,7 +286,9 @@ def make_executor(
 
     Args:
         executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask`` or ``compiled``; an Executor of ours; any
-            `concurrent.futures.Executor`; or a `distributed.Client`.
+            `concurrent.futures.Executor`; or a `distributed.Client`. ``auto`` takes the compiled testbed for 200
+            rollouts and more, if it can be compiled (see `AutoExecutor`); else threads, processes where systems in
+            Python have work to do, or this thread alone for a single worker.
         testbed: The testbed of the rollouts; serial rollouts and threads use it.
         rollouts: The number of rollouts; a single one is run in this thread.
         workers: The number of threads or processes; by default the number of cores.
@@ -295,8 +300,13 @@ def make_executor(
     """
     if executor == "auto":
         alone = min(rollouts, checked_workers(workers)) <= 1
-        executor = "processes" if time_limit is not None else "serial" if alone else choose_executor(testbed)
-        workers = None if executor == "serial" else workers
+        in_drake = "processes" if time_limit is not None else "serial" if alone else choose_executor(testbed)
+        of_drake = None if in_drake == "serial" else workers
+        if time_limit is None and rollouts >= COMPILE_FROM:
+            from vtbdrake.rollout.compiled import AutoExecutor
+
+            return AutoExecutor(testbed, _by_name(in_drake, testbed=testbed, workers=of_drake), workers=workers)
+        executor, workers = in_drake, of_drake
     from vtbdrake.rollout.futures import FuturesExecutor
     from vtbdrake.rollout.worker_processes import ProcessExecutor
 
@@ -318,7 +328,7 @@ def make_executor(
     raise ValueError(_unknown(executor))
 
 
-def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_limit: float | None) -> Executor:
+def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_limit: float | None = None) -> Executor:
     from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor
 
     if name in ("serial", "threads", "compiled") and time_limit is not None:
