@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 
 from vtbdrake.argument_checks import as_whole
 from vtbdrake.rollout.start import Start
-from vtbdrake.state import VariableError
+from vtbdrake.state import Variable, VariableError
 from vtbdrake.state.layout import FlatState, LayoutError
 from vtbdrake.state.variables import A, with_unit
 from vtbdrake.testbed import VirtualTestbed
@@ -207,25 +207,17 @@ class BeliefToStart:
         vectors = {signal.name for signal in [*mental.interface.sense, *mental.interface.act] if signal.is_vector}
         self._sensors = {n: s for n, s in mental.simulated_sensors.items() if n in vectors and can_resume(s)}
         self._actuators = {n: s for n, s in mental.simulated_actuators.items() if n in vectors and can_resume(s)}
-        copied: list[_Target] = []
-        self._computed: list[tuple[BeliefRule, list[_Target]]] = []
-        for rule in mental.belief_rules:
-            targets = [_Target(mental, rule, number) for number in range(len(rule.targets))]
-            if all(target.is_copy and target.address not in uncertain for target in targets):
-                copied += targets
-            else:
-                self._computed.append((rule, targets))
-        self._copied = _Copied(copied)
+        self._rules = [_Rule(mental, rule, drawn=uncertain) for rule in mental.belief_rules]
         self._estimates = {
             address: (variable, mental.dps_layout.slice_of(variable))
-            for rule, _ in self._computed
+            for rule in mental.belief_rules
             for address in rule.of
             for variable in [self._variables[address]]
         }
         self._draws = {address: self._draw(address, how) for address, how in spreads.items()}
         # The believed values of uncertain variables without a rule.
         self._prior = {a: np.asarray(self._variables[a].get(self._context)) for a in uncertain}
-        set_by = [*self._prior, *(address for rule in mental.belief_rules for address in rule.targets)]
+        set_by = [*self._prior, *(target.address for rule in self._rules for target in rule.targets)]
         self._kinds = {a: (v.kind, mental.start_layout.slice_of(v)) for a in set_by for v in [self._variables[a]]}
 
     def _whole(self, sample: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
@@ -276,7 +268,7 @@ class BeliefToStart:
         self._check_belief(belief, now)
         if belief.world is not None:
             return self._perfect(belief.dps, belief.world)
-        return self._start(belief.dps, self._believed(belief.dps))
+        return self._start(belief.dps, *self._believed(belief.dps))
 
     def starts(self, belief: Belief, *, samples: int, now: float = -inf) -> list[Start]:
         """Return starts in ``samples`` worlds, drawn from the belief and its uncertainty; see `start`.
@@ -290,13 +282,13 @@ class BeliefToStart:
         if not (self._draws or self._samples) or belief.world is not None:
             return [self.start(belief, now=now)] * samples
         self._check_belief(belief, now)
-        believed = self._believed(belief.dps)
+        numbers, believed = self._believed(belief.dps)
         starts = []
         for n in range(samples):
             rng = np.random.default_rng([self._seed, n])
             drawn = {a: self._drawn(a, draw(np.asarray(believed[a]), rng)) for a, draw in self._draws.items()}
             drawn |= self._samples[n % len(self._samples)] if self._samples else {}
-            starts.append(self._start(belief.dps, believed | drawn))
+            starts.append(self._start(belief.dps, numbers, believed | drawn))
         return starts
 
     def _drawn(self, address: str, value: ArrayLike) -> np.ndarray:
@@ -324,8 +316,11 @@ class BeliefToStart:
                 "allowed (max_age)"
             )
 
-    def _believed(self, dps: DpsState) -> dict[str, ArrayLike]:
-        """Return the believed values by address, except copies of single estimates (see `_Copied`)."""
+    def _believed(self, dps: DpsState) -> tuple[np.ndarray, dict[str, ArrayLike]]:
+        """Return the numbers of the start layout, with the DPS and all that is written into them at once (see `_Rule`).
+
+        And the other believed values, by address.
+        """
         if not self._mental.belief_rules:
             raise BeliefError(
                 f"{self._mental.scenario!r} does not declare which estimates of its DPS set its simulated world: "
@@ -338,19 +333,23 @@ class BeliefToStart:
                 raise BeliefError(f"the DPS has not received {name} yet, so that it does not know its world")
         if None in [place for _, place in self._estimates.values()]:
             self._mental.dps_layout.put(self._context, dps.contents)
-        numbers, estimates = dps.contents.numbers, {}
+        of_dps, estimates = dps.contents.numbers, {}
         for address, (variable, place) in self._estimates.items():
             if place is None:
                 estimates[address] = variable.get(self._context)
             elif variable.shape:
-                estimates[address] = numbers[place].reshape(variable.shape)
+                estimates[address] = of_dps[place].reshape(variable.shape)
             else:
-                estimates[address] = numbers.item(place.start)
-        believed: dict[str, ArrayLike] = dict(self._prior)
-        for rule, targets in self._computed:
-            values = rule.values_of([estimates[address] for address in rule.of], late=rule.late(dps.time))
-            believed |= {t.address: t.checked(value, estimates) for t, value in zip(targets, values, strict=True)}
-        return believed
+                estimates[address] = of_dps.item(place.start)
+        numbers, believed = self._default.numbers.copy(), dict[str, ArrayLike](self._prior)
+        numbers[self._dps] = of_dps
+        for rule in self._rules:
+            values = rule.values(estimates, dps.time)
+            if rule.places is None:
+                believed |= zip(rule.addresses, values, strict=True)
+            else:
+                numbers[rule.places] = values
+        return numbers, believed
 
     def _check_dps(self, dps: DpsState) -> None:
         try:
@@ -365,12 +364,10 @@ class BeliefToStart:
         commands = {f"{COMMAND}{name}": value for name, value in dps.commands.items()}
         return {address: value for address, value in commands.items() if address in self._variables}
 
-    def _start(self, dps: DpsState, believed: Mapping[str, ArrayLike]) -> Start:
-        """Return the start of a rollout with the believed values, in which the DPS continues."""
+    def _start(self, dps: DpsState, believed_numbers: np.ndarray, believed: Mapping[str, ArrayLike]) -> Start:
+        """Return the start of a rollout with the believed values (see `_believed`), in which the DPS continues."""
         context, layout, commands = self._context, self._mental.start_layout, self._commands(dps)
-        numbers, rest, later = np.array(self._default.numbers), {}, {}
-        numbers[self._dps] = dps.contents.numbers
-        self._copied.write(dps.contents.numbers, numbers)
+        numbers, rest, later = believed_numbers.copy(), {}, {}
         for address, value in believed.items():
             kind, place = self._kinds[address]
             if place is not None:
@@ -381,7 +378,7 @@ class BeliefToStart:
                 rest[address] = value
         context.SetTime(dps.time)
         abstract = {**self._default.abstract, **dps.contents.abstract}
-        layout.put(context, replace(self._default, numbers=numbers, abstract=abstract))
+        layout.put(context, FlatState(layout.names, numbers, abstract))
         try:
             # The commands matter here to actuators alone.
             self._variables.write(context, rest | commands if self._actuators else rest)
@@ -415,88 +412,101 @@ class BeliefToStart:
         return Start(dps.time, self._mental.whole_layout.take(context), values)
 
 
-class _Target:
-    """A variable of the simulated world that a rule sets.
+class _Rule:
+    """A rule of a mental testbed.
 
     Args:
         mental: The testbed of the rollouts.
         rule: The rule.
-        number: The number of the variable among the targets of the rule.
+        drawn: Addresses of the variables that are drawn.
+
+    Attributes:
+        targets: What it sets.
+        addresses: The addresses of the targets.
+        places: Where the targets lie in the numbers of the start layout, if all are single numbers there, such as joint
+            angles, and none is drawn: they are checked and written at once.
     """
 
-    def __init__(self, mental: VirtualTestbed, rule: BeliefRule, number: int) -> None:
-        self.rule = rule
-        self.address = rule.targets[number]
-        self.variable = mental.variables()[self.address]
-        lower, upper = (np.asarray(bound, dtype=float) for bound in self.variable.bounds)
-        distance = upper - lower
-        self._tolerance = np.where(np.isfinite(distance), _BEYOND * distance, 0.0)
-        # An infinite value is within no bounds.
-        largest = np.finfo(float).max
-        self._least, self._most = np.maximum(lower, -largest), np.minimum(upper, largest)
-        # The places of the estimate, or of one of its entries, and of the variable, if that is a copy.
-        source = mental.dps_layout.slice_of(mental.variables()[rule.of[0]]) if rule.by is None else None
-        is_fitting = source is not None and source.stop - source.start == len(rule.targets)
-        self.source = source.start + number if source is not None and is_fitting else None
-        self.place = mental.start_layout.slice_of(self.variable)
-        # The bounds of a scalar; no value lies within those of an array.
-        self.interval = (float(self._least), float(self._most)) if self.variable.shape == () else (inf, -inf)
+    def __init__(self, mental: VirtualTestbed, rule: BeliefRule, *, drawn: Collection[str]) -> None:
+        self._rule = rule
+        self.addresses = rule.targets
+        self.targets = [_Target(mental.variables()[address]) for address in rule.targets]
+        places = [mental.start_layout.slice_of(target.variable) for target in self.targets]
+        single = [place.start for place in places if place is not None and place.stop - place.start == 1]
+        is_whole = len(single) == len(places) and not set(rule.targets) & set(drawn)
+        self.places = np.array(single) if is_whole else None
+        self._ends = np.array([target.ends for target in self.targets]).T if is_whole else np.empty((2, 0))
 
-    @property
-    def is_copy(self) -> bool:
-        """Return whether the believed value is one number of the contents of the DPS, unchanged."""
-        return self.source is not None and self.place is not None and self.variable.shape == ()
-
-    def checked(self, value: Any, estimates: Mapping[str, Any]) -> ArrayLike:
-        """Return the believed value, within the bounds of the variable.
+    def values(self, estimates: Mapping[str, Any], time: float) -> Sequence[ArrayLike] | np.ndarray:
+        """Return the believed values of the targets, within the bounds of their variables.
 
         Args:
-            value: The value by the rule.
-            estimates: Address -> value of the estimates of the rule, for messages.
-
-        Raises:
-            BeliefError: The value is missing, or lies beyond the bounds.
-        """
-        if isinstance(value, float) and self.interval[0] <= value <= self.interval[1]:
-            return value  # Most are of joints: numpy would take ten times as long.
-        variable = self.variable
-        basis = {address: np.asarray(estimates[address]).tolist() for address in self.rule.of}
-        try:
-            believed = np.asarray(value, dtype=float).reshape(variable.shape)
-        except (TypeError, ValueError) as error:
-            raise BeliefError(
-                f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, of {basis}"
-            ) from error
-        if not np.isfinite(believed).all():
-            raise BeliefError(f"the belief about {variable.address} is missing: {believed.tolist()}, of {basis}")
-        if ((believed < self._least - self._tolerance) | (believed > self._most + self._tolerance)).any():
-            amount, allowed = with_unit(str(believed.tolist()), variable.unit), variable.bounds_text()
-            raise BeliefError(
-                f"the belief about {variable.address} is {amount}, of {basis}, but it must lie in {allowed}"
-            )
-        return np.clip(believed, self._least, self._most)
-
-
-class _Copied:
-    """Scalar variables that are copies of single estimates, such as joint angles; written all at once."""
-
-    def __init__(self, targets: Sequence[_Target]) -> None:
-        self.targets = targets
-        self._from = np.array([target.source for target in targets], dtype=int)
-        self._to = np.array([target.place.start for target in targets if target.place], dtype=int)
-        self._least, self._most = np.array([target.interval for target in targets]).reshape(-1, 2).T
-
-    def write(self, estimates: np.ndarray, numbers: np.ndarray) -> None:
-        """Write the believed values into the numbers of a start.
+            estimates: Address -> value of estimates.
+            time: Time of the DPS in seconds.
 
         Raises:
             BeliefError: A value is missing, or lies beyond the bounds.
         """
-        values = estimates[self._from]
-        if not ((values >= self._least) & (values <= self._most)).all():
-            pairs = zip(self.targets, values.tolist(), strict=True)
-            values = np.array([target.checked(value, {target.rule.of[0]: value}) for target, value in pairs])
-        numbers[self._to] = values
+        basis = {address: estimates[address] for address in self._rule.of}
+        values = self._rule.values_of([*basis.values()], late=self._rule.late(time))
+        if isinstance(values, np.ndarray) and self.places is not None and values.dtype == float:
+            least, most = self._ends
+            if ((values >= least) & (values <= most)).all():
+                return values
+        return [target.checked(value, basis) for target, value in zip(self.targets, values, strict=True)]
+
+
+class _Target:
+    """A variable of the simulated world that a rule sets.
+
+    Attributes:
+        address: Its address.
+        variable: The variable.
+        ends: The ends of its bounds; an infinite value is within no bounds.
+    """
+
+    def __init__(self, variable: Variable) -> None:
+        self.variable, self.address = variable, variable.address
+        lower, upper = (np.asarray(bound, dtype=float) for bound in variable.bounds)
+        distance = upper - lower
+        self._tolerance = np.where(np.isfinite(distance), _BEYOND * distance, 0.0)
+        largest = np.finfo(float).max
+        self.ends = np.maximum(lower, -largest), np.minimum(upper, largest)
+
+    def checked(self, value: Any, basis: Mapping[str, Any]) -> ArrayLike:
+        """Return the believed value, within the bounds of the variable.
+
+        Args:
+            value: The value by the rule.
+            basis: Address -> value of the estimates of the rule, for messages.
+
+        Raises:
+            BeliefError: The value is missing, or lies beyond the bounds.
+        """
+        variable, (least, most) = self.variable, self.ends
+        try:
+            believed = np.asarray(value, dtype=float).reshape(variable.shape)
+        except (TypeError, ValueError) as error:
+            raise BeliefError(
+                f"{variable.address} takes numbers of shape {variable.shape}, but {value!r} is believed, "
+                f"of {_plain(basis)}"
+            ) from error
+        if ((believed >= least) & (believed <= most)).all():
+            return believed
+        if not np.isfinite(believed).all():
+            raise BeliefError(
+                f"the belief about {variable.address} is missing: {believed.tolist()}, of {_plain(basis)}"
+            )
+        if ((believed < least - self._tolerance) | (believed > most + self._tolerance)).any():
+            amount, allowed = with_unit(str(believed.tolist()), variable.unit), variable.bounds_text()
+            raise BeliefError(
+                f"the belief about {variable.address} is {amount}, of {_plain(basis)}, but it must lie in {allowed}"
+            )
+        return np.clip(believed, least, most)
+
+
+def _plain(estimates: Mapping[str, Any]) -> dict[str, Any]:
+    return {address: np.asarray(estimate).tolist() for address, estimate in estimates.items()}
 
 
 def _resume(system: System, root: Context, value: Any) -> None:

@@ -106,7 +106,7 @@ class BeliefRule:
         last = self.period * (ceil(time / self.period - 1e-6) - 1)
         return self.age + time - last
 
-    def values_of(self, estimates: Sequence[ArrayLike], *, late: float = 0.0) -> Sequence[ArrayLike]:
+    def values_of(self, estimates: Sequence[ArrayLike], *, late: float = 0.0) -> Sequence[ArrayLike] | np.ndarray:
         """Return the value of each target.
 
         Args:
@@ -123,7 +123,7 @@ class BeliefRule:
             value = self.by(*estimates) if self.period is None else self.by(*estimates, late=late)
         if len(self.targets) == 1:
             return [value]
-        values = value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else list(value)
+        values = value if isinstance(value, np.ndarray) and value.ndim == 1 else list(value)
         if len(values) != len(self.targets):
             raise ValueError(f"the belief about {self.target} has {len(values)} values for {len(self.targets)} targets")
         return values
