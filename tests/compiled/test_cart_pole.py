@@ -168,7 +168,7 @@ def test_refuses_values_that_do_not_fit() -> None:
         rollouts({"u.plan": np.zeros(10)})
     with pytest.raises(ValueError, match=r"lies in \[-1e\+09"):
         rollouts({"u.plan": np.full(11, 100.0)})
-    with pytest.raises(ValueError, match="3 values of u.plan, but 2"):
+    with pytest.raises(ValueError, match="2 of .*bias.*, 3 of u.plan"):
         rollouts({BIAS: np.zeros((2, 2)), "u.plan": plans(3)})
 
 

@@ -12,9 +12,10 @@ import pytest
 
 from vtbdrake.compiled import UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
+from vtbdrake.components.casadi_system.kernel import TRANSLATIONS
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter, Problem
-from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
+from vtbdrake.reasoning import Belief, BeliefConfig, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import (
     Constraint,
     Cutoff,
@@ -218,6 +219,34 @@ def test_decisions_of_a_reasoner_on_board_are_the_same() -> None:
     assert decisions[0].chosen == decisions[1].chosen != 0
     assert decisions[0].quality == pytest.approx(decisions[1].quality, rel=1e-11)
     assert {r.computed for candidate in decisions[1].candidates for r in candidate.rollouts} == {"compiled"}
+
+
+def test_worlds_drawn_from_a_belief_are_compiled() -> None:
+    testbed, decisions = SCENARIO.build(), []
+    belief = BeliefConfig(samples=3, uncertainty={MASS: 0.1}, risk="mean")
+    for executor in ("serial", "compiled"):
+        with make_reasoner(SCENARIO, rollouts=12, executor=executor, belief=belief) as reasoner:
+            decisions.append(reasoner.decide(testbed, testbed.default_context()))
+    results = [[r for candidate in decision.candidates for r in candidate.rollouts] for decision in decisions]
+    assert {result.computed for result in results[1]} == {"compiled"}
+    values = [[result.value for result in each] for each in results]
+    assert len({*values[0]}) > len(decisions[0].candidates)  # Each world has another mass.
+    np.testing.assert_allclose(*values, rtol=1e-11)
+
+
+def test_warm_reasoner_compiles_nothing_whenever_it_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    translated = []
+    monkeypatch.setitem(TRANSLATIONS, None, lambda function: translated.append(function) or function)
+    scenario = CartPoleScenario(onboard=True)
+    testbed = scenario.build()
+    belief = Belief.of(testbed, testbed.default_context())
+    arguments = reasoning(scenario, "dps.planner.candidate", Budget(rollouts=4), executor="compiled")
+    with Reasoner(scenario=scenario, **arguments) as reasoner:
+        reasoner.warm_up()
+        compiled = list(translated)
+        for time in (0.0, 0.06 - 1e-8, 0.08, 0.0371, 12.34):
+            assert reasoner.decide(replace(belief, dps=replace(belief.dps, time=time)))
+    assert translated == compiled
 
 
 def test_auto_compiles_the_mental_testbed() -> None:

@@ -116,5 +116,6 @@ def _near(walker: Walker, z: Array, random: np.random.Generator) -> Array:
     for block in walker.blocks.values():
         if block.kind == DISCRETE:
             part = near[block.entries]
-            part += _SPREAD * (1.0 + np.abs(part)) * random.uniform(-1.0, 1.0, part.size)
+            finite = np.where(np.isfinite(part), part, 0.0)  # No decision has an infinite time, for example.
+            part += _SPREAD * (1.0 + np.abs(finite)) * random.uniform(-1.0, 1.0, part.size)
     return near

@@ -264,21 +264,37 @@ class CandidateEquations(Equations):
         super().__init__(system, context, varied)
         if not system.mental:
             raise refusal(system, "reasons itself: give it mental=True in a mental copy")
-        if system.on_request:
-            raise refusal(system, "works on request, which is not compiled")
         self.timing = Timing(system.period, system.due(0), unrestricted=True)
 
     def output(self, port: str, at: At) -> Expression:
         system: Any = self.system
         return at.state(system.groups[port])
 
+    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int | str, Expression]]]]:
+        system: Any = self.system
+        if system.on_request:
+            yield Timing(system.period, system.sampled(0), unrestricted=True), self._take_request
+        yield from super().updates()
+
+    def _take_request(self, at: At) -> dict[int | str, Expression]:
+        return self._of_candidate(at, 0.0, {"taken": at.input("request")})
+
     def update(self, at: At) -> dict[int | str, Expression]:
         system: Any = self.system
-        candidate, candidate_at = (at.parameter(group) for group in system.candidate_groups)
-        tick = casadi.floor((at.time - system.offset - system.latency) / system.period + 0.5)
-        sampled_at = system.offset + tick * system.period
-        is_shown = casadi.fabs(candidate_at - sampled_at) < 0.5 * system.period
-        shown = {"decision": candidate, "sampled_at": sampled_at, "valid": 1.0}
+        candidate = at.parameter(system.candidate_groups[0])
+        sampled_at = self._sampled_at(at, system.latency)
+        return self._of_candidate(at, system.latency, {"decision": candidate, "sampled_at": sampled_at, "valid": 1.0})
+
+    def _sampled_at(self, at: At, delay: float) -> Expression:
+        """Return when the sample was due that was taken ``delay`` seconds ago."""
+        system: Any = self.system
+        return system.offset + casadi.floor((at.time - system.offset - delay) / system.period + 0.5) * system.period
+
+    def _of_candidate(self, at: At, delay: float, shown: dict[str, Expression]) -> dict[int | str, Expression]:
+        """Return new values of ports if the sample taken ``delay`` seconds ago is that of the candidate."""
+        system: Any = self.system
+        candidate_at = at.parameter(system.candidate_groups[1])
+        is_shown = casadi.fabs(candidate_at - self._sampled_at(at, delay)) < 0.5 * system.period
         groups = system.groups
         return {groups[name]: casadi.if_else(is_shown, value, at.state(groups[name])) for name, value in shown.items()}
 

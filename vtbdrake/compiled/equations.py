@@ -115,7 +115,7 @@ class Equations(ABC):
 
     Attributes:
         system: The system.
-        timing: When it is updated; None: never.
+        timing: When `update` is made; None: never.
         memory: Numbers that the equations keep beside the system's own state, with their values at the begin.
         extras: Variables that lie in no numeric group, such as masses, by the name under which `At.extra` returns them,
             with their sizes; they are among those that vary.
@@ -151,6 +151,11 @@ class Equations(ABC):
     def update(self, at: At) -> dict[int | str, Expression]:
         """Return the next values of the discrete groups, by number, and of the memory, by name."""
         return {}
+
+    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int | str, Expression]]]]:
+        """Yield when the system is updated, and how; a system with updates at several timings has several."""
+        if self.timing is not None:
+            yield self.timing, self.update
 
     def fixed(self) -> Iterator[Fixed]:
         """Yield what is compiled in."""

@@ -23,6 +23,7 @@ from vtbdrake.compiled.plant import OVERRUN
 from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.compiled.walker import MEMORY, Walker
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
+from vtbdrake.lru import LruDict
 from vtbdrake.state import Variables
 from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.instants import sample_instants, sample_times
@@ -31,7 +32,8 @@ _log = logging.getLogger(__name__)
 
 # Steps that are called one after the other before they become a function of their own.
 _UNROLLED = 16
-_LARGEST_CHUNK = 128
+# As many rollouts are made in one call of a function; functions are kept of so many numbers.
+_LARGEST_CHUNK, _MAX_SIZES = 128, 16
 
 _NO_UPDATE = -1.0
 
@@ -163,50 +165,51 @@ class CompiledRollouts:
 
     def filled(self, z: Array, values: Mapping[str, ArrayLike]) -> Array:
         """Return n copies of z with values by address, shape (n, nz); see `__call__`."""
-        places = []
-        count = 1
-        for address, value in values.items():
-            variable = self.walker.variables[address]
-            try:
-                array = np.asarray(value, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{address} takes numbers, not {value!r}") from error
-            many = array.ndim == len(variable.shape) + 1
-            if array.shape[many:] != variable.shape:
-                raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
-            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.bounds)
-            if not (np.isfinite(array).all() and (array >= lower).all() and (array <= upper).all()):
-                raise ValueError(f"{address} is finite and lies in {variable.bounds_text()}")
-            if not array.size and many:
-                raise ValueError(f"there are no values of {address}: give one, or one for each of the rollouts")
-            if many and count not in (1, len(array)):
-                raise ValueError(f"there are {len(array)} values of {address}, but {count} of others")
-            count = len(array) if many else count
-            places.append((self.walker.place(address), array.reshape(len(array) if many else 1, -1)))
-        batch = np.repeat(z[np.newaxis], count, axis=0)
-        for entries, array in places:
-            batch[:, entries] = array
+        arrays = {address: self._checked(address, value) for address, value in values.items()}
+        counts = {len(array) for array in arrays.values()} - {1}
+        if len(counts) > 1:
+            numbers = ", ".join(f"{len(array)} of {address}" for address, array in arrays.items())
+            raise ValueError(f"each rollout takes one value of each variable, but there are {numbers}")
+        batch = np.repeat(z[np.newaxis], counts.pop() if counts else 1, axis=0)
+        for address, array in arrays.items():
+            batch[:, self.walker.place(address)] = array
         return batch
+
+    def _checked(self, address: str, value: ArrayLike) -> Array:
+        """Return the values of a variable, of one rollout or of n, as an array of shape (1 or n, size)."""
+        variable = self.walker.variables[address]
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{address} takes numbers, not {value!r}") from error
+        many = array.ndim == len(variable.shape) + 1
+        if array.shape[many:] != variable.shape:
+            raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
+        lower, upper = variable.bounds
+        if not (np.isfinite(array) & (array >= lower) & (array <= upper)).all():
+            raise ValueError(f"{address} is finite and lies in {variable.bounds_text()}")
+        if not array.size and many:
+            raise ValueError(f"there are no values of {address}: give one, or one for each of the rollouts")
+        return array.reshape(len(array) if many else 1, -1)
 
     def from_z(self, z: Array, t0: float) -> CompiledBatch:
         """Make the rollouts that begin at the vectors z, shape (n, nz), and the time t0 (s)."""
         self.walker.check_fixed(z, self._z0)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
-        chunks = list(_chunks(len(z)))
         noise = self._noise(z, instants, program.count)
-
-        def run(chunk: slice) -> tuple[Array, Array]:
-            return program.run(z[chunk], None if noise is None else noise[chunk], plan)
-
-        if self._workers > 1 and len(z) > _LARGEST_CHUNK:
-            with ThreadPoolExecutor(self._workers) as pool:
-                results = list(pool.map(run, chunks))
+        if len(z) <= _LARGEST_CHUNK:
+            final, recorded = program.run(z, noise, plan)
         else:
-            results = [run(chunk) for chunk in chunks]
-        final = np.concatenate([result[0] for result in results])
-        recorded = np.concatenate([result[1] for result in results])
-        valid = self.walker.is_finite(final) & (final[:, self._overruns] <= 0.0).all(axis=1)
+            chunks = [slice(k, k + _LARGEST_CHUNK) for k in range(0, len(z), _LARGEST_CHUNK)]
+            with ThreadPoolExecutor(self._workers) as pool:
+                results = list(
+                    pool.map(lambda part: program.run(z[part], None if noise is None else noise[part], plan), chunks)
+                )
+            final, recorded = (np.concatenate(parts) for parts in zip(*results, strict=True))
+        valid = self.walker.is_finite(final)
+        if self._overruns:
+            valid &= (final[:, self._overruns] <= 0.0).all(axis=1)
         outputs = {}
         start = 0
         for name, shape in self._shapes.items():
@@ -376,7 +379,7 @@ class _Program:
         results: Any = self.function(*arguments)
         packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
         self._packed = translate(packed)
-        self._buffers: dict[int, Buffers] = {}
+        self._buffers: LruDict[int, Buffers] = LruDict(_MAX_SIZES)
         self._lock = threading.Lock()
 
     def plan(self, instants: Sequence[Instant]) -> Array:
@@ -390,9 +393,11 @@ class _Program:
         """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny); see `plan`."""
         n, nz = z.shape
         with self._lock:
-            if n not in self._buffers:
-                self._buffers[n] = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
-        arguments, evaluate, result = self._buffers[n].parts
+            buffers = self._buffers.use(n)
+            if buffers is None:
+                buffers = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
+                self._buffers.add(n, buffers)
+        arguments, evaluate, result = buffers.parts
         arguments[: n * nz] = z.ravel()
         arguments[n * nz : n * (nz + plan.size)].reshape(n, -1)[:] = plan.ravel()
         if noise is not None:
@@ -451,12 +456,3 @@ def _chained(functions: Sequence[casadi.Function], sizes: Sequence[int]) -> casa
         z, y = function(z, when, random)
         recorded.append(y)
     return casadi.Function(f"rollout_{total}", [begin, instants, w], [z, casadi.horzcat(*recorded)])
-
-
-def _chunks(n: int) -> Any:
-    """Yield slices of n rollouts in powers of two, so that few sizes occur."""
-    start = 0
-    while start < n:
-        size = min(_LARGEST_CHUNK, 1 << ((n - start).bit_length() - 1))
-        yield slice(start, start + size)
-        start += size

@@ -121,8 +121,7 @@ class Walker:
                     refused.append(f"{path}: {error}")
         if refused:
             raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
-        timed = [equations.timing for equations in self.equations.values() if equations.timing is not None]
-        self.timings = tuple(dict.fromkeys(timed))
+        self.timings = tuple(dict.fromkeys(when for each in self.equations.values() for when, _ in each.updates()))
         self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
         self.size = max((block.entries.stop for block in self.blocks.values()), default=0)
         self.draws = tuple(self._reserved())
@@ -272,12 +271,14 @@ class Walker:
             at = Evaluation(self, z, time, w)
             following = casadi.SX(z)
             for path, equations in self.equations.items():
-                timing = equations.timing
-                if timing is None or timing.unrestricted != unrestricted or self.timings.index(timing) not in due:
-                    continue
-                for name, value in at.update(path).items():
-                    kind = DISCRETE if isinstance(name, int) else MEMORY
-                    following[self.blocks[path, kind, name].entries] = value
+                for timing, update in equations.updates():
+                    if timing.unrestricted != unrestricted or self.timings.index(timing) not in due:
+                        continue
+                    with _addressed(path):
+                        values = update(at.of(path))
+                    for name, value in values.items():
+                        kind = DISCRETE if isinstance(name, int) else MEMORY
+                        following[self.blocks[path, kind, name].entries] = value
             z = following
         return z
 
@@ -461,11 +462,9 @@ class Evaluation:
         self._under_way: list[tuple[str, str]] = []
         self.shared: dict[tuple[str, str], Any] = {}
 
-    def update(self, path: str) -> dict[int | str, Expression]:
-        """Return what an update of the system at a path returns."""
-        with _addressed(path):
-            following = self.walker.equations[path].update(_Reading(self, path))
-        return following
+    def of(self, path: str) -> At:
+        """Return what the system at a path reads."""
+        return _Reading(self, path)
 
     def output(self, path: str, port: str) -> Expression:
         """Return the value of an output port of a leaf system.
@@ -482,7 +481,7 @@ class Evaluation:
                 raise UnsupportedTestbedError(f"{path}: {self.walker.uncovered[path]}")
             self._under_way.append(key)
             with _addressed(path):
-                self._values[key] = self.walker.equations[path].output(port, _Reading(self, path))
+                self._values[key] = self.walker.equations[path].output(port, self.of(path))
             self._under_way.pop()
         return self._values[key]
 

@@ -175,13 +175,22 @@ class OnboardReasoner(SlowPart):
         return replace(self.function, function=self._decider.limited(_SHARE * (self.latency - period)))
 
     def compiled_equations(self, context: Context, varied: frozenset[str]) -> Equations:
-        """Return the equations of the part of a mental copy; see `VirtualTestbed.compiled`."""
+        """Return the equations of the part of a mental copy; see `VirtualTestbed.compiled`.
+
+        A class derived from this one has the same equations if it defines a constructor alone; else it writes its own.
+        """
         # Imported here: without it, a reasoner needs no CasADi.
         from vtbdrake.compiled.components import CandidateEquations
         from vtbdrake.compiled.equations import refusal
 
-        if type(self) is not OnboardReasoner:
-            raise refusal(self, "may do something else than an OnboardReasoner, from which it is derived")
+        kinds = type(self).__mro__
+        defined = {name for kind in kinds[: kinds.index(OnboardReasoner)] for name in vars(kind)}
+        if changed := sorted(name for name in defined if not name.startswith("__")):
+            raise refusal(
+                self,
+                f"is derived from OnboardReasoner, and does something else, as it defines {', '.join(changed)}: define "
+                "a constructor alone, or the method compiled_equations",
+            )
         return CandidateEquations(self, context, varied)
 
     @property

@@ -24,7 +24,7 @@ from vtbdrake.reasoning.decision import Budget, Decision, check_budget
 from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
-from vtbdrake.rollout import Constraint, Cutoff, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
+from vtbdrake.rollout import Constraint, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
 from vtbdrake.rollout.executor import checked_workers, choose_executor
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.testbed import Scenario
@@ -189,7 +189,8 @@ class Reasoner:
 
         executor = CompiledExecutor(self.problem.testbed, workers=self._search.workers)
         try:
-            executor.prepare(self.task, [dict.fromkeys(self.space.addresses)])
+            varied = [*self.space.addresses, *self.belief_to_start.uncertain]
+            executor.prepare(self.task, [dict.fromkeys(varied)])
         except (ValueError, ArithmeticError) as error:
             executor.close()
             if self._search.executor != "auto":
@@ -222,7 +223,7 @@ class Reasoner:
         )
 
     def warm_up(self) -> None:
-        """Let every worker build its testbed, so that no decision has to wait for it.
+        """Let every worker build its testbed, or compile what decisions at any time take, so that none has to wait.
 
         The first decision with a budget of wall time warms up before its budget begins; so does the first one after a
         decision that was interrupted (Ctrl-C), which ends the workers that had rollouts.
@@ -234,10 +235,8 @@ class Reasoner:
             self._warm_up()
 
     def _warm_up(self) -> None:
-        if self.executor.cancels and not self._warm:
-            # Rollouts that are cancelled at their first sample.
-            points: list[dict[str, Any]] = [{} for _ in range(self._workers)]
-            list(self.executor.run(self.task, points, cutoff=Cutoff(deadline=-inf)))
+        if not self._warm:
+            self.executor.warm_up(self.task, self._workers)
         self._warm = True
 
     def decide(

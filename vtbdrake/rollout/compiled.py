@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from math import inf, nan
+from typing import Any
 
 import casadi
 import numpy as np
@@ -31,6 +32,8 @@ COMPILED = "compiled"
 
 # As many rollouts are computed in one call. Between calls, Ctrl-C is noticed and results come back.
 _BATCH = 1024
+# A share of a period at which no event of another period is due.
+_BETWEEN = 0.382
 
 
 class CompiledExecutor(Executor):
@@ -76,8 +79,8 @@ class CompiledExecutor(Executor):
             ValueError: The task needs what compiled rollouts cannot do: pruning, a recorded motion, states.
         """
         starts = start_of_each(start, len(points))
-        for indices in _by_fields(points):
-            compiled = self._of(task, [points[i] for i in indices])
+        for fields, indices in _by_fields(points):
+            compiled = self._of(task, fields, [points[i] for i in indices])
             while indices:
                 count = _BATCH if cutoff is None else min(_BATCH, compiled.affordable(cutoff))
                 batch, indices = indices[:count], indices[count:]
@@ -101,12 +104,16 @@ class CompiledExecutor(Executor):
 
     def prepare(self, task: RolloutTask, points: Sequence[Parameters]) -> None:
         """Compile the testbed of a task, for points like these; the errors are those of `run`."""
-        self._of(task, points)
+        for fields, indices in _by_fields(points):
+            self._of(task, fields, [points[i] for i in indices])
 
-    def _of(self, task: RolloutTask, points: Sequence[Parameters]) -> _CompiledTask:
-        fields, _ = split(points[0])
+    def warm_up(self, task: RolloutTask, rollouts: int) -> None:
+        """Compile what rollouts need that begin with the events of the testbed or between them; make one of each."""
+        self._of(task, {}, [{}]).warm_up()
+
+    def _of(self, task: RolloutTask, fields: Parameters, points: Sequence[Parameters]) -> _CompiledTask:
         key = (id(task), values_key(fields))
-        addresses = frozenset(_variables(frozenset().union(*points)))
+        addresses = frozenset[str]().union(*points) - {f"{FIELD}{name}" for name in fields}
         compiled = self._compiled.use(key)
         if compiled is None or not compiled.varies(addresses):
             if compiled is not None:
@@ -224,6 +231,13 @@ class _CompiledTask:
         self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
 
+    def warm_up(self) -> None:
+        """Make a rollout that begins with the periodic events, and one between them: there are more instants in it."""
+        begin = self._start_context.context.get_time()
+        shortest = min((period for period, _ in self._testbed.event_timings()), default=0.0)
+        for t0 in (begin, begin + _BETWEEN * shortest):
+            self._rollouts.from_z(self._z0[np.newaxis], t0)
+
     def varies(self, addresses: frozenset[str]) -> bool:
         """Return whether variables can be varied without compiling again."""
         if addresses not in self._varies:
@@ -241,7 +255,7 @@ class _CompiledTask:
         for (_, addresses), indices in by_start.items():
             try:
                 z, t0 = self._begin(starts[indices[0]])
-                values = {a: np.array([points[i][a] for i in indices]) for a in _variables(addresses)}
+                values = {a: np.array([points[i][a] for i in indices]) for a in addresses if not a.startswith(FIELD)}
                 filled = self._rollouts.filled(z, values)
             except StartError:
                 raise
@@ -291,12 +305,11 @@ class _CompiledTask:
         self, points: Sequence[Parameters], batch: CompiledBatch, wall_time: float
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Yield (row, result) of the rollouts of a batch, except those that Drake makes: invalid, or f fails."""
-        task, f = self._task, self._task.quality
-        valid, samples = batch.valid.copy(), []
+        task, valid, samples = self._task, batch.valid.copy(), []
         counts = np.full(len(points), len(batch.times))
         for k, measure in enumerate(self._measures):
             samples.append(self._samples(k, measure, batch.outputs, counts, valid))
-            if k == 0 and f is not None and task.threshold is not None and not task.run_on:
+            if k == 0 and task.threshold is not None and not task.run_on:
                 exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
                 counts = np.where(exceeded.any(axis=1), exceeded.argmax(axis=1) + 1, counts)
         for count in set(counts[valid].tolist()):
@@ -318,22 +331,23 @@ class _CompiledTask:
         m = samples[0].shape[1] if samples else len(batch.times)
         times = batch.times[:m]
         t_star = h = value = np.full(len(rows), nan)
-        quality, exceeded = np.empty((len(rows), 0)), np.zeros((len(rows), m), dtype=bool)
-        of_measures = samples
+        quality, of_measures = np.empty((len(rows), 0)), samples
+        exceedances: dict[int, np.ndarray] = {}
         if f is not None:
             t_star, value = read_quality(f, times, samples[0], task.threshold)
-            h, quality = f.quality(value), f.quality(samples[0])
-            exceeded, of_measures = exceeds(samples[0], task.threshold, minimize=task.minimize), samples[1:]
+            h, quality, of_measures = f.quality(value), f.quality(samples[0]), samples[1:]
+            if task.threshold is not None:
+                exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
+                exceedances = {k: times[exceeded[k]] for k in np.flatnonzero(exceeded.any(axis=1)).tolist()}
         measures = [measure.read(times, each) for measure, each in zip(task.measures, of_measures, strict=True)]
         # One row per rollout.
         numbers = np.array([t_star, h, value, *measures]).T
-        finite = np.isfinite(numbers[:, 3 if f is None else 2 :]).all(axis=1)
-        has_exceeded: list[bool] = np.logical_or.reduce(exceeded, axis=1).tolist()
+        finite = np.isfinite(numbers[:, 3 if f is None else 2 :]).all(axis=1).tolist()
         for k, (row, (t, best, reported, *of_row)) in enumerate(zip(rows.tolist(), numbers.tolist(), strict=True)):
             if finite[k]:
                 result = RolloutResult(
                     parameters=dict(points[row]),
-                    end=THRESHOLD if has_exceeded[k] else HORIZON,
+                    end=THRESHOLD if k in exceedances else HORIZON,
                     times=times,
                     quality=quality[k],
                     t_star=t,
@@ -341,7 +355,7 @@ class _CompiledTask:
                     value=reported,
                     measures=tuple(of_row),
                     threshold=task.f_m,
-                    exceedances=times[exceeded[k]] if has_exceeded[k] else times[:0],
+                    exceedances=exceedances.get(k, times[:0]),
                     record={address: batch.outputs[address][row, :m] for address in task.record},
                     wall_time=wall_time,
                     computed=COMPILED,
@@ -383,19 +397,15 @@ class _CompiledTask:
         return bool(exceeds(np.array(sample), task.threshold, minimize=task.minimize))
 
 
-def _by_fields(points: Sequence[Parameters]) -> list[list[int]]:
-    """Return the numbers of the points, in groups with the same values of the scenario's fields."""
-    if points and not any(address.startswith(FIELD) for address in frozenset().union(*points)):
-        return [list(range(len(points)))]
-    groups: dict[Hashable, list[int]] = {}
+def _by_fields(points: Sequence[Parameters]) -> list[tuple[dict[str, Any], list[int]]]:
+    """Return the values of the scenario's fields, by name, each with the numbers of the points that have them."""
+    if points and not any(address.startswith(FIELD) for address in frozenset[str]().union(*points)):
+        return [({}, list(range(len(points))))]
+    groups: dict[Hashable, tuple[dict[str, Any], list[int]]] = {}
     for i, point in enumerate(points):
-        groups.setdefault(values_key(split(point)[0]), []).append(i)
+        fields, _ = split(point)
+        groups.setdefault(values_key(fields), (fields, []))[1].append(i)
     return list(groups.values())
-
-
-def _variables(addresses: Iterable[str]) -> list[str]:
-    """Return the addresses of variables, without those of the scenario's fields."""
-    return [address for address in addresses if not address.startswith(FIELD)]
 
 
 def _value(value: np.ndarray) -> float | np.ndarray:

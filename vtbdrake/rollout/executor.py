@@ -13,6 +13,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 from tqdm.auto import tqdm
@@ -84,6 +85,12 @@ class Executor(Closing):
             WorkerError: The task cannot be sent to the workers, they are lost or take no more work, or the executor
                 has not finished another call.
         """
+
+    def warm_up(self, task: RolloutTask, rollouts: int) -> None:
+        """Build what so many rollouts of a task need at a time, so that the next ones need not wait for it."""
+        if self.cancels:
+            # They are cancelled at their first sample.
+            list(self.run(task, [{}] * rollouts, cutoff=Cutoff(deadline=-inf)))
 
     def close(self) -> None:
         """Release threads, processes and testbeds."""

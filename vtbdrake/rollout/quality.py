@@ -181,7 +181,7 @@ class Quality(Measure):
 
     def accepts(self, samples: np.ndarray) -> np.ndarray:
         """Return which samples of f are valid: finite, not negative, and at most ``upper``."""
-        valid: np.ndarray = np.isfinite(samples) & (samples >= 0.0) & (samples <= self.upper)
+        valid: np.ndarray = (samples >= 0.0) & (samples <= min(self.upper, np.finfo(float).max))
         return valid
 
     def quality(self, samples: np.ndarray) -> np.ndarray:

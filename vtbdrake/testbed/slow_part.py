@@ -344,8 +344,8 @@ class SlowPart(AddressedSystem):
         for name, index in self._indices.items():
             self.DeclareStateOutputPort(name, DiscreteStateIndex(index))
         self.codecs = {int(self._progress): PROGRESS_CODEC}
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, max(0.0, offset - _EARLY), self._sample)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset + latency - _SHOWN_EARLY, self._show)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, self.sampled(0), self._sample)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, self.due(0), self._show)
 
     @property
     def groups(self) -> Mapping[str, int]:
@@ -453,6 +453,10 @@ class SlowPart(AddressedSystem):
         self._root.FixValue(self.GetMyMutableContextFromRoot(context), Value(RootReference(context)))
 
     # -- results from outside
+
+    def sampled(self, tick: int) -> float:
+        """Return when sample number ``tick`` is taken, in seconds: just before its time, but not before 0."""
+        return max(0.0, self.offset - _EARLY) + tick * self.period
 
     def due(self, tick: int) -> float:
         """Return when the result of sample number ``tick`` is shown, in seconds: just before a latency has passed."""
