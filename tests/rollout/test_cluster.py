@@ -207,6 +207,21 @@ def test_client_of_the_user_stays_open(cluster):
     assert client.status == "closed"
 
 
+def test_workers_may_have_removed_the_task_themselves(cluster):
+    def remove(dask_worker):
+        for name in [name for name in dask_worker.plugins if "vtbdrake" in name]:
+            dask_worker.plugins.pop(name).teardown(dask_worker)
+
+    with DaskExecutor(cluster.client) as executor:
+        _assert_right(executor, TASK, _points(2))
+        cluster.client.run(remove)  # As a worker that is being closed does.
+
+
+def test_an_encrypted_scheduler_needs_certificates():
+    with pytest.raises(ValueError, match=r"tls://127.0.0.1:9 needs certificates: give executor=Client\("):
+        DaskExecutor("tls://127.0.0.1:9")
+
+
 def test_lost_scheduler_is_an_error():
     with dask_cluster(workers=1) as short, Client(short.address, timeout="1s", set_as_default=False) as client:
         rollouts = DaskExecutor(client).run(TASK, _points(1000))

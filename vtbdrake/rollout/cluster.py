@@ -24,6 +24,7 @@ from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor, check
 try:
     from distributed import Client, KilledWorker, WorkerPlugin, as_completed, get_worker
     from distributed.client import ClosedClientError
+    from distributed.security import Security
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("rollouts on a Dask cluster need: pip install 'vtbdrake[cluster]'") from error
 
@@ -182,8 +183,11 @@ class DaskExecutor(FuturesExecutor):
         return name
 
     def _forget(self, name: str) -> None:
-        """Remove a task from the workers; without a scheduler there are none."""
-        with suppress(*_GONE):
+        """Remove a task from the workers; without a scheduler there are none.
+
+        A worker that is being closed, such as at a restart of the cluster, has removed its tasks itself (KeyError).
+        """
+        with suppress(*_GONE, KeyError):
             self._client.unregister_worker_plugin(name)
 
     def _room(self) -> int:
@@ -213,6 +217,11 @@ def _connected(address: str | None) -> Client:
         raise ValueError(
             "executor='dask' needs a scheduler: start one with `dask scheduler` and workers with `dask worker ADDRESS` "
             f"and set {ADDRESS}, or give executor=distributed.Client(...)"
+        )
+    if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
+        raise ValueError(
+            f"the scheduler at {address} needs certificates: give executor=Client(address, security=Security(...)), or "
+            "name them in Dask's configuration (distributed.comm.tls)"
         )
     try:
         return Client(address, set_as_default=False)
