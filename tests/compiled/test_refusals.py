@@ -263,10 +263,13 @@ def test_initialization_events_are_named(monkeypatch: pytest.MonkeyPatch) -> Non
         compiled(alone(Started()))
 
 
-def test_without_a_compiler_it_is_interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_it_is_interpreted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     diagram = alone(ConstantVectorSource([0.3]), ZeroOrderHold(0.1, 1), Gain(3.0, 1))
     batch = compiled(diagram, outputs=("part2.y0",), compile=None)()
+    assert "the testbed is interpreted by CasADi, several times more slowly" in caplog.text
     np.testing.assert_array_equal(batch.outputs["part2.y0"][0].ravel(), [0.0] + 10 * [3.0 * 0.3])
 
 

@@ -77,7 +77,7 @@ class SymbolicEquations(Equations):
         return {i: self._translated(following.value(i), at) for i in range(following.num_groups())}
 
     def _unwritten(self, error: RuntimeError | None = None) -> UnsupportedTestbedError:
-        why = "" if error is None else f" ({error})"
+        why = "" if error is None else f" ({' '.join(str(error).split())})"
         return refusal(self.system, f"has no equations that Drake can write down{why}: {REMEDY}")
 
     def _new(self, name: str, size: int) -> list[Variable]:

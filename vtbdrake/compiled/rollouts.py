@@ -133,7 +133,9 @@ class CompiledRollouts:
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
         self._lock = threading.Lock()
         self._refuse_initialization()
-        self._program(self.schedule_at(context.get_time()))
+        program = self._program(self.schedule_at(context.get_time()))
+        if compile is None and not program.is_machine_code:
+            _log.warning("the testbed is interpreted by CasADi, several times more slowly: see `vtbdrake doctor`")
         if check:
             from vtbdrake.compiled.check import check_rollouts
 
@@ -379,6 +381,7 @@ class _Program:
         results: Any = self.function(*arguments)
         packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
         self._packed = translate(packed)
+        self.is_machine_code = self._packed is not packed
         self._buffers: LruDict[int, Buffers] = LruDict(_MAX_SIZES)
         self._lock = threading.Lock()
 
