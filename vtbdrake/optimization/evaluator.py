@@ -168,8 +168,7 @@ class Evaluator:
         """
         counted = self._conditions if conditions is None else conditions
         outcomes = [self._outcomes.get((point, c)) if c in counted else None for c in self._conditions]
-        finished = [outcome for outcome in outcomes if outcome is not None]
-        ends = [outcome.end for outcome in finished]
+        ends = [outcome.end for outcome in outcomes if outcome is not None]
         exact = len(ends) == len(outcomes) and PRUNED not in ends
         constraints = len(self._problem.constraints)
         if FAILED in ends:

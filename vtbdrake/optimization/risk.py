@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isnan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -21,7 +21,12 @@ class Risk(ABC):
     """A function of the qualities h of one point under n conditions, shape (n,); larger is better.
 
     The function must not fall when one of the qualities rises: racing relies on it.
+
+    Attributes:
+        keeps_one: Whether the risk of a single quality is that quality.
     """
+
+    keeps_one: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, h: np.ndarray) -> float:
@@ -32,6 +37,8 @@ class Risk(ABC):
 class Mean(Risk):
     """The mean, for conditions that occur equally often."""
 
+    keeps_one = True
+
     def __call__(self, h: np.ndarray) -> float:
         return float(np.mean(h))
 
@@ -40,6 +47,8 @@ class Mean(Risk):
 class Worst(Risk):
     """The worst case."""
 
+    keeps_one = True
+
     def __call__(self, h: np.ndarray) -> float:
         return float(np.min(h))
 
@@ -47,6 +56,8 @@ class Worst(Risk):
 @dataclass(frozen=True)
 class _Level(Risk):
     level: float
+
+    keeps_one = True
 
     def __post_init__(self) -> None:
         level = as_number(f"the level of {type(self).__name__}", self.level)
@@ -128,8 +139,7 @@ def aggregate(
         The qualities, larger is better (a cost is negated), and the worst violation of each constraint.
     """
     outcome = outcomes[0]
-    if len(outcomes) == 1 and outcome is not None and isinstance(risk, Mean | Worst | _Level):
-        # Each of these risks of one quality is that quality.
+    if len(outcomes) == 1 and outcome is not None and risk.keeps_one:
         qualities = [outcome.value, *outcome.measures[: len(minimize) - 1]]
         signed = (-quality if cost else quality for quality, cost in zip(qualities, minimize, strict=True))
         return tuple(signed), tuple(outcome.measures[len(minimize) - 1 :][:constraints])

@@ -28,6 +28,7 @@ from vtbdrake.reasoning.space import same_values
 from vtbdrake.rollout import Cutoff, RolloutResult
 from vtbdrake.rollout.pruning import PRUNED, STALLED
 from vtbdrake.rollout.start import Start
+from vtbdrake.rollout.task import FAILED as ROLLOUT_FAILED
 from vtbdrake.rollout.task import TERMINATED
 from vtbdrake.testbed.interrupt import Interruptible
 
@@ -87,6 +88,7 @@ class DecisionRun:
         self._budget = budget
         self._deadline = inf if budget.seconds is None else requested_at + budget.seconds
         self._problem = reasoner.problem
+        self._sign = reasoner.problem.objectives[0].sign
         self._starts = starts
         self._time = starts[0].time
         self._plan_in_use = plan_in_use
@@ -236,7 +238,7 @@ class DecisionRun:
         tried = [point for point in self._proposed if point in begun]
         candidates = tuple(self._candidate(number, point) for number, point in enumerate(tried))
         eligible = [candidate for candidate in candidates if candidate.status == ELIGIBLE]
-        sign = problem.objectives[0].sign
+        sign = self._sign
         ranked = sorted(eligible, key=lambda candidate: (-sign * candidate.quality, candidate.number))
         best = ranked[0] if ranked else None
         improvement = margin = nan
@@ -245,12 +247,13 @@ class DecisionRun:
         if len(ranked) > 1:
             margin = sign * (ranked[0].quality - ranked[1].quality) + 0.0
         elapsed = time.monotonic() - self._requested_at
-        results = [self._results[point, sample] for point, sample in self._keys() if (point, sample) in self._results]
+        results = [result for candidate in candidates for result in candidate.rollouts]
+        ends = Counter(result.end for result in results)
         budget = self._budget
         health = Health(
             rollouts=len(results),
-            failed=sum(result.failed for result in results),
-            cut_off=sum(result.end in (PRUNED, STALLED) for result in results),
+            failed=ends[ROLLOUT_FAILED],
+            cut_off=ends[PRUNED] + ends[STALLED],
             rollout_time=sum(result.wall_time for result in results) / len(results) if results else nan,
             elapsed=elapsed,
             used=max(len(results) / (budget.rollouts or inf), elapsed / (budget.seconds or inf)),
@@ -273,9 +276,6 @@ class DecisionRun:
             starts=tuple(self._starts),
         )
 
-    def _keys(self) -> Iterator[RolloutKey]:
-        return ((point, sample) for point in self._proposed for sample in range(self._reasoner.samples))
-
     def _candidate(self, number: int, point: Point) -> Candidate:
         results = [self._results.get((point, sample)) for sample in range(self._reasoner.samples)]
         evaluation = self._evaluations.get(point) or self._evaluator.evaluation(point)
@@ -291,7 +291,7 @@ class DecisionRun:
             number=number,
             values=self._planned[point] or dict(self._plan_in_use),
             status=status,
-            quality=self._evaluator.in_user_terms(evaluation)[0] if has_quality else nan,
+            quality=self._sign * evaluation.values[0] + 0.0 if has_quality else nan,  # No negative zero.
             violations=evaluation.violations,
             rollouts=finished,
         )

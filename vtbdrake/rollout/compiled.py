@@ -340,6 +340,7 @@ class _CompiledTask:
                 exceeded = exceeds(samples[0], task.threshold, minimize=task.minimize)
                 exceedances = {k: times[exceeded[k]] for k in np.flatnonzero(exceeded.any(axis=1)).tolist()}
         measures = [measure.read(times, each) for measure, each in zip(task.measures, of_measures, strict=True)]
+        threshold = task.f_m
         # One row per rollout.
         numbers = np.array([t_star, h, value, *measures]).T
         finite = np.isfinite(numbers[:, 3 if f is None else 2 :]).all(axis=1).tolist()
@@ -354,7 +355,7 @@ class _CompiledTask:
                     h=best,
                     value=reported,
                     measures=tuple(of_row),
-                    threshold=task.f_m,
+                    threshold=threshold,
                     exceedances=exceedances.get(k, times[:0]),
                     record={address: batch.outputs[address][row, :m] for address in task.record},
                     wall_time=wall_time,

@@ -329,8 +329,8 @@ class RolloutRunner:
         restored = self.task.start is not None or self._start_context.start is not None
         with _failures_as_outcomes:
             self._variables.write(self._context, parameters)
-            before = self._variables.read(self._context, list(parameters))
             # Initialization events are part of a default s0; in a restored s0 they have happened already.
+            before = {} if restored else self._variables.read(self._context, list(parameters))
             params = InitializeParams(suppress_initialization_events=restored)
             with making():
                 self._initialized = self._simulator.Initialize(params)

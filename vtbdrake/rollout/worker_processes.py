@@ -42,6 +42,8 @@ _GRACE = 0.5
 TIME_LIMIT = 3600.0
 # What a worker sends besides its answers: the rollout with a time limit begins; its memory has grown too much.
 _BEGUN, _GROWN = b"B", b"G"
+# In bytes.
+_PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class ProcessExecutor(Executor):
@@ -445,11 +447,18 @@ def _run_rollout(
     return runners.run(load(), unpack(point), start=unpack_start(start), cutoff=cutoff, announce=announce)
 
 
+@cache
+def _statm() -> int | None:
+    """Return the descriptor of the file that tells how much memory this process holds; None without /proc."""
+    with suppress(OSError):
+        return os.open("/proc/self/statm", os.O_RDONLY)
+    return None
+
+
 def _memory() -> float:
     """Return how much memory this process holds, in bytes; without /proc, the most that it ever held."""
-    try:
-        with open("/proc/self/statm", "rb") as file:
-            return float(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
+    statm = _statm()
+    if statm is None:
         # Not used on Linux, where a process inherits the maximum of the one that started it.
         return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return float(os.pread(statm, 128, 0).split()[1]) * _PAGE

@@ -93,11 +93,11 @@ class Variable:
             raise VariableError(f"{self.address} takes numbers of shape {self.shape}, not {value!r}") from None
         if array.shape != self.shape:
             raise VariableError(f"{self.address} has shape {self.shape}, but the value given has {array.shape}")
-        if not np.isfinite(array).all():
-            raise VariableError(f"{self.address} must be finite, but the value given is {value!r}")
-        lower, upper = (np.asarray(bound, dtype=float) for bound in self.bounds)
-        outside = np.flatnonzero((array < lower) | (array > upper))
-        if outside.size:
+        lower, upper = self.bounds
+        if not (np.isfinite(array) & (array >= lower) & (array <= upper)).all():
+            if not np.isfinite(array).all():
+                raise VariableError(f"{self.address} must be finite, but the value given is {value!r}")
+            outside = np.flatnonzero((array < lower) | (array > upper))
             variable, number = (_entry(self, outside[0]), array.flat[outside[0]]) if self.shape else (self, array)
             allowed = with_unit(variable.bounds_text(), variable.unit)
             raise VariableError(f"{variable.address} must lie in {allowed}, but the value given is {float(number)}")

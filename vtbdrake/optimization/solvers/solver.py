@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vtbdrake.argument_checks import counted
-from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
+from vtbdrake.optimization.parameter import Choice, Dimension, Parameter, checked_points
 
 # A point s^0: one value per parameter, in their order.
 Point = tuple[Any, ...]
@@ -102,8 +102,8 @@ def rank_key(evaluation: Evaluation) -> tuple[int, float]:
 
 def best_of(evaluations: Iterable[Evaluation | None]) -> Evaluation | None:
     """Return the best evaluation of one objective by Deb's rule; None if all failed or are None."""
-    usable = (evaluation for evaluation in evaluations if evaluation is not None and evaluation.usable)
-    return min(usable, key=rank_key, default=None)
+    best = min((each for each in evaluations if each is not None), key=rank_key, default=None)
+    return best if best is not None and best.usable else None
 
 
 def costs(evaluations: Sequence[Evaluation]) -> list[float]:
@@ -154,9 +154,7 @@ class Search:
             if len(self.start) != self.size:
                 raise SolverError(f"a start has one value per parameter, {self.size}, not {len(self.start)}")
             try:
-                start = tuple(
-                    parameter.as_value(value) for parameter, value in zip(self.space, self.start, strict=True)
-                )
+                (start,) = checked_points(self.space, [self.start])
             except ValueError as error:
                 raise SolverError(f"the start lies outside of the space: {error}") from error
             object.__setattr__(self, "start", start)
