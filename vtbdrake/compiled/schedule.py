@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import ceil, inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from vtbdrake.arrays import Array
 from vtbdrake.compiled.equations import Timing
 
 
-@dataclass(frozen=True)
-class Instant:
+class Instant(NamedTuple):
     """An instant at which something happens: first a sample is taken, then systems are updated.
 
     Attributes:
@@ -57,7 +56,7 @@ def _next(timings: Sequence[Timing], now: float) -> tuple[float, tuple[int, ...]
     """Return the next time after ``now`` at which updates are due, and which."""
     times = [_next_time(timing, now) for timing in timings]
     earliest = min(times, default=inf)
-    return earliest, tuple(i for i, time in enumerate(times) if time == earliest)
+    return earliest, tuple([i for i, time in enumerate(times) if time == earliest])
 
 
 def _next_time(timing: Timing, now: float) -> float:

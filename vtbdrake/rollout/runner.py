@@ -272,7 +272,7 @@ class RolloutRunner:
 
     def _set_times(self) -> None:
         self._t0 = self._start_context.context.get_time()
-        self._instants = self.task.instants(self._t0, self._timings)
+        self._instants = self.task.instants(self._t0, self._timings, times=self._times)
         self._windows: list[float | None] = [None] * len(self._times)
         if self._player is not None:
             self._windows = self._player.window_starts(self._instants)
