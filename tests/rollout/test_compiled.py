@@ -119,6 +119,19 @@ def test_a_function_of_what_is_no_number_is_not_compiled() -> None:
         assert traced(lambda value: 1.0, [argument]) is None
 
 
+# CasADi rounds 2.5 to 3, numpy to 2.
+@pytest.mark.parametrize("f", [np.round, lambda x: np.rint(x + 0.5)])
+def test_a_quality_that_casadi_computes_otherwise_is_not_compiled(f):
+    assert traced(f, [3.1]) is None
+
+
+@pytest.mark.parametrize("f", [lambda x: np.maximum(x[0], 3.0), lambda x: np.clip(x[0], -1.0, 1.0)])
+def test_a_quality_of_what_is_not_finite_is_none(f):
+    function = traced(f, [np.array([2.0, 5.0])])
+    assert float(function([2.0, np.nan])) == f([2.0, np.nan])
+    assert np.isnan(float(function([np.nan, 0.0])))
+
+
 def test_begins_at_starts() -> None:
     testbed = SCENARIO.build()
     context = testbed.default_context()
