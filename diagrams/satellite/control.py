@@ -11,15 +11,19 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
-from vtbdrake.components.casadi_system.kernel import Kernel
+from vtbdrake.components.casadi_system.kernel import Kernel, clamp
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.estimation import BASE
 from vtbdrake_diagrams.satellite.kinematics import joint_rates
 from vtbdrake_diagrams.satellite.kinematics import reaction as arm_reaction
-from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative, gripper_errors
+from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, gripper_errors
 from vtbdrake_diagrams.satellite.supervisor import GUIDANCE, Guidance, Mode, stopping_speed
 
+# The distance from the ends of the arm's joints, in rad.
+_MARGIN = 0.02
+# The number of the rates of the arm's joints and, behind them, of the time since an abort.
+_MOTION = ARM_JOINTS + 1
 # Share of their opening from which on the fingers release the bar.
 _OPEN = 0.9
 
@@ -73,19 +77,15 @@ class ArmController(AddressedSystem):
         super().__init__()
         self._period, self._wheels = period, wheels
         servicer = Servicer()
-        self._rates = joint_rates()
-        self._lower, self._upper = servicer.lower + 0.02, servicer.upper - 0.02
-        self._stowed = np.array(servicer.stowed)
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
         self._guidance = self.DeclareVectorInputPort("guidance", GUIDANCE)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
         self._command = self.declare_discrete_state(joint_position=Quantity(servicer.home, "rad, m"))
         self.DeclareStateOutputPort("joint_position", self._command.index)
-        self._memory = self.declare_discrete_state(
-            joint_rate_command=Quantity(np.zeros(ARM_JOINTS), "rad/s"),
-            aborted_for=Quantity(0.0, "s"),
-            measured_position=Quantity(servicer.home, "rad, m"),
+        self._motion = self.declare_discrete_state(
+            joint_rate_command=Quantity(np.zeros(ARM_JOINTS), "rad/s"), aborted_for=Quantity(0.0, "s")
         )
+        self._measured = self.declare_discrete_state(measured_position=Quantity(servicer.home, "rad, m"))
         # The momentum of the arm's motion, and whether the target is part of it.
         self._momentum = self.declare_discrete_state(
             momentum=Quantity(np.zeros(3), "N m s"), holding=Quantity(0.0, bounds=(0.0, 1.0))
@@ -113,87 +113,109 @@ class ArmController(AddressedSystem):
         self._settings = self.declare_parameters(
             **{name: Quantity(value, unit, (0.0, most)) for name, (value, unit, most) in settings.items()}
         )
-        self._following = _following(tuple(settings))
+        self._rates, self._moved = _rates(tuple(settings), period), _moved(tuple(settings), period)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        T = self._period
-        p, memory = self._settings.view(context), self._memory.mutable(state)
-        instructions = self._guidance.Eval(context)
-        guidance = Guidance.of(instructions)
-        relative, measured = Relative(self._relative.Eval(context)), self._joints.Eval(context)
-        command, q, before = self._command.array(context), measured[:ARM_JOINTS], memory.joint_rate_command.copy()
-        mode = guidance.mode
-        if mode == Mode.ABORT and measured[ARM_JOINTS:].min() > _OPEN * guidance.opening:
-            memory.aborted_for += T
-            if memory.aborted_for < p.back_off:
-                away = np.concatenate((np.zeros(3), -p.back_off_speed * relative.R_BG[:, 2]))
-                rates = self._rates.value((q, away, [0.0, p.damping])).copy()
-            else:
-                rates = (self._stowed - command[:ARM_JOINTS]).clip(-0.5 * p.joint_rate, 0.5 * p.joint_rate)
-        elif guidance.follows:
-            settings = self._settings.array(context)
-            rates = self._following.value((relative.vector, instructions, settings, q)).copy()
-        elif mode in (Mode.RETREAT, Mode.HOLD, Mode.ABORT):
-            rates = before * np.exp(-T / max(p.brake_time, T))
-        else:
-            rates = np.zeros(ARM_JOINTS)
-        rates *= min(1.0, p.joint_rate / max(float(np.abs(rates).max()), 1e-9))
+        settings, guidance = self._settings.array(context), self._guidance.Eval(context)
+        relative, measured = self._relative.Eval(context), self._joints.Eval(context)
+        command, motion = self._command.mutable_array(state), self._motion.mutable_array(state)
+        following = self._rates.value((settings, guidance, relative, measured, command, motion))
         if self._wheels:
-            momentum, most = self._momentum.mutable(state), T * p.largest_reaction
-            holding = mode in (Mode.RETREAT, Mode.HOLD)
-            # When the target is gripped, its momentum comes at once.
-            had = momentum.momentum if holding == (momentum.holding > 0.5) else None
-            rates, has, reaction = self._gentle(q, before, rates, had, most=most, holding=holding)
-            momentum.momentum, momentum.holding = has, holding
-            self._torque.mutable(state).reaction = reaction
-        following = (command[:ARM_JOINTS] + T * rates).clip(q - p.lead, q + p.lead)
-        following = following.clip(self._lower, self._upper)
-        fingers = command[ARM_JOINTS:]
-        fingers = fingers + (guidance.opening - fingers).clip(-T * p.finger_rate, T * p.finger_rate)
-        self._command.mutable(state).joint_position = np.concatenate((following, fingers))
-        memory.joint_rate_command, memory.measured_position = rates, measured
+            rates = self._gentle(context, state, motion[:ARM_JOINTS], following[:ARM_JOINTS])
+            following[:ARM_JOINTS] = rates
+        motion[:] = following
+        command[:] = self._moved.value((settings, guidance, measured, command, motion))
+        self._measured.mutable_array(state)[:] = measured
 
-    def _gentle(
-        self, q: Array, before: Array, rates: Array, had: Array | None, *, most: float, holding: bool
-    ) -> tuple[Array, Array, Array]:
-        """Return the rates on the way from ``before`` to ``rates`` whose momentum changes slowly, that and its rate.
+    def _gentle(self, context: Context, state: DiscreteValues, before: Array, rates: Array) -> Array:
+        """Return the rates on the way from those of the last period to ``rates`` whose momentum changes slowly.
 
-        Args:
-            q: The positions of the joints.
-            before: Their rates one period ago.
-            rates: The rates that they should have.
-            had: h_B one period ago; None: that of ``before``.
-            most: The largest change of h_B, in N m s.
-            holding: Whether the target is part of it.
+        The momentum and its rate are written to ``state``.
         """
+        q, mode = self._joints.Eval(context)[:ARM_JOINTS], Guidance.of(self._guidance.Eval(context)).mode
+        most = self._period * self._settings.view(context).largest_reaction
+        momentum, holding = self._momentum.mutable(state), mode in (Mode.RETREAT, Mode.HOLD)
         kernel = arm_reaction(holding=holding)
         unchanged = kernel.value((q, before))[:3].copy()
         change = kernel.value((q, rates))[:3] - unchanged
-        had = unchanged if had is None else had
+        # When the target is gripped, its momentum comes at once.
+        had = momentum.momentum.copy() if holding == (momentum.holding > 0.5) else unchanged
         room = np.maximum(most - np.sign(change) * (unchanged - had), _LEAST * most)
         share = min(1.0, float((room / np.maximum(np.abs(change), 1e-12)).min()))
         has = unchanged + share * change
-        return before + share * (rates - before), has, (has - had) / self._period
+        momentum.momentum, momentum.holding = has, holding
+        self._torque.mutable(state).reaction = (has - had) / self._period
+        return before + share * (rates - before)
 
 
 @lru_cache
-def _following(settings: tuple[str, ...]) -> Kernel:
-    """Return the rates of the joints while the gripper follows, as a kernel of (relative, guidance, settings, q)."""
-    relative, guidance = casadi.SX.sym("relative", RELATIVE), casadi.SX.sym("guidance", GUIDANCE)
-    values, q = casadi.SX.sym("settings", len(settings)), casadi.SX.sym("q", ARM_JOINTS)
-    p = SimpleNamespace(**dict(zip(settings, casadi.vertsplit(values), strict=True)))
-    _, _, distance, rate, _, flip = casadi.vertsplit(guidance)
-    axis, w_BH, v_BH = relative[4:11:3], relative[14:17], relative[17:20]
-    e_p, e_R = gripper_errors(relative, distance, flip)
-    v_BD = v_BH - casadi.cross(w_BH, distance * axis) - rate * axis
+def _rates(settings: tuple[str, ...], period: float) -> Kernel:
+    """Return the rates of the joints and the time since an abort, before wheels limit the rates.
+
+    It is a kernel of (settings, guidance, relative, measured positions, commanded positions, rates and time before).
+    """
+    values, p = _symbols(settings)
+    instructions, relative = casadi.SX.sym("guidance", GUIDANCE), casadi.SX.sym("relative", RELATIVE)
+    measured, command = (casadi.SX.sym(name, len(JOINT_NAMES)) for name in ("measured", "command"))
+    motion = casadi.SX.sym("motion", _MOTION)
+    before, aborted_for = motion[:ARM_JOINTS], motion[ARM_JOINTS]
+    guidance, servicer = Guidance(*casadi.vertsplit(instructions)), Servicer()
+
+    # Where it follows: the velocity of D, and back to it.
+    axis, w_BH, v_BH, tool = relative[4:11:3], relative[14:17], relative[17:20], relative[22:29:3]
+    e_p, e_R = gripper_errors(relative, guidance.distance, guidance.flip)
+    v_BD = v_BH - casadi.cross(w_BH, guidance.distance * axis) - guidance.rate * axis
     length = casadi.norm_2(e_p)
     speed = casadi.fmin(p.speed, stopping_speed(length, gain=p.position_gain, acceleration=p.acceleration))
     turn = p.orientation_gain * e_R
     turn *= casadi.fmin(1, p.turn_rate / casadi.fmax(casadi.norm_2(turn), 1e-9))
     V_BG = casadi.vertcat(w_BH + turn, v_BD + speed * e_p / casadi.fmax(length, 1e-9))
-    rates = joint_rates().expression([q, V_BG, casadi.vertcat(p.posture_gain, p.damping)])
-    return Kernel("following", [relative, guidance, values, q], casadi.densify(rates), compile=False)
+
+    # After an abort: back along the gripper's axis, then to where the arm was stowed.
+    opened = casadi.mmin(measured[ARM_JOINTS:]) > _OPEN * guidance.opening
+    returns = casadi.logic_and(guidance.mode == Mode.ABORT, opened)
+    aborted_for += casadi.if_else(returns, period, 0)
+    backs_off = casadi.logic_and(returns, aborted_for < p.back_off)
+    V_BG = casadi.if_else(backs_off, casadi.vertcat(0, 0, 0, -p.back_off_speed * tool), V_BG)
+    gains = casadi.vertcat(casadi.if_else(backs_off, 0, p.posture_gain), p.damping)
+    led = joint_rates().expression([measured[:ARM_JOINTS], V_BG, gains])
+    stowing = clamp(casadi.DM(servicer.stowed) - command[:ARM_JOINTS], -0.5 * p.joint_rate, 0.5 * p.joint_rate)
+    braking = casadi.if_else(
+        guidance.mode >= Mode.RETREAT, before * casadi.exp(-period / casadi.fmax(p.brake_time, period)), 0
+    )
+
+    rates = casadi.if_else(guidance.follows > 0.5, led, braking)
+    rates = casadi.if_else(returns, casadi.if_else(backs_off, led, stowing), rates)
+    rates *= casadi.fmin(1, p.joint_rate / casadi.fmax(casadi.mmax(casadi.fabs(rates)), 1e-9))
+    arguments = [values, instructions, relative, measured, command, motion]
+    return Kernel("rates", arguments, casadi.densify(casadi.vertcat(rates, aborted_for)), compile=None)
+
+
+@lru_cache
+def _moved(settings: tuple[str, ...], period: float) -> Kernel:
+    """Return the commands after a period with some rates, within the limits of the arm and of ``lead``.
+
+    It is a kernel of (settings, guidance, measured positions, commanded positions, rates and time since an abort).
+    """
+    values, p = _symbols(settings)
+    instructions, motion = casadi.SX.sym("guidance", GUIDANCE), casadi.SX.sym("motion", _MOTION)
+    measured, command = (casadi.SX.sym(name, len(JOINT_NAMES)) for name in ("measured", "command"))
+    servicer, q, fingers = Servicer(), measured[:ARM_JOINTS], command[ARM_JOINTS:]
+    lower, upper = casadi.DM(servicer.lower + _MARGIN), casadi.DM(servicer.upper - _MARGIN)
+    arm = clamp(clamp(command[:ARM_JOINTS] + period * motion[:ARM_JOINTS], q - p.lead, q + p.lead), lower, upper)
+    fingers += clamp(
+        Guidance(*casadi.vertsplit(instructions)).opening - fingers, -period * p.finger_rate, period * p.finger_rate
+    )
+    return Kernel(
+        "moved", [values, instructions, measured, command, motion], casadi.vertcat(arm, fingers), compile=None
+    )
+
+
+def _symbols(names: tuple[str, ...]) -> tuple[casadi.SX, SimpleNamespace]:
+    """Return the symbol of a vector, and its entries by name."""
+    vector = casadi.SX.sym("settings", len(names))
+    return vector, SimpleNamespace(**dict(zip(names, casadi.vertsplit(vector), strict=True)))
 
 
 class AttitudeController(AddressedSystem):

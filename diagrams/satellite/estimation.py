@@ -66,13 +66,12 @@ class BaseEstimator(AddressedSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        following = self._base.mutable_array(state)
-        following[:] = self._kernel.value((self._base.array(context), self._imu.Eval(context)))
-        # The samples before the first interval are over at t = 0 and are about no motion.
-        self._base.mutable(state).time = context.get_time() - self._period
-        history = self._history.mutable_array(state)
+        base, history = self._base.mutable_array(state), self._history.mutable_array(state)
+        base[:] = self._kernel.value((base, self._imu.Eval(context)))
+        # Its time. The samples before the first interval are over at t = 0 and are about no motion.
+        base[0] = context.get_time() - self._period
         history[POSE:] = history[:-POSE]
-        history[:POSE] = following[:POSE]
+        history[:POSE] = base[:POSE]
 
 
 def pose_at(history: ArrayLike, time: float) -> RigidTransform:
@@ -106,7 +105,7 @@ def _navigation(period: float) -> Kernel:
     v_next = v + period * rotated(q_mid, f)
     p_next = p + period * (v + v_next) / 2
     following = casadi.vertcat(0, q_next, p_next, rotated(q_next, w), v_next)
-    return Kernel("navigation", [base, imu], casadi.densify(following), compile=False)
+    return Kernel("navigation", [base, imu], casadi.densify(following), compile=None)
 
 
 def turned(q: casadi.SX, theta: casadi.SX) -> casadi.SX:

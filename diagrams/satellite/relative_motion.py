@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi
-import numpy as np
 from pydrake.systems.framework import BasicVector, Context
 
 from vtbdrake.arrays import Array
@@ -74,37 +73,19 @@ class Relative:
         """Return the position of the gripper, (3,) in m."""
         return self.vector[29:32]
 
-    def errors(self, distance: float, flip: float) -> tuple[float, float]:
-        """Return by how far (m) and by which angle (rad) the gripper is off the place D before the fixture.
-
-        Args:
-            distance: From D to the fixture, along its z axis, in m.
-            flip: 1 if the gripper is to be turned by pi about that axis, else 0.
-        """
-        length, angle = _lengths().value((self.vector, np.array([distance, flip]))).tolist()
-        return length, angle
-
 
 def gripper_errors(relative: casadi.SX, distance: casadi.SX, flip: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
     """Return the errors of the gripper's position (m) and orientation (rotation vector, rad), in B.
 
     Args:
         relative: The numbers of a `Relative`.
-        distance: As in `Relative.errors`.
-        flip: As in `Relative.errors`.
+        distance: From the place where the gripper should be to the fixture, along its z axis, in m.
+        flip: 1 if the gripper is to be turned by pi about that axis, else 0.
     """
     R_BH, R_BG = (casadi.reshape(numbers, 3, 3).T for numbers in (relative[2:11], relative[20:29]))
     turn = casadi.if_else(flip > 0.5, -1, 1)
     R_BD = casadi.horzcat(turn * R_BH[:, 0], turn * R_BH[:, 1], R_BH[:, 2])
     return relative[11:14] - distance * R_BH[:, 2] - relative[29:32], rotation_vector(R_BD @ R_BG.T)
-
-
-@lru_cache
-def _lengths() -> Kernel:
-    """Return the lengths of the `gripper_errors` as a kernel of (relative, [distance, flip])."""
-    relative, place = casadi.SX.sym("relative", RELATIVE), casadi.SX.sym("place", 2)
-    lengths = (casadi.norm_2(error) for error in gripper_errors(relative, place[0], place[1]))
-    return Kernel("gripper_errors", [relative, place], casadi.vertcat(*lengths), compile=False)
 
 
 class RelativeMotion(AddressedSystem):
@@ -129,7 +110,6 @@ class RelativeMotion(AddressedSystem):
         super().__init__()
         self._period = period
         self._kernel = _relative(period)
-        _lengths()  # Made before threads use it: CasADi's expressions are not for several threads.
         self._base = self.DeclareVectorInputPort("base", BASE)
         self._target = self.DeclareVectorInputPort("target", 13)
         self._status = self.DeclareVectorInputPort("status", 4)
@@ -137,15 +117,14 @@ class RelativeMotion(AddressedSystem):
         self.DeclareVectorOutputPort("relative", RELATIVE, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        valid, age = self._status.Eval(context)[:2].tolist()
-        arguments = self._base.Eval(context), self._target.Eval(context), self._joints.Eval(context)
-        output.SetFromVector(np.concatenate(((min(age, _LONG_AGO), valid), self._kernel.value(arguments))))
+        ports = self._base, self._target, self._status, self._joints
+        output.SetFromVector(self._kernel.value([port.Eval(context) for port in ports]))
 
 
 @lru_cache
 def _relative(period: float) -> Kernel:
-    """Return all but age and validity of a `Relative` as a kernel of (base, target, joint positions)."""
-    base, target = casadi.SX.sym("base", BASE), casadi.SX.sym("target", 13)
+    """Return a `Relative` as a kernel of (base, target, status, joint positions)."""
+    base, target, status = casadi.SX.sym("base", BASE), casadi.SX.sym("target", 13), casadi.SX.sym("status", 4)
     joints = casadi.SX.sym("joints", len(JOINT_NAMES))
     _, q_IB, p_IB, w_IB, v_IB = casadi.vertsplit(base, [0, 1, 5, 8, 11, BASE])
     q_IT, p_IT, w_IT, v_IT = casadi.vertsplit(target, [0, 4, 7, 10, 13])
@@ -161,8 +140,9 @@ def _relative(period: float) -> Kernel:
     R_BH, p_BH = casadi.horzcat(*axes), in_base(p_IT + arm - p_IB)
     v = v_IT + casadi.cross(w_IT, arm) - v_IB - casadi.cross(w_IB, p_IT + arm - p_IB)
     G = gripper(joints[:ARM_JOINTS])
-    values = [R_BH.T.reshape((9, 1)), p_BH, in_base(w_IT - w_IB), in_base(v), G.R.T.reshape((9, 1)), G.p]
-    return Kernel("relative", [base, target, joints], casadi.densify(casadi.vertcat(*values)), compile=False)
+    valid, age = status[0], casadi.fmin(status[1], _LONG_AGO)
+    values = [age, valid, R_BH.T.reshape((9, 1)), p_BH, in_base(w_IT - w_IB), in_base(v), G.R.T.reshape((9, 1)), G.p]
+    return Kernel("relative", [base, target, status, joints], casadi.densify(casadi.vertcat(*values)), compile=None)
 
 
 def _inverse(q: casadi.SX) -> casadi.SX:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from math import exp, hypot
-from typing import Any
+from functools import lru_cache
+from math import cos, exp
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.arrays import Array
+from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer, Target
-from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative
+from vtbdrake_diagrams.satellite.relative_motion import RELATIVE, Relative, gripper_errors
 
 
 class Mode(IntEnum):
@@ -115,23 +117,39 @@ def stopping_speed(distance: Any, *, gain: Any, acceleration: Any) -> Any:
     return casadi.sqrt((gain * near) ** 2 + 2.0 * acceleration * (distance - near))
 
 
-def _all_below(values: Array, limit: float) -> bool:
-    """Return whether no value is beyond a limit, in either direction; NaN is."""
-    return all(abs(value) < limit for value in values.tolist())
+class _Situation(NamedTuple):
+    """What the supervisor knows of target and gripper.
+
+    Attributes:
+        age: The age of the newest estimate of the target, in s.
+        tracked: 1 if the target is tracked, else 0.
+        error: The distance of the gripper from the place where it should be, in m.
+        angle: The angle between its orientation and the one that it should have, in rad.
+        reach: The distance of the wrist, if the gripper were at the fixture, from the shoulder, in m.
+        facing: The cosine of the angle between the fixture's z axis and the base's x axis.
+        speed: The speed of the fixture against the base, in m/s.
+    """
+
+    age: float
+    tracked: float
+    error: float
+    angle: float
+    reach: float
+    facing: float
+    speed: float
 
 
-@dataclass
-class _Step:
-    """A step holds what an update changes: mode, guidance, how long the gripper is steady (s), and attempts."""
-
-    mode: float
-    reason: float
-    distance: float
-    rate: float
-    opening: float
-    flip: float
-    steady: float
-    attempts: float
+@lru_cache
+def _situation() -> Kernel:
+    """Return a `_Situation` as a kernel of (relative, guidance)."""
+    relative, guidance = casadi.SX.sym("relative", RELATIVE), casadi.SX.sym("guidance", GUIDANCE)
+    servicer, (_, _, distance, _, _, flip) = Servicer(), casadi.vertsplit(guidance)
+    shoulder = servicer.X_BA @ np.array([0.0, 0.0, servicer.foot + servicer.lengths[0]])
+    axis, p_BH, v_BH = relative[4:11:3], relative[11:14], relative[17:20]
+    wrist = p_BH - (sum(servicer.lengths[5:]) + servicer.tool) * axis
+    lengths = (*gripper_errors(relative, distance, flip), wrist - casadi.DM(shoulder))
+    values = casadi.vertcat(relative[:2], *map(casadi.norm_2, lengths), axis[0], casadi.norm_2(v_BH))
+    return Kernel("situation", [relative, guidance], values, compile=None)
 
 
 class Supervisor(AddressedSystem):
@@ -177,11 +195,8 @@ class Supervisor(AddressedSystem):
     def __init__(self, *, period: float, acceleration: float) -> None:
         super().__init__()
         self._period = period
-        servicer, target = Servicer(), Target()
-        self._shoulder = servicer.X_BA @ np.array([0.0, 0.0, servicer.foot + servicer.lengths[0]])
-        self._wrist = sum(servicer.lengths[5:]) + servicer.tool
-        self._opening = servicer.opening
-        self._bar = 2.0 * target.bar_radius
+        self._opening, self._bar = Servicer().opening, 2.0 * Target().bar_radius
+        self._situation = _situation()
         self._capture = self.DeclareVectorInputPort("capture", 1)
         self._relative = self.DeclareVectorInputPort("relative", RELATIVE)
         self._joints = self.DeclareVectorInputPort("joint_position", len(JOINT_NAMES))
@@ -202,9 +217,9 @@ class Supervisor(AddressedSystem):
             steady_for=Quantity(0.0, "s"),
             attempts_made=Quantity(0.0),
             last_fingers=Quantity([self._opening, self._opening], "m"),
+            # The arm's positions through a low-pass filter, which are behind by the arm's rates times _SMOOTHING.
+            smooth_position=Quantity(np.zeros(ARM_JOINTS), "rad"),
         )
-        # The arm's positions through a low-pass filter, which are behind by the arm's rates times _SMOOTHING.
-        self._smooth = self.declare_discrete_state(smooth_position=Quantity(np.zeros(ARM_JOINTS), "rad"))
         settings = {
             # Value, unit, and the largest value.
             "standoff": (0.25, "m", 2.0),
@@ -230,112 +245,98 @@ class Supervisor(AddressedSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        T = self._period
-        p, last, memory = self._settings.view(context), self._instructions.view(context), self._memory.view(context)
-        mode = last.mode
-        relative = Relative(self._relative.Eval(context))
-        joints = self._joints.Eval(context)
-        arm, fingers = joints[:ARM_JOINTS], joints[ARM_JOINTS:]
-        behind = arm - self._smooth.array(context)
-        rests = _all_below(behind, p.still_rate * _SMOOTHING)
-        go = float(self._capture.Eval(context)[0])
-        still = _all_below(fingers - memory.last_fingers, 5e-4 * T / 0.02)
-        holds = 0.6 * self._bar < sum(fingers.tolist()) < 1.4 * self._bar
-        in_mode, since = memory.time_in_mode + T, memory.capture_time + T if mode != Mode.WAIT else 0.0
-
-        step = _Step(
-            mode=mode,
-            reason=memory.reason,
-            distance=last.distance,
-            rate=0.0,
-            opening=last.opening,
-            flip=last.flip,
-            steady=memory.steady_for,
-            attempts=memory.attempts_made,
-        )
-        trouble = self._trouble(mode, go, relative, since, p)
-        fresh = relative.age < p.hold_after
+        T, p = self._period, self._settings.view(context)
+        instructions, memory = self._instructions.mutable_array(state), self._memory.mutable(state)
+        guidance = self._instructions.vector.view(instructions)
+        seen = _Situation(*self._situation.value((self._relative.Eval(context), instructions)).tolist())
+        go = self._capture.Eval(context).item(0)
+        *arm, left, right = self._joints.Eval(context).tolist()
+        behind = [now - smooth for now, smooth in zip(arm, memory.smooth_position.tolist(), strict=True)]
+        rests = all(abs(angle) < p.still_rate * _SMOOTHING for angle in behind)
+        last_left, last_right = memory.last_fingers.tolist()
+        still = abs(left - last_left) < 5e-4 * T / 0.02 and abs(right - last_right) < 5e-4 * T / 0.02
+        holds = 0.6 * self._bar < left + right < 1.4 * self._bar
+        mode, rate, fresh = guidance.mode, guidance.rate, seen.age < p.hold_after
+        memory.time_in_mode += T
+        memory.capture_time = memory.capture_time + T if mode != Mode.WAIT else 0.0
+        guidance.rate = 0.0
+        trouble = self._trouble(mode, go, seen, memory.capture_time, p)
         if trouble is not None:
-            step.mode, step.reason = Mode.ABORT, trouble
+            guidance.mode, memory.reason = Mode.ABORT, trouble
         elif mode == Mode.WAIT:
-            if go > 0.5 and relative.valid and fresh and not self._unreachable(relative, p):
-                step.mode, step.reason, step.distance = Mode.APPROACH, Reason.TRACKED, p.standoff
-                step.flip = float((relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0)
+            if go > 0.5 and seen.tracked > 0.5 and fresh and not self._unreachable(seen, p):
+                guidance.mode, memory.reason, guidance.distance = Mode.APPROACH, Reason.TRACKED, p.standoff
+                relative = Relative(self._relative.Eval(context))
+                guidance.flip = (relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0
         elif mode in (Mode.APPROACH, Mode.TRACK) and fresh:
-            self._steer(step, relative, last.rate, p)
+            self._steer(guidance, memory, seen, rate, p)
         elif mode == Mode.GRIP:
-            self._grip(step, still, holds, in_mode, p)
-        elif mode == Mode.RETREAT and holds and self._lasts(step, rests) > p.still_time:
-            step.mode, step.reason = Mode.HOLD, Reason.STOPPED
+            self._grip(guidance, memory, still, holds, p)
+        elif mode == Mode.RETREAT and holds and self._lasts(memory, rests) > p.still_time:
+            guidance.mode, memory.reason = Mode.HOLD, Reason.STOPPED
         elif mode in (Mode.RETREAT, Mode.HOLD) and not holds and still:
-            step.mode, step.reason = Mode.ABORT, Reason.SLIPPED
-        if step.mode == Mode.ABORT:
-            step.opening = self._opening
-        if step.mode != mode:
-            in_mode = step.steady = 0.0
-        follows = step.mode in (Mode.APPROACH, Mode.TRACK, Mode.GRIP) and fresh
-        following = self._instructions.mutable(state)
-        following.mode, following.follows, following.flip = step.mode, follows, step.flip
-        following.distance, following.rate, following.opening = step.distance, step.rate, step.opening
-        remembered = self._memory.mutable(state)
-        remembered.reason, remembered.time_in_mode, remembered.capture_time = step.reason, in_mode, since
-        remembered.steady_for, remembered.attempts_made = step.steady, step.attempts
-        remembered.last_fingers = fingers
-        self._smooth.mutable(state).smooth_position = arm - behind * exp(-T / _SMOOTHING)
+            guidance.mode, memory.reason = Mode.ABORT, Reason.SLIPPED
+        if guidance.mode == Mode.ABORT:
+            guidance.opening = self._opening
+        if guidance.mode != mode:
+            memory.time_in_mode = memory.steady_for = 0.0
+        guidance.follows = guidance.mode in (Mode.APPROACH, Mode.TRACK, Mode.GRIP) and fresh
+        memory.last_fingers = left, right
+        decay = exp(-T / _SMOOTHING)
+        memory.smooth_position = [now - decay * late for now, late in zip(arm, behind, strict=True)]
 
-    def _lasts(self, step: _Step, true: bool) -> float:
+    def _lasts(self, memory: NamedView, true: bool) -> float:
         """Return for how long something has been true, in s."""
-        step.steady = step.steady + self._period if true else 0.0
-        return step.steady
+        steady: float = memory.steady_for + self._period if true else 0.0
+        memory.steady_for = steady
+        return steady
 
-    def _steer(self, step: _Step, relative: Relative, rate: float, p: NamedView) -> None:
+    def _steer(self, guidance: NamedView, memory: NamedView, seen: _Situation, rate: float, p: NamedView) -> None:
         """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
         T = self._period
-        error, angle = relative.errors(step.distance, step.flip)
-        close = error < p.position_tolerance and angle < p.orientation_tolerance
-        lasts = self._lasts(step, close)
-        if step.mode == Mode.APPROACH:
+        close = seen.error < p.position_tolerance and seen.angle < p.orientation_tolerance
+        lasts = self._lasts(memory, close)
+        if guidance.mode == Mode.APPROACH:
             if lasts > 0.5:
-                step.mode, step.reason = Mode.TRACK, Reason.BEFORE_BAR
-        elif step.distance > 0.0:
+                guidance.mode, memory.reason = Mode.TRACK, Reason.BEFORE_BAR
+        elif guidance.distance > 0.0:
             push = p.acceleration
-            goal = min(p.closing_speed, stopping_speed(step.distance, gain=1.0 / T, acceleration=push))
-            step.rate = -min(goal, push * T - rate) if close else 0.0
-            step.distance += step.rate * T
+            goal = min(p.closing_speed, stopping_speed(guidance.distance, gain=1.0 / T, acceleration=push))
+            guidance.rate = -min(goal, push * T - rate) if close else 0.0
+            guidance.distance += guidance.rate * T
         else:
-            step.steady = lasts if error < p.grip_tolerance else 0.0
-            if step.steady > p.grip_time:
-                step.mode, step.reason = Mode.GRIP, Reason.AT_BAR
+            memory.steady_for = lasts if seen.error < p.grip_tolerance else 0.0
+            if memory.steady_for > p.grip_time:
+                guidance.mode, memory.reason = Mode.GRIP, Reason.AT_BAR
 
-    def _grip(self, step: _Step, still: bool, holds: bool, in_mode: float, p: NamedView) -> None:
+    def _grip(self, guidance: NamedView, memory: NamedView, still: bool, holds: bool, p: NamedView) -> None:
         """Close the fingers; ``still`` tells whether they rest, ``holds`` whether the bar is between them."""
-        step.opening = 0.0
-        if self._lasts(step, still) <= 0.3 or in_mode <= 0.5:
+        guidance.opening = 0.0
+        if self._lasts(memory, still) <= 0.3 or memory.time_in_mode <= 0.5:
             return
         if holds:
-            step.mode, step.reason = Mode.RETREAT, Reason.GRIPPED
-        elif step.attempts + 1.0 >= p.attempts:
-            step.mode, step.reason = Mode.ABORT, Reason.MISSED_TOO_OFTEN
+            guidance.mode, memory.reason = Mode.RETREAT, Reason.GRIPPED
+        elif memory.attempts_made + 1.0 >= p.attempts:
+            guidance.mode, memory.reason = Mode.ABORT, Reason.MISSED_TOO_OFTEN
         else:
-            step.mode, step.reason, step.attempts = Mode.APPROACH, Reason.MISSED, step.attempts + 1.0
-            step.distance, step.opening = p.standoff, self._opening
+            guidance.mode, memory.reason = Mode.APPROACH, Reason.MISSED
+            memory.attempts_made += 1.0
+            guidance.distance, guidance.opening = p.standoff, self._opening
 
-    def _trouble(self, mode: float, go: float, relative: Relative, since: float, p: NamedView) -> float:
+    def _trouble(self, mode: float, go: float, seen: _Situation, since: float, p: NamedView) -> float | None:
         """Return the reason for an abort, or None."""
         if mode not in (Mode.APPROACH, Mode.TRACK, Mode.GRIP):
             return Reason.COMMANDED if go < -0.5 and mode in (Mode.RETREAT, Mode.HOLD) else None
         if go < -0.5:
             return Reason.COMMANDED
-        if relative.age > p.lost_after or not relative.valid:
+        if seen.age > p.lost_after or not seen.tracked > 0.5:
             return Reason.LOST
-        if self._unreachable(relative, p):
+        if self._unreachable(seen, p):
             return Reason.OUT_OF_REACH
-        if hypot(*relative.v_BH.tolist()) > p.largest_speed:
+        if seen.speed > p.largest_speed:
             return Reason.TOO_FAST
         return Reason.TIMEOUT if since > p.time_limit else None
 
-    def _unreachable(self, relative: Relative, p: NamedView) -> bool:
+    def _unreachable(self, seen: _Situation, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""
-        wrist = relative.p_BH - self._wrist * relative.R_BH[:, 2]
-        far = hypot(*(wrist - self._shoulder).tolist()) > p.reach
-        return far or relative.R_BH[0, 2] < np.cos(p.largest_angle)
+        return bool(seen.reach > p.reach or seen.facing < cos(p.largest_angle))

@@ -236,7 +236,7 @@ class _Flight:
     def kernel(self, name: str, *values: casadi.SX) -> Kernel:
         """Return values as a kernel of the flight; those of matrices row after row."""
         y = casadi.densify(casadi.vertcat(*(casadi.vec(value.T) if value.is_square() else value for value in values)))
-        return Kernel(name, [self.track, self.flight, self.conditions], y, compile=False)
+        return Kernel(name, [self.track, self.flight, self.conditions], y, compile=None)
 
 
 @lru_cache
