@@ -103,5 +103,5 @@ def test_errors_of_the_gripper_are_those_of_its_pose(flip: float) -> None:
     poses = [(X.rotation().matrix().ravel(), X.translation()) for X in (X_BH, X_BG)]
     relative = np.concatenate([[0.0, 1.0], *poses[0], np.zeros(6), *poses[1]])
     angle = X_DG.rotation().ToAngleAxis().angle()
-    errors = [np.linalg.norm(error) for error in gripper_errors(casadi.DM(relative), 0.25, casadi.DM(flip))]
+    errors = [float(casadi.norm_2(e)) for e in gripper_errors(casadi.DM(relative), 0.25, casadi.DM(flip))]
     assert errors == pytest.approx([np.linalg.norm(X_DG.translation()), angle], abs=1e-12)
