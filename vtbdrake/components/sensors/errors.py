@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf, sqrt
 
 import numpy as np
@@ -17,6 +18,9 @@ from vtbdrake.state import AddressedSystem, Quantity
 
 # Channels of a sensor's stream; 0 is its white noise.
 _DRIFT_CHANNEL, _DROPOUT_CHANNEL, _OUTLIER_CHANNEL, _OUTLIER_SIZE_CHANNEL = 1, 2, 3, 4
+
+# The settings of so many contexts are kept.
+_KEPT = 128
 
 
 @dataclass
@@ -69,8 +73,8 @@ class _Settings:
     """The parameters of an `ErrorStage`, as they are used. None: there is no such error."""
 
     seed: int
-    # 0 without random errors.
-    stream: int = 0
+    # None without random errors.
+    stream: int | None = None
     noise: NDArray[np.float64] | None = None
     bias: NDArray[np.float64] | None = None
     # Of one step of the random walk.
@@ -147,17 +151,16 @@ class ErrorStage:
                 "outlier_size": Quantity(model.outlier_size, unit, positive),
             }
         self.parameters = sensor.declare_parameters(**settings)
-        self._settings = sensor.declare_cache(
-            "error settings", self._calc_settings, {sensor.numeric_parameter_ticket(self.parameters.index)}
-        )
+        # What the parameters say is found again by their values, which are the same in many steps.
+        self._settings = lru_cache(_KEPT)(self._settings_of)
         if model is not None:
             memory = {"walk": Quantity(np.zeros(n), unit)}
             if self.longest:
                 memory["in_transit"] = Quantity(np.tile(default, (self.longest, 1)), unit)
             self.memory = sensor.declare_discrete_state(**memory)
 
-    def _calc_settings(self, context: Context) -> _Settings:
-        parameters = self.parameters.view(context)
+    def _settings_of(self, values: bytes) -> _Settings:
+        parameters = self.parameters.vector.view(np.frombuffer(values))
         deviations = [getattr(parameters, name) for name in self.noise]
         settings = _Settings(int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self.noise.values()))))
         if self.has_model:
@@ -182,18 +185,14 @@ class ErrorStage:
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what the sensor shows when it measures ``y``."""
-        all_but_seed = self.parameters.array(context)[1:]
-        if not (np.count_nonzero(all_but_seed) or (self.has_model and self._remembers(context))):
-            return y
-        settings: _Settings = self._settings(context)
-        key = {"seed": settings.seed, "stream": settings.stream, "tick": round(context.get_time() / self._period)}
+        settings = self._settings(self.parameters.array(context).tobytes())
+        key: dict[str, int] = {}
+        if settings.stream is not None:
+            tick = round(context.get_time() / self._period)
+            key = {"seed": settings.seed, "stream": settings.stream, "tick": tick}
         if settings.noise is not None:
             y = y + settings.noise * normal_noise(y.size, **key)
         return self._shown(context, state, y, settings, key) if self.has_model else y
-
-    def _remembers(self, context: Context) -> bool:
-        """Return whether samples may be in transit, or the random walk has left zero."""
-        return self.longest > 0 or any(self.memory.view(context).walk.tolist())
 
     def _shown(
         self,
