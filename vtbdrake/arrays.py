@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar, dataclass_transform
 
@@ -23,20 +24,23 @@ def immutable(cls: _Class) -> _Class:
     copied, before the class's own ``__post_init__`` and again after unpickling. Values are compared by identity.
     """
     check = cls.__dict__.get("__post_init__")
+    is_of_floats: dict[str, bool] = {}
 
     def post_init(self: Any) -> None:
-        _own_arrays(self)
+        _own_arrays(self, is_of_floats)
         if check is not None:
             check(self)
 
     def set_state(self: Any, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        _own_arrays(self)
+        _own_arrays(self, is_of_floats)
 
     methods = {"__post_init__": post_init, "__setstate__": set_state, "__deepcopy__": lambda self, memo: self}
     for name, method in methods.items():
         setattr(cls, name, method)
-    return dataclass(frozen=True, eq=False)(cls)  # type: ignore[return-value]
+    dataclass(frozen=True, eq=False)(cls)
+    is_of_floats |= {field.name: field.type in ("Array", Array) for field in fields(cls)}
+    return cls
 
 
 def set_read_only(value: Any, **arrays: NDArray[Any]) -> None:
@@ -46,13 +50,13 @@ def set_read_only(value: Any, **arrays: NDArray[Any]) -> None:
         object.__setattr__(value, name, array)
 
 
-def _own_arrays(value: Any) -> None:
-    for field in fields(value):
-        array: Any = getattr(value, field.name, None)  # None: a field that ``__post_init__`` computes.
-        of_floats = field.type in ("Array", Array) and array is not None
-        if not (of_floats or isinstance(array, np.ndarray)):
+def _own_arrays(value: Any, is_of_floats: Mapping[str, bool]) -> None:
+    """Make the arrays of an immutable value its own; ``is_of_floats`` tells of each field whether it is an `Array`."""
+    for name, of_floats in is_of_floats.items():
+        array: Any = getattr(value, name, None)  # None: a field that ``__post_init__`` computes.
+        if array is None or not (of_floats or isinstance(array, np.ndarray)):
             continue
         is_right = isinstance(array, np.ndarray) and (array.dtype == float or not of_floats)
         # A view may be read-only while its base is not.
         if not is_right or array.flags.writeable or not array.flags.owndata:
-            set_read_only(value, **{field.name: np.array(array, dtype=float if of_floats else None)})
+            set_read_only(value, **{name: np.array(array, dtype=float if of_floats else None)})
