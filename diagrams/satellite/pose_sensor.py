@@ -105,9 +105,10 @@ class PoseReader(AddressedSystem):
         estimate = self.DeclareAbstractState(Value(PoseEstimate.missing()))
         self.DeclareStateOutputPort("estimate", estimate)
         self._estimate = int(estimate)
-        self._last = self.declare_discrete_state(last_pose=Quantity(np.zeros(7), "1, m"))
-        self._arrived = self.declare_discrete_state(
-            last_time=Quantity(0.0, "s"), waiting=Quantity(0.0, bounds=(0.0, 1.0))
+        self._last = self.declare_discrete_state(
+            last_pose=Quantity(np.zeros(7), "1, m"),
+            last_time=Quantity(0.0, "s"),
+            waiting=Quantity(0.0, bounds=(0.0, 1.0)),
         )
         self._settings = self.declare_parameters(
             latency=Quantity(latency, "s", (0.0, 1.0)), deviation=Quantity(deviation, "m", (0.0, 10.0))
@@ -116,22 +117,21 @@ class PoseReader(AddressedSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        settings, last = self._settings.view(context), self._last.array(context)
-        arrived = self._arrived.view(context)
-        taken, pose = context.get_time() - self._period - settings.latency, self._pose.Eval(context)
-        # Nothing was measured before the start; times are rounded.
-        is_new = taken > -0.5 * self._period and pose.tolist() != last.tolist()
-        if not (is_new or arrived.waiting):
+        last, pose = self._last.view(context), self._pose.Eval(context)
+        waiting, differs = last.waiting, pose.tolist() != last.last_pose.tolist()
+        if not (differs or waiting):
             return EventStatus.DidNothing()
-        if arrived.waiting:
-            X_IB: RigidTransform = pose_at(self._history.Eval(context), arrived.last_time)
+        settings = self._settings.view(context)
+        taken = context.get_time() - self._period - settings.latency
+        # Nothing was measured before the start; times are rounded.
+        is_new = differs and taken > -0.5 * self._period
+        if waiting:
+            X_IB: RigidTransform = pose_at(self._history.Eval(context), last.last_time)
             covariance = settings.deviation**2 * _COVARIANCE
-            estimate = PoseEstimate.of(X_IB @ pose_of_state(last), covariance, time=arrived.last_time)
+            estimate = PoseEstimate.of(X_IB @ pose_of_state(last.last_pose), covariance, time=last.last_time)
             state.get_mutable_abstract_state(self._estimate).set_value(estimate)
-        numbers = state.get_mutable_discrete_state()
-        following = self._arrived.mutable(numbers)
+        following = self._last.mutable(state.get_mutable_discrete_state())
         following.waiting = is_new
         if is_new:
-            self._last.mutable(numbers).last_pose = pose
-            following.last_time = max(taken, 0.0)
+            following.last_pose, following.last_time = pose, max(taken, 0.0)
         return EventStatus.Succeeded()
