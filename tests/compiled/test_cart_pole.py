@@ -9,7 +9,7 @@ import casadi
 import numpy as np
 import pytest
 
-from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError, rollouts
 from vtbdrake.compiled.rollouts import CompiledBatch
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutTask, SerialExecutor
@@ -107,6 +107,22 @@ def test_threads_and_batches_change_nothing() -> None:
     np.testing.assert_array_equal(state, alone(values).outputs["plant.state"])
     single = alone({"u.plan": values["u.plan"][149]})
     np.testing.assert_array_equal(state[149], single.outputs["plant.state"][0])
+
+
+def test_long_rollouts_are_made_in_smaller_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each group has the noise of its own seeds."""
+    seed, measured = "sim.sense.joint_position.seed", "sim.sense.joint_position.joint_encoders"
+    options = {"parameters": [seed], "outputs": [measured], "check": False}
+    values = {seed: np.array([7.0, 8.0, 7.0, 9.0, 10.0])}
+    sizes = []
+    buffers = rollouts.Buffers
+    monkeypatch.setattr(rollouts, "Buffers", lambda f, **options: sizes.append(f.nnz_out()) or buffers(f, **options))
+    together = compiled(SCENARIOS["errors"], **options)(values).outputs[measured]
+    monkeypatch.setattr(rollouts, "_MOST_BYTES", 1)
+    apart = compiled(SCENARIOS["errors"], **options)(values).outputs[measured]
+    np.testing.assert_array_equal(apart, together)
+    assert len(np.unique(together[:, -1, 0])) == 4
+    assert sizes == [5 * sizes[1], sizes[1]]
 
 
 def test_machine_code_gives_the_same_numbers() -> None:

@@ -32,8 +32,9 @@ _log = logging.getLogger(__name__)
 
 # Steps that are called one after the other before they become a function of their own.
 _UNROLLED = 16
-# As many rollouts are made in one call of a function; functions are kept of so many numbers.
-_LARGEST_CHUNK, _MAX_SIZES = 128, 16
+# As many rollouts, with arguments and results of so many bytes, are made in one call of a function at most; functions
+# are kept of so many sizes, with their memory.
+_MOST_ROLLOUTS, _MOST_BYTES, _MAX_SIZES = 128, 8_000_000, 16
 
 _NO_UPDATE = -1.0
 
@@ -199,15 +200,16 @@ class CompiledRollouts:
         self.walker.check_fixed(z, self._z0)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
-        noise = self._noise(z, instants, program.count)
-        if len(z) <= _LARGEST_CHUNK:
-            final, recorded = program.run(z, noise, plan)
+        chunks = [z[k : k + program.most] for k in range(0, len(z), program.most)]
+
+        def run(chunk: Array) -> tuple[Array, Array]:
+            return program.run(chunk, self._noise(chunk, instants, program.count), plan)
+
+        if len(chunks) <= 1:
+            final, recorded = run(z)
         else:
-            chunks = [slice(k, k + _LARGEST_CHUNK) for k in range(0, len(z), _LARGEST_CHUNK)]
             with ThreadPoolExecutor(self._workers) as pool:
-                results = list(
-                    pool.map(lambda part: program.run(z[part], None if noise is None else noise[part], plan), chunks)
-                )
+                results = list(pool.map(run, chunks))
             final, recorded = (np.concatenate(parts) for parts in zip(*results, strict=True))
         valid = self.walker.is_finite(final)
         if self._overruns:
@@ -365,7 +367,13 @@ class CompiledRollouts:
 
 
 class _Program:
-    """The rollout over a number of instants as machine code."""
+    """The rollout over a number of instants as machine code.
+
+    Attributes:
+        count: The number of instants.
+        function: The function of one rollout; see `_rollout`.
+        most: The largest number of rollouts in one call of `run`.
+    """
 
     def __init__(
         self,
@@ -382,6 +390,8 @@ class _Program:
         packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
         self._packed = translate(packed)
         self.is_machine_code = self._packed is not packed
+        bytes_each = 8 * (packed.nnz_in() + packed.nnz_out())
+        self.most = min(max(_MOST_BYTES // bytes_each, 1), _MOST_ROLLOUTS)
         self._buffers: LruDict[int, Buffers] = LruDict(_MAX_SIZES)
         self._lock = threading.Lock()
 
