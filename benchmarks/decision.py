@@ -118,7 +118,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
 
     ours, rolled_out = 1e3 * np.array(overheads), 1e3 * np.array(rollouts)
     anew, again = (
-        1e3 * np.median([seconds(partial(begin_at, *starts)) for _ in range(decisions)]) / 2
+        1e3 * np.median([processor_time(partial(begin_at, *starts)) for _ in range(decisions)]) / 2
         for starts in ((first_start, second_start), (first_start, first_start))
     )
     ours += 2 * max(float(anew - again), 0.0)
