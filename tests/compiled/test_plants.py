@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.common.value import Value
-from pydrake.multibody.math import SpatialForce
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
+from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain, Sine, ZeroOrderHold
 
@@ -96,6 +97,33 @@ def test_a_floating_base_tumbles() -> None:
     rollouts = rollouts_of(builder.Build(), ("plant.state",))
     assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
     assert np.ptp(rollouts().outputs["plant.state"][0], axis=0)[7] > 1e-3
+
+
+def test_poses_of_bodies_are_recorded() -> None:
+    """Of a floating base that turns through all angles, and of a link with a tilted joint beside its origin."""
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    base, arm = (plant.AddRigidBody(name, BOX) for name in ("base", "arm"))
+    tilted = RigidTransform(RollPitchYaw(0.3, -0.5, 1.0), [0.1, 0.2, -0.3])
+    plant.AddJoint(RevoluteJoint("hinge", base.body_frame(), plant.AddFrame(
+        FixedOffsetFrame("pivot", arm.body_frame(), tilted)), [0, 0, 1], 0.1))  # fmt: skip
+    plant.Finalize()
+    builder.AddNamedSystem("plant", plant)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    spin = SpatialVelocity([3.0, -4.0, 9.0], [0.1, 0.2, 3.0])
+    plant.SetFreeBodySpatialVelocity(plant.GetMyMutableContextFromRoot(context), base, spin)
+    variables = collect(diagram)
+    entries = [f"plant.{body}.{e}" for body in ("base", "arm") for e in ("x", "y", "height", "roll", "pitch", "yaw")]
+    rollouts = CompiledRollouts(
+        diagram, variables, context, horizon=1.0, sample_period=0.05, outputs=["plant.state", *entries], compile=False
+    )
+    recorded = rollouts().outputs
+    for k, state in enumerate(recorded["plant.state"][0]):
+        plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(context), state)
+        expected = [variables[entry].get(context) for entry in entries]
+        np.testing.assert_allclose([recorded[entry][0, k] for entry in entries], expected, rtol=0, atol=1e-12)
+    assert np.ptp(recorded["plant.base.yaw"]) > 5.0 and np.ptp(recorded["plant.arm.pitch"]) > 1.0
 
 
 def test_a_rollout_that_reaches_a_stop_is_not_valid() -> None:

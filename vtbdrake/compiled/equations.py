@@ -148,6 +148,10 @@ class Equations(ABC):
     def output(self, port: str, at: At) -> Expression:
         """Return the value of an output port, shape (n, 1)."""
 
+    def derived(self, name: str, at: At) -> Expression | None:
+        """Return the value of a variable that is computed from the state, if it has an expression."""
+        return None
+
     def update(self, at: At) -> dict[int | str, Expression]:
         """Return the next values of the discrete groups, by number, and of the memory, by name."""
         return {}

@@ -11,9 +11,10 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
 from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refusal, zeros
+from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
 from vtbdrake.components.compiled_plant.links import contacts
-from vtbdrake.state.multibody import multibody_variables
+from vtbdrake.state.multibody import POSE_ENTRIES, bodies, element_address, multibody_variables
 from vtbdrake.state.variables import A, Variable
 
 # What may act on a plant beside its actuation.
@@ -59,6 +60,17 @@ class PlantEquations(Equations):
         if port == "reaction_forces" and not self._plant.has_sampled_output_ports():
             return self._reactions(at)
         raise refusal(self._plant, f"has the output port {port}, which is not compiled")
+
+    def derived(self, name: str, at: At) -> Expression | None:
+        address, _, entry = name.rpartition(".")
+        found = (body for body in bodies(self._plant) if element_address(self._plant, body, _no_prefix) == address)
+        body = next(found, None)
+        if body is None or entry not in POSE_ENTRIES:
+            return None
+        R, p = self._model.pose(body, at.state(0)[: self._model.nq])
+        pose = casadi.vertcat(p, roll_pitch_yaw_angles(R))
+        (value,) = self._substituted([pose[list(POSE_ENTRIES).index(entry)]], at)
+        return value
 
     def _reactions(self, at: At) -> Callable[[int], Expression]:
         """Return the reaction forces of the present step, by the place of the joint among those of the plant."""
@@ -140,9 +152,14 @@ def _force(force: AppliedForce | ExternallyAppliedSpatialForce) -> AppliedForce:
     return AppliedForce(int(force.body_index), casadi.DM(force.p_BoBq_B), casadi.DM(F_Bq_W))
 
 
+def _no_prefix(instance: str) -> str:
+    """Variables of a plant have addresses within it."""
+    return ""
+
+
 def _inputs(plant: MultibodyPlant) -> Iterator[Variable]:
     """Yield the variables of a plant that can be inputs of its compiled step, with their addresses within it."""
-    for variable in multibody_variables(plant, prefix=lambda instance: ""):
+    for variable in multibody_variables(plant, prefix=_no_prefix):
         if variable.kind == A and not variable.hidden:
             yield variable
 

@@ -288,15 +288,26 @@ class Walker:
             return time
         if address in self.variables:
             entries = self._lies(address)
-            if entries is None:
+            value = self._derived(address, Evaluation(self, z, time, w)) if entries is None else z[entries]
+            if value is None:
                 raise ValueError(f"{address} cannot be recorded in the compiled testbed: {self._reason(address)}")
-            return z[entries]
+            return value
         system, port = self._port(address)
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
         leaf, number = writer_of(system, port.get_index())
         evaluation = Evaluation(self, z, time, w)
         return casadi.densify(evaluation.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
+
+    def _derived(self, address: str, evaluation: Evaluation) -> Expression | None:
+        """Return the value of a variable that its system computes from the state, if it has an expression."""
+        if self.variables[address].derived:
+            for path, equations in self.equations.items():
+                name = self._within(path, address)
+                value = equations.derived(name, evaluation.of(path)) if name else None
+                if value is not None:
+                    return value
+        return None
 
     def reader(self, address: str) -> Callable[[Context], Any]:
         """Return a function that reads an output of `output` from a root context."""

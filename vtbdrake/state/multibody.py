@@ -35,7 +35,8 @@ Prefix = Callable[[str], str]
 
 _JOINT_UNITS = {"revolute": ("rad", "rad/s", "N m s/rad"), "prismatic": ("m", "m/s", "N s/m")}
 _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
-_POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+# What is derived from the pose of a body, with its units: the entries of [x, y, z, roll, pitch, yaw].
+POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
 _FRICTION = ("material", "coulomb_friction")
 
 
@@ -50,7 +51,7 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Va
         yield from _body_variables(plant, body, address)
         if body.is_floating_base_body():
             yield _floating_pose(plant, body, address)
-            for entry in _POSE_ENTRIES:
+            for entry in POSE_ENTRIES:
                 yield _pose_entry(plant, body, address, entry)
     for index in range(plant.num_frames()):
         frame = plant.get_frame(FrameIndex(index))
@@ -74,7 +75,7 @@ def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str
         for body in bodies(plant)
         if not body.is_floating_base_body()
         for address in [element_address(plant, body, prefix)]
-        for entry in _POSE_ENTRIES
+        for entry in POSE_ENTRIES
     }
 
 
@@ -225,7 +226,7 @@ def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Vari
 
 
 def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str) -> Variable:
-    axis, unit = list(_POSE_ENTRIES).index(entry) % 3, _POSE_ENTRIES[entry]
+    axis, unit = list(POSE_ENTRIES).index(entry) % 3, POSE_ENTRIES[entry]
 
     def read(root: Context) -> float:
         X_WB = body.EvalPoseInWorld(plant.GetMyContextFromRoot(root))

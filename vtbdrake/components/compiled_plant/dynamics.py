@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import casadi
 import numpy as np
 from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
-from pydrake.multibody.tree import Frame, Joint
+from pydrake.multibody.tree import Frame, Joint, RigidBody
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.casadi_system.kernel import clamp
@@ -323,6 +323,11 @@ class PlantDynamics:
         return casadi.vertcat(R @ alpha, R @ linear)
 
     # -- forces
+
+    def pose(self, body: RigidBody, q: Expression) -> Pose:
+        """Return the pose of a body in the world, (R_WB, p_WB)."""
+        k, X_MB = self._mounts[int(body.index())]
+        return X_MB if k < 0 else times(self._poses(q)[k], X_MB)
 
     def generalized(self, q: Expression, forces: Sequence[AppliedForce]) -> Expression:
         """Return tau of forces in the world that act on bodies."""
