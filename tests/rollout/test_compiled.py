@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from math import inf
 from operator import itemgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -368,6 +369,18 @@ def test_auto_tells_once_why_nothing_is_compiled(
         results = [result for _ in range(2) for _, result in executor.run(task, [point, point])]
     assert [result.computed for result in results] == 4 * ["drake"]
     assert caplog.text.count("rollouts are simulated in Drake: ") == 1 and reason in caplog.text
+
+
+def test_auto_takes_drake_without_a_compiler(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("CC", "no-compiler")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    task = RolloutTask(SCENARIO, 0.1, Quality(height, "plant.state"))
+    with caplog.at_level("INFO"):
+        results = outcomes(task, points(2), auto(COMPILE_FROM))
+    assert [result.computed for result in results] == 2 * ["drake"]
+    assert "rollouts are simulated in Drake: " in caplog.text and "no-compiler" in caplog.text
 
 
 def test_what_is_not_compiled_runs_in_the_executor_that_is_given() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vtbdrake.compiled import CompiledBatch, CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
+from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, SerialExecutor, checked_workers
 from vtbdrake.rollout.pruning import Cutoff
@@ -130,7 +131,7 @@ class AutoExecutor(Executor):
 
     The log tells why a testbed is not compiled, and ``RolloutResult.computed`` how a rollout was made. The choice does
     not depend on how long rollouts take, so that a study that is repeated is computed as before. Rollouts are in Drake
-    where a field of the scenario is varied: each of its values would be compiled anew.
+    without a C compiler, and where a field of the scenario is varied: each of its values would be compiled anew.
 
     Args:
         testbed: A testbed to use for tasks of its scenario; others are built.
@@ -139,7 +140,7 @@ class AutoExecutor(Executor):
     """
 
     def __init__(self, testbed: VirtualTestbed, drake: Executor, *, workers: int | None = None) -> None:
-        self._compiled = CompiledExecutor(testbed, workers=workers, drake=drake)
+        self._compiled = CompiledExecutor(testbed, workers=workers, compile=True, drake=drake)
         self._drake = drake
         self._refused: RolloutTask | None = None
 
@@ -158,7 +159,7 @@ class AutoExecutor(Executor):
             if fields:
                 raise UnsupportedTestbedError(f"each value of {fields[0]} would be compiled anew")
             self._compiled.prepare(task, points)
-        except (ValueError, ArithmeticError) as error:
+        except (ValueError, ArithmeticError, CompilerError) as error:
             self._refused = task
             _log.info("rollouts are simulated in Drake: %s", error)
             return False
