@@ -248,7 +248,7 @@ class Supervisor(AddressedSystem):
         T, p = self._period, self._settings.view(context)
         instructions, memory = self._instructions.mutable_array(state), self._memory.mutable(state)
         guidance = self._instructions.vector.view(instructions)
-        seen = _Situation(*self._situation.value((self._relative.Eval(context), instructions)).tolist())
+        situation = _Situation(*self._situation.value((self._relative.Eval(context), instructions)).tolist())
         go = self._capture.Eval(context).item(0)
         *arm, left, right = self._joints.Eval(context).tolist()
         behind = [now - smooth for now, smooth in zip(arm, memory.smooth_position.tolist(), strict=True)]
@@ -256,20 +256,20 @@ class Supervisor(AddressedSystem):
         last_left, last_right = memory.last_fingers.tolist()
         still = abs(left - last_left) < 5e-4 * T / 0.02 and abs(right - last_right) < 5e-4 * T / 0.02
         holds = 0.6 * self._bar < left + right < 1.4 * self._bar
-        mode, rate, fresh = guidance.mode, guidance.rate, seen.age < p.hold_after
+        mode, rate, fresh = guidance.mode, guidance.rate, situation.age < p.hold_after
         memory.time_in_mode += T
         memory.capture_time = memory.capture_time + T if mode != Mode.WAIT else 0.0
         guidance.rate = 0.0
-        trouble = self._trouble(mode, go, seen, memory.capture_time, p)
+        trouble = self._trouble(mode, go, situation, memory.capture_time, p)
         if trouble is not None:
             guidance.mode, memory.reason = Mode.ABORT, trouble
         elif mode == Mode.WAIT:
-            if go > 0.5 and seen.tracked > 0.5 and fresh and not self._unreachable(seen, p):
+            if go > 0.5 and situation.tracked > 0.5 and fresh and not self._unreachable(situation, p):
                 guidance.mode, memory.reason, guidance.distance = Mode.APPROACH, Reason.TRACKED, p.standoff
                 relative = Relative(self._relative.Eval(context))
                 guidance.flip = (relative.R_BH[:, 0] * relative.R_BG[:, 0]).sum() < 0.0
         elif mode in (Mode.APPROACH, Mode.TRACK) and fresh:
-            self._steer(guidance, memory, seen, rate, p)
+            self._steer(guidance, memory, situation, rate, p)
         elif mode == Mode.GRIP:
             self._grip(guidance, memory, still, holds, p)
         elif mode == Mode.RETREAT and holds and self._lasts(memory, rests) > p.still_time:
@@ -291,10 +291,10 @@ class Supervisor(AddressedSystem):
         memory.steady_for = steady
         return steady
 
-    def _steer(self, guidance: NamedView, memory: NamedView, seen: _Situation, rate: float, p: NamedView) -> None:
+    def _steer(self, guidance: NamedView, memory: NamedView, situation: _Situation, rate: float, p: NamedView) -> None:
         """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
         T = self._period
-        close = seen.error < p.position_tolerance and seen.angle < p.orientation_tolerance
+        close = situation.error < p.position_tolerance and situation.angle < p.orientation_tolerance
         lasts = self._lasts(memory, close)
         if guidance.mode == Mode.APPROACH:
             if lasts > 0.5:
@@ -305,7 +305,7 @@ class Supervisor(AddressedSystem):
             guidance.rate = -min(goal, push * T - rate) if close else 0.0
             guidance.distance += guidance.rate * T
         else:
-            memory.steady_for = lasts if seen.error < p.grip_tolerance else 0.0
+            memory.steady_for = lasts if situation.error < p.grip_tolerance else 0.0
             if memory.steady_for > p.grip_time:
                 guidance.mode, memory.reason = Mode.GRIP, Reason.AT_BAR
 
@@ -323,20 +323,20 @@ class Supervisor(AddressedSystem):
             memory.attempts_made += 1.0
             guidance.distance, guidance.opening = p.standoff, self._opening
 
-    def _trouble(self, mode: float, go: float, seen: _Situation, since: float, p: NamedView) -> float | None:
+    def _trouble(self, mode: float, go: float, situation: _Situation, since: float, p: NamedView) -> float | None:
         """Return the reason for an abort, or None."""
         if mode not in (Mode.APPROACH, Mode.TRACK, Mode.GRIP):
             return Reason.COMMANDED if go < -0.5 and mode in (Mode.RETREAT, Mode.HOLD) else None
         if go < -0.5:
             return Reason.COMMANDED
-        if seen.age > p.lost_after or not seen.tracked > 0.5:
+        if situation.age > p.lost_after or not situation.tracked > 0.5:
             return Reason.LOST
-        if self._unreachable(seen, p):
+        if self._unreachable(situation, p):
             return Reason.OUT_OF_REACH
-        if seen.speed > p.largest_speed:
+        if situation.speed > p.largest_speed:
             return Reason.TOO_FAST
         return Reason.TIMEOUT if since > p.time_limit else None
 
-    def _unreachable(self, seen: _Situation, p: NamedView) -> bool:
+    def _unreachable(self, situation: _Situation, p: NamedView) -> bool:
         """Return whether the arm cannot bring its wrist behind the fixture, or only from its rear."""
-        return bool(seen.reach > p.reach or seen.facing < cos(p.largest_angle))
+        return bool(situation.reach > p.reach or situation.facing < cos(p.largest_angle))

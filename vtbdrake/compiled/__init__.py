@@ -4,6 +4,7 @@ from vtbdrake.compiled.check import CompiledDifferenceError
 from vtbdrake.compiled.equations import At, Draw, Equations, Fixed, Timing, UnsupportedTestbedError
 from vtbdrake.compiled.registry import EQUATIONS
 from vtbdrake.compiled.rollouts import CompiledBatch, CompiledRollouts
+from vtbdrake.components.casadi_system.compiler import CompilerError
 
 __all__ = [
     "EQUATIONS",
@@ -11,6 +12,7 @@ __all__ = [
     "CompiledBatch",
     "CompiledDifferenceError",
     "CompiledRollouts",
+    "CompilerError",
     "Draw",
     "Equations",
     "Fixed",

@@ -63,8 +63,8 @@ class PlantEquations(Equations):
 
     def derived(self, name: str, at: At) -> Expression | None:
         address, _, entry = name.rpartition(".")
-        found = (body for body in bodies(self._plant) if element_address(self._plant, body, _no_prefix) == address)
-        body = next(found, None)
+        addressed = {element_address(self._plant, body, _no_prefix): body for body in bodies(self._plant)}
+        body = addressed.get(address)
         if body is None or entry not in POSE_ENTRIES:
             return None
         R, p = self._model.pose(body, at.state(0)[: self._model.nq])

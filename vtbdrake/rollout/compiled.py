@@ -12,9 +12,8 @@ from typing import Any
 import casadi
 import numpy as np
 
-from vtbdrake.compiled import CompiledBatch, CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.compiled import CompiledBatch, CompiledRollouts, CompilerError, UnsupportedTestbedError
 from vtbdrake.compiled.trace import traced
-from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, SerialExecutor, checked_workers
 from vtbdrake.rollout.pruning import Cutoff
