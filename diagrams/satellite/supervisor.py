@@ -118,7 +118,7 @@ def stopping_speed(distance: Any, *, gain: Any, acceleration: Any) -> Any:
 
 
 class _Situation(NamedTuple):
-    """What the supervisor knows of target and gripper.
+    """It is what the supervisor knows of target and gripper.
 
     Attributes:
         age: The age of the newest estimate of the target, in s.

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import LinearSystem
+from pydrake.systems.framework import Context
 
-from tests.reasoning.pusher import CANDIDATE, PERIOD, PLANNER, STATE, Law, PusherScenario
+from tests.reasoning.pusher import CANDIDATE, PLANNER, STATE, Law, PusherScenario
 from vtbdrake.compiled import EQUATIONS, At, Equations, UnsupportedTestbedError
 from vtbdrake.compiled.equations import Expression
 from vtbdrake.optimization import Parameter
@@ -110,18 +109,8 @@ class DerivedScenario(PusherScenario):
     every: float = 0.2
     counts: bool = False
 
-    def make_dps(self) -> Diagram:
-        builder = DiagramBuilder()
-        planner = builder.AddNamedSystem("planner", (Counting if self.counts else Configured)(scenario=self))
-        law = builder.AddNamedSystem("law", Law())
-        builder.ExportInput(law.GetInputPort("state"), "state")
-        builder.ConnectInput("state", planner.GetInputPort("state"))
-        builder.Connect(planner.GetOutputPort("decision"), law.GetInputPort("setpoint"))
-        builder.Connect(planner.GetOutputPort("valid"), law.GetInputPort("valid"))
-        goal = builder.AddNamedSystem("goal", LinearSystem([[0.0]], [[1.0]], [[1.0]], [[0.0]], PERIOD))
-        builder.ExportInput(goal.get_input_port(), "goal")
-        builder.ExportOutput(law.GetOutputPort("force"), "force")
-        return builder.Build()
+    def make_planner(self) -> OnboardReasoner:
+        return (Counting if self.counts else Configured)(scenario=self)
 
 
 def test_a_derived_class_with_a_constructor_alone_is_compiled() -> None:

@@ -100,7 +100,7 @@ def test_a_floating_base_tumbles() -> None:
 
 
 def test_poses_of_bodies_are_recorded() -> None:
-    """Of a floating base that turns through all angles, and of a link with a tilted joint beside its origin."""
+    """They are those of a floating base that turns through all angles, and of a link with a tilted joint."""
     builder = DiagramBuilder()
     plant = MultibodyPlant(0.01)
     base, arm = (plant.AddRigidBody(name, BOX) for name in ("base", "arm"))

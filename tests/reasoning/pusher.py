@@ -92,27 +92,27 @@ class PusherScenario(Scenario):
             commands=[Signal("goal", size=1, unit="m"), *request],
         )
 
+    def make_planner(self) -> OnboardReasoner:
+        walls = [Constraint(lambda state: state[0], of=[STATE], at_most=self.wall)] if self.wall < 1e3 else []
+        return OnboardReasoner(
+            1,
+            scenario=self,
+            decision=[Parameter(CANDIDATE, -1.0, 1.0)],
+            quality=Quality(missed_by, of=[STATE, "u.goal"], minimize=True, reading="end"),
+            horizon=self.horizon,
+            budget=Budget(rollouts=self.rollouts, seconds=60.0 if self.waits else None),
+            period=self.every or PERIOD,
+            latency=self.latency,
+            patience=300.0 if self.waits else 3.0,
+            on_request=not self.every,
+            believed={"state": 2},
+            mental=not self.reasons,
+            options={"search": SearchConfig(method=self.method, workers=1), "constraints": walls},
+        )
+
     def make_dps(self) -> Diagram:
         builder = DiagramBuilder()
-        walls = [Constraint(lambda state: state[0], of=[STATE], at_most=self.wall)] if self.wall < 1e3 else []
-        planner = builder.AddNamedSystem(
-            "planner",
-            OnboardReasoner(
-                1,
-                scenario=self,
-                decision=[Parameter(CANDIDATE, -1.0, 1.0)],
-                quality=Quality(missed_by, of=[STATE, "u.goal"], minimize=True, reading="end"),
-                horizon=self.horizon,
-                budget=Budget(rollouts=self.rollouts, seconds=60.0 if self.waits else None),
-                period=self.every or PERIOD,
-                latency=self.latency,
-                patience=300.0 if self.waits else 3.0,
-                on_request=not self.every,
-                believed={"state": 2},
-                mental=not self.reasons,
-                options={"search": SearchConfig(method=self.method, workers=1), "constraints": walls},
-            ),
-        )
+        planner = builder.AddNamedSystem("planner", self.make_planner())
         law = builder.AddNamedSystem("law", Law())
         builder.ExportInput(law.GetInputPort("state"), "state")
         builder.ConnectInput("state", planner.GetInputPort("state"))
