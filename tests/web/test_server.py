@@ -9,14 +9,20 @@ import socket as socketlib
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import msgpack
 import pytest
+import uvicorn
+from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Response
 from websockets.sync.client import ClientConnection, connect
+from websockets.uri import parse_uri
 
 from tests.web.test_drive import LimitedPendulumScenario, problem
 from vtbdrake.web import View, view
@@ -105,6 +111,33 @@ def test_foreign_host_and_foreign_origin_are_refused(running: View) -> None:
         assert refused.value.response.status_code == 403
     with pytest.raises(InvalidStatus), connect(url.replace("http", "ws", 1) + "session"):
         pass
+
+
+@pytest.mark.parametrize("path", ["", "session"])
+def test_page_that_answers_no_ping_stays_connected(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = partial(uvicorn.Config, ws_ping_interval=0.02, ws_ping_timeout=0.02)
+    monkeypatch.setattr("vtbdrake.web.host.uvicorn.Config", quick)
+    with view(CartPoleScenario()) as opened:
+        client = ClientProtocol(parse_uri(base(opened).replace("http", "ws", 1) + path))
+        request = client.connect()
+        request.headers.update(cookie(opened))
+        client.send_request(request)
+        parts = urlsplit(opened.url)
+        assert parts.hostname is not None and parts.port is not None
+        with socketlib.create_connection((parts.hostname, parts.port), PATIENCE) as socket:
+            socket.sendall(b"".join(client.data_to_send()))
+            pings = 0
+            while pings < 20:
+                data = socket.recv(65536)
+                assert data, "the server has closed the connection"
+                client.receive_data(data)
+                for event in client.events_received():
+                    if isinstance(event, Frame):
+                        assert event.opcode is not Opcode.CLOSE
+                        pings += event.opcode is Opcode.PING
+                    else:
+                        assert isinstance(event, Response) and event.status_code == 101
+                client.data_to_send()  # Its answers to pings, which are not sent.
 
 
 def test_port_in_use_is_an_error(running: View) -> None:

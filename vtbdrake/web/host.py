@@ -91,7 +91,13 @@ class Host:
             f"{'https' if tls else 'http'}://{tls.host if tls else '127.0.0.1'}:{self.port}/?token={access.token}"
         )
         config = uvicorn.Config(
-            access, log_level="warning", lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=1
+            access,
+            log_level="warning",
+            lifespan="off",
+            ws="websockets-sansio",
+            # A tab that stands still does not answer pings; they keep connections through proxies open, no more.
+            ws_ping_timeout=None,
+            timeout_graceful_shutdown=1,
         )
         config.ws_per_message_deflate = tls is not None  # On the loopback interface it only takes time.
         with ExitStack() as stack:
@@ -136,7 +142,7 @@ class Host:
         url = self._meshcat_url.replace("http", "ws", 1)
         await browser.accept()
         try:
-            async with websockets.connect(url, max_size=None, compression=None) as meshcat:
+            async with websockets.connect(url, max_size=None, compression=None, ping_interval=None) as meshcat:
                 # Where nothing moves, nothing is sent that could fail: only reading notices that a browser is gone.
                 await first_of(relay(meshcat.recv, browser.send_bytes), _drop_all(browser))
         except CLOSED:
