@@ -95,7 +95,8 @@ class Host:
             log_level="warning",
             lifespan="off",
             ws="websockets-sansio",
-            # A tab that stands still does not answer pings; they keep connections through proxies open, no more.
+            # Pings keep connections through proxies open. Pongs wait behind commands, which may take long: a late one
+            # ends nothing.
             ws_ping_timeout=None,
             timeout_graceful_shutdown=1,
         )
