@@ -117,7 +117,7 @@ class TorqueRegressor:
     ) -> None:
         context = plant.CreateDefaultContext() if context is None else context
         carried = [body for body in bodies(plant) if not plant.IsAnchored(body)]
-        addresses = [element_address(plant, body, lambda instance: "") for body in carried]
+        addresses = [element_address(plant, body) for body in carried]
         short = [body.name() for body in carried]
         self.bodies = tuple(short if len(set(short)) == len(short) else addresses)
         inputs = [[f"{address}.{part}" for part in ("mass", "center_of_mass", "inertia")] for address in addresses]

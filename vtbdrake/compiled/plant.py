@@ -63,7 +63,7 @@ class PlantEquations(Equations):
 
     def derived(self, name: str, at: At) -> Expression | None:
         address, _, entry = name.rpartition(".")
-        addressed = {element_address(self._plant, body, _no_prefix): body for body in bodies(self._plant)}
+        addressed = {element_address(self._plant, body): body for body in bodies(self._plant)}
         body = addressed.get(address)
         if body is None or entry not in POSE_ENTRIES:
             return None
@@ -152,14 +152,9 @@ def _force(force: AppliedForce | ExternallyAppliedSpatialForce) -> AppliedForce:
     return AppliedForce(int(force.body_index), casadi.DM(force.p_BoBq_B), casadi.DM(F_Bq_W))
 
 
-def _no_prefix(instance: str) -> str:
-    """Variables of a plant have addresses within it."""
-    return ""
-
-
 def _inputs(plant: MultibodyPlant) -> Iterator[Variable]:
     """Yield the variables of a plant that can be inputs of its compiled step, with their addresses within it."""
-    for variable in multibody_variables(plant, prefix=_no_prefix):
+    for variable in multibody_variables(plant):
         if variable.kind == A and not variable.hidden:
             yield variable
 

@@ -40,7 +40,11 @@ POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad"
 _FRICTION = ("material", "coulomb_friction")
 
 
-def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix) -> Iterator[Variable]:
+def _within_plant(instance: str) -> str:
+    return ""
+
+
+def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix = _within_plant) -> Iterator[Variable]:
     """Yield every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of floating bases only."""
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -87,11 +91,14 @@ def bodies(plant: MultibodyPlant) -> Iterator[RigidBody]:
 
 
 def element_address(
-    plant: MultibodyPlant, element: RigidBody | Joint | FixedOffsetFrame | JointActuator, prefix: Prefix
+    plant: MultibodyPlant,
+    element: RigidBody | Joint | FixedOffsetFrame | JointActuator,
+    prefix: Prefix = _within_plant,
 ) -> str:
     """Return the address ``prefix.instance.element``, without an instance that Drake itself has named.
 
-    If an element has the name of its model instance, the name occurs once.
+    Without a prefix, it is the address within the plant. If an element has the name of its model instance, the name
+    occurs once.
     """
     instance = plant.GetModelInstanceName(element.model_instance())
     named = element.model_instance() not in (world_model_instance(), default_model_instance())

@@ -265,7 +265,7 @@ class _Reader:
                 raise ValueError(f"the input {address} is given more than once.")
 
     def _address(self, element: Any) -> str:
-        return element_address(self._plant, element, lambda instance: "")
+        return element_address(self._plant, element)
 
 
 def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
