@@ -45,7 +45,11 @@ class _Wrench(LeafSystem):
 
 
 class DrakeLoop:
-    """The DPS of the manipulator between an `LcmSubscriberSystem` for each channel and an `LcmPublisherSystem`."""
+    """The DPS of the manipulator between an `LcmSubscriberSystem` for each channel and an `LcmPublisherSystem`.
+
+    It commands the machine only in `run`: its first one initializes the simulator, which publishes a command. Earlier,
+    that command would move the machine under another loop that is about to take over.
+    """
 
     def __init__(self, scenario: Scenario, url: str, *, period: float) -> None:
         self._period = period
@@ -91,13 +95,16 @@ class DrakeLoop:
         builder.Connect(sender.get_output_port(), command.get_input_port())
         self._simulator = Simulator(builder.Build())
         self._simulator.set_target_realtime_rate(1.0)
-        self._simulator.Initialize()
+        self._initialized = False
 
     def run(self, cycles: int, *, warm_up: int) -> np.ndarray:
         """Return the times from each deadline to the end of its cycle, in seconds, shape (cycles,).
 
         Late cycles are not left out: the loop catches up."""
         simulator = self._simulator
+        if not self._initialized:
+            simulator.Initialize()  # This waits for messages, and publishes.
+            self._initialized = True
         ends: list[tuple[float, float]] = []
 
         def watch(context: Context) -> None:

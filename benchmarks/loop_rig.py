@@ -75,7 +75,7 @@ class Rig:
     real_time: RealTime
 
     def runtime(self, target: VirtualTestbed | DpsAlone, *, pace: str | None = None) -> TimedRuntime:
-        """Return a loop that commands the machine already."""
+        """Return a loop that is switched to real: it commands the machine from its next cycle on."""
         self.drain()
         # How long the system holds up the loop is to be measured: it must not end the measurement.
         patient = [replace(signal, max_age=PATIENCE) for signal in target.interface.sense]

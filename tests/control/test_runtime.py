@@ -722,6 +722,23 @@ def test_blocked_machine_is_not_commanded_until_reset():
     assert runtime.guards.latched[0].kind == "blocked"
 
 
+def test_publisher_that_moved_the_machine_before_the_first_command_is_named():
+    class Contended(ScriptedBridge):
+        competing_publisher = None
+
+    scenario, clock = ServoScenario(rate=0.0), SimulatedClock()
+    bridge = Contended(scenario.interface(), clock, still)
+    continuity = {"velocity": ("speed", 0.3)}
+    runtime = Runtime(DpsAlone(scenario), bridge, period=PERIOD, clock=clock, continuity=continuity)
+    runtime.target.write(runtime.context, {"u.target": TARGET})
+    runtime.cycle()
+    runtime.switch("real")
+    bridge.competing_publisher = "somebody else commands"
+    runtime.cycle()
+    (fault,) = runtime.guards.latched
+    assert "away from speed" in fault.reason and fault.reason.endswith("; somebody else commands")
+
+
 def test_second_publisher_is_an_alarm_and_blocks_only_switches(caplog):
     class Contended(ScriptedBridge):
         foreign, competing_publisher = 0, None

@@ -341,6 +341,8 @@ class Runtime(Closing, Stepped):
             if differences := discontinuity(self, name, command):
                 reasons += differences
                 self.guards.withhold(name)
+        if reasons and self.bridge.competing_publisher is not None:
+            reasons.append(self.bridge.competing_publisher)  # It may have moved the machine since the switch.
         return "; ".join(reasons) or None
 
     def _read_waiting(self) -> bool:
