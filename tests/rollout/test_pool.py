@@ -8,12 +8,13 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from textwrap import dedent
 
 import numpy as np
 import pytest
 
-from tests.rollout.scenarios import GreedyScenario, RecordedScenario, child_pids
+from tests.rollout.scenarios import HANG, GreedyScenario, RecordedScenario, TreacherousScenario, child_pids
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
@@ -197,6 +198,23 @@ def test_closing_during_a_call_is_an_error(finished):
             next(rollouts)
     with pytest.raises(WorkerError, match="closed while it had rollouts to run"):
         list(rollouts)
+
+
+def test_closing_from_another_thread_loses_no_worker(tmp_path, caplog):
+    others, fuse = set(child_pids()), tmp_path / "fuse"
+    fuse.touch()
+    task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(_angle, SHOULDER))
+    points = [{SHOULDER: 0.1, "dps.gain[0]": gain} for gain in (HANG, 0.0, 0.0)]
+    executor = ProcessExecutor(3)
+    executor.start_workers(3)  # Here, as those of another thread are not among `child_pids`.
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(lambda: list(executor.run(task, points)))
+        while fuse.exists():  # Until the first one hangs.
+            select.select([], [], [], 0.01)
+        executor.close()
+        with pytest.raises(WorkerError, match="closed while it had rollouts to run"):
+            call.result()
+    assert caplog.text == "" and set(child_pids()) == others
 
 
 def test_second_call_during_a_call_is_refused():

@@ -130,8 +130,7 @@ class ProcessExecutor(Executor):
             while left:
                 finished: list[tuple[int, RolloutResult]] = []
                 replies = self._replies(call)
-                if not self._workers:
-                    raise WorkerError("the executor was closed while it had rollouts to run")
+                self._check_open()
                 for worker, index, reply in replies:
                     if isinstance(reply, RolloutResult):
                         finished.append((index, reply))
@@ -262,16 +261,22 @@ class ProcessExecutor(Executor):
         return replies
 
     def _replace(self, worker: _Worker, call: _Call) -> _Worker:
+        self._check_open()
         worker.kill()
         task = None if call.cutoff is None else call.task
         new = self._workers[self._workers.index(worker)] = _Worker(self._max_testbeds, self._growth, task)
         return new
 
+    def _check_open(self) -> None:
+        if not self._workers:
+            raise WorkerError("the executor was closed while it had rollouts to run")
+
     def close(self) -> None:
-        """End all workers."""
-        for worker in self._workers:
+        """End all workers; a call of `run` in another thread raises a `WorkerError`."""
+        # At once: that thread must not take workers for lost that are killed here, and start others.
+        workers, self._workers = self._workers, []
+        for worker in workers:
             worker.kill()
-        self._workers.clear()
 
 
 class _Call(NamedTuple):
