@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import types
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -314,6 +315,28 @@ def test_a_module_that_f_imports_when_it_runs(tmp_path, monkeypatch, statement):
 
     assert digest_with(1) == digest_with(1) != digest_with(22)
     assert "gains_of_a_test" not in sys.modules
+
+
+@pytest.mark.parametrize("edited", ["conditioning.pyx", "used_by_a_test.pyx", None])
+def test_a_function_compiled_from_cython_changes_with_its_source(edited, tmp_path, monkeypatch):
+    (library,) = (ROOT / "diagrams" / "space_climber").glob(f"conditioning*{EXTENSION_SUFFIXES[0]}")
+    shutil.copy(library, tmp_path)
+    source = (ROOT / "diagrams" / "space_climber" / "conditioning.pyx").read_text()
+    (tmp_path / "conditioning.pyx").write_text(f"{source}\nfrom used_by_a_test cimport something\n")
+    (tmp_path / f"used_by_a_test{EXTENSION_SUFFIXES[0]}").touch()  # It is found, and never imported.
+    (tmp_path / "used_by_a_test.pyx").write_text("cdef double something():\n    return 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("conditioning")
+    monkeypatch.delitem(sys.modules, "conditioning")
+    monkeypatch.setitem(sys.modules, "conditioning", module)
+    functions = [value for value in vars(module).values() if "cython_function" in type(value).__name__]
+    function, other = functions[:2]
+    before, unreadable = digest(function)
+    assert unreadable == () and digest(other)[0] != before
+    if edited:
+        with open(tmp_path / edited, "a") as file:
+            file.write("\n# Changed.\n")
+    assert (digest(function)[0] == before) == (edited is None)
 
 
 def test_modules_that_import_each_other(tmp_path, monkeypatch):

@@ -7,11 +7,12 @@ import dis
 import functools
 import hashlib
 import importlib.util
+import re
 import sys
 import weakref
 from collections.abc import Iterator
 from functools import cache
-from importlib.machinery import SourceFileLoader
+from importlib.machinery import EXTENSION_SUFFIXES, SourceFileLoader
 from pathlib import Path
 from types import (
     CellType,
@@ -48,6 +49,9 @@ _DISPATCHING = cast(FunctionType, functools.singledispatch(_hashed)).__code__
 # How the parts of a node are compared: in their order, as a set, or as a set of pairs.
 _ORDERED, _SET, _PAIRS = 0, 1, 2
 
+# The module in an import of Cython.
+_CYTHON_IMPORT = re.compile(rb"^\s*(?:from|c?import)\s+([\w.]+)", re.MULTILINE)
+
 
 class _Node(NamedTuple):
     """A value without what it refers to, and its parts: the label of a plain value, or the number of another node."""
@@ -64,8 +68,9 @@ def digest(value: Any) -> tuple[str, tuple[str, ...]]:
     digest covers everything that the value refers to: containers; objects, by the state with which pickle would send
     them, and the class if it is the user's; functions, by their bytecode (without line numbers, docstrings and names
     of local variables), default values, closure, and by the globals and the attributes of the user's modules that they
-    use. Python, vtbdrake and installed packages are given by their names, and the values that they hold for the user
-    (a partial, a cache around a function) by their parts. Sets and dicts have no order.
+    use. What the user has compiled from Cython is given by its name and the source of its module. Python, vtbdrake and
+    installed packages are given by their names, and the values that they hold for the user (a partial, a cache around a
+    function) by their parts. Sets and dicts have no order.
 
     The references form a graph, possibly with cycles. Its nodes get labels that are refined by those of their parts
     until no more nodes can be told apart (Weisfeiler and Leman, 1968), so that neither the order in which the graph
@@ -175,6 +180,9 @@ class _Graph:
         return self._made("code", code.co_code, shape, links, code.co_consts)
 
     def _source(self, module: _Source) -> _Node:
+        if module.is_compiled:
+            text, names = module.compiled_from()
+            return self._made("compiled source", text, [_source(name) for name in names])
         code = module.code()
         return self._made("source", code, [_source(name) for name in _References(code).imports(module.package)])
 
@@ -197,6 +205,8 @@ class _Graph:
     def _class(self, kind: type) -> _Node:
         if not is_own(kind):
             return self._made(f"class {kind.__module__}.{kind.__qualname__}")
+        if _source(_home(kind)).is_compiled:
+            return self._made(f"class {kind.__name__}", kind.__bases__, _source(_home(kind)))
         declared = vars(kind).get("__dataclass_fields__", {})
         fields = {name: (item.default, item.default_factory) for name, item in declared.items()}
         return self._made(f"class {kind.__name__}", kind.__bases__, dict(_members(kind)), fields)
@@ -204,8 +214,11 @@ class _Graph:
     def _object(self, value: Any) -> _Node:
         kind = type(value)
         home, name = (getattr(value, key, None) for key in ("__module__", "__qualname__"))
-        if isinstance(home, str) and isinstance(name, str) and not _is_own_module(home) and _found(home, name) is value:
-            return self._made(f"global {home}.{name}")  # For example a function of a compiled library.
+        if isinstance(home, str) and isinstance(name, str) and _found(home, name) is value:
+            if not _is_own_module(home):
+                return self._made(f"global {home}.{name}")  # For example a function of a compiled library.
+            if _source(home).is_compiled:
+                return self._made(f"compiled {name}", _source(home))
         reduced = _reduced(value)
         if reduced is None:
             self.unreadable.add(f"{kind.__module__}.{kind.__qualname__}")
@@ -353,6 +366,23 @@ class _Source(NamedTuple):
     """A module of the user, by its source."""
 
     name: str
+
+    @property
+    def is_compiled(self) -> bool:
+        """Return whether it is a shared library, for example of a module in Cython."""
+        return (_file(self.name) or "").endswith(tuple(EXTENSION_SUFFIXES))
+
+    def compiled_from(self) -> tuple[bytes, list[str]]:
+        """Return the source in Cython beside the shared library, and the user's modules that it imports.
+
+        Without a source it is the library itself, which another compiler makes another one of.
+        """
+        library = Path(_file(self.name) or "")
+        name = library.name.partition(".")[0]
+        files = [file for file in (library.with_name(name + end) for end in (".pyx", ".pxd")) if file.is_file()]
+        text = b"\n".join(file.read_bytes() for file in files or [library])
+        imported = {name.decode() for name in _CYTHON_IMPORT.findall(text)} if files else set()
+        return text, sorted({module for name in imported if (module := _resolved(name, self.package))})
 
     @property
     def package(self) -> str:
