@@ -77,7 +77,8 @@ class SamplingSolver(Solver):
 class PredictiveSampling(SamplingSolver):
     """Predictive sampling: the best point so far, and normal noise around it.
 
-    mu <- argmax of f over {mu, clip(mu + sigma e_1), ..., clip(mu + sigma e_(N-1))}, e_i ~ N(0, I).
+    mu <- argmax of f over {mu, clip(mu + sigma e_1), ..., clip(mu + sigma e_(N-1))}, e_i ~ N(0, I). A batch leaves mu
+    out once its evaluation is known.
 
     Args:
         search: See `SamplingSolver`.
@@ -91,6 +92,12 @@ class PredictiveSampling(SamplingSolver):
     def __init__(self, search: Search, *, name: str, population: int | None = None, sigma: float = 0.1) -> None:
         super().__init__(search, name=name, population=population, sigma=sigma)
         self._best: Evaluation | None = None
+
+    def _next(self) -> list[Point]:
+        points = super()._next()
+        new = slice(int(self._best is not None and self._best.exact), None)
+        self._U = self._U[new]
+        return points[new]
 
     def _move(self, U: np.ndarray, evaluations: Sequence[Evaluation]) -> None:
         best = best_of([self._best, *evaluations])
