@@ -279,7 +279,7 @@ def test_auto_takes_drake_where_nothing_can_be_compiled(caplog: pytest.LogCaptur
     ):
         decision = reasoner.decide(testbed, testbed.default_context())
     assert {r.computed for candidate in decision.candidates for r in candidate.rollouts} == {"drake"}
-    assert "the mental testbed is simulated in Drake: compiled rollouts cannot do what pruning= asks for" in caplog.text
+    assert "rollouts are simulated in Drake: compiled rollouts cannot do what pruning= asks for" in caplog.text
 
 
 def test_compiled_is_refused_when_the_reasoner_is_made() -> None:

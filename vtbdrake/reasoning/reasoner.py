@@ -188,14 +188,10 @@ class Reasoner:
         from vtbdrake.rollout.compiled import CompiledExecutor
 
         executor = CompiledExecutor(self.problem.testbed, workers=self._search.workers)
-        try:
-            varied = [*self.space.addresses, *self.belief_to_start.uncertain]
-            executor.prepare(self.task, [dict.fromkeys(varied)])
-        except (ValueError, ArithmeticError) as error:
-            executor.close()
-            if self._search.executor != "auto":
-                raise
-            _log.info("the mental testbed is simulated in Drake: %s", error)
+        points = [dict.fromkeys([*self.space.addresses, *self.belief_to_start.uncertain])]
+        if self._search.executor == "compiled":
+            executor.prepare(self.task, points)
+        elif not executor.suits(self.task, points):
             return None
         _log.info("decisions are computed in the compiled testbed, which was compared with Drake's")
         return executor

@@ -107,6 +107,18 @@ class CompiledExecutor(Executor):
         for fields, indices in _by_fields(points):
             self._of(task, fields, [points[i] for i in indices])
 
+    def suits(self, task: RolloutTask, points: Sequence[Parameters]) -> bool:
+        """Compile the testbed of a task, for points like these; if that is refused, log why, and return False."""
+        fields = sorted(address for address in frozenset().union(*points) if address.startswith(FIELD))
+        try:
+            if fields:
+                raise UnsupportedTestbedError(f"each value of {fields[0]} would be compiled anew")
+            self.prepare(task, points)
+        except (ValueError, ArithmeticError, CompilerError) as error:
+            _log.info("rollouts are simulated in Drake: %s", error)
+            return False
+        return True
+
     def warm_up(self, task: RolloutTask, rollouts: int) -> None:
         """Compile what rollouts need that begin with the events of the testbed or between them; make one of each."""
         self._of(task, {}, [{}]).warm_up()
@@ -146,23 +158,11 @@ class AutoExecutor(Executor):
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
-        executor = self._compiled if points and self._compiles(task, points) else self._drake
-        yield from executor.run(task, points, start=start, cutoff=cutoff)
-
-    def _compiles(self, task: RolloutTask, points: Sequence[Parameters]) -> bool:
-        """Return whether the testbed of a task is compiled; what was refused once is not tried again."""
-        if task is self._refused:
-            return False
-        fields = sorted(address for address in frozenset().union(*points) if address.startswith(FIELD))
-        try:
-            if fields:
-                raise UnsupportedTestbedError(f"each value of {fields[0]} would be compiled anew")
-            self._compiled.prepare(task, points)
-        except (ValueError, ArithmeticError, CompilerError) as error:
+        # What was refused once is not tried again.
+        if points and task is not self._refused and not self._compiled.suits(task, points):
             self._refused = task
-            _log.info("rollouts are simulated in Drake: %s", error)
-            return False
-        return True
+        executor = self._drake if task is self._refused else self._compiled
+        yield from executor.run(task, points, start=start, cutoff=cutoff)
 
     def close(self) -> None:
         self._compiled.close()
