@@ -99,12 +99,10 @@ class DecisionRun:
         self._evaluator = Evaluator(self._problem, self._results, self._roll_out)
         self._count = 0
         self._evaluations: dict[Point, Evaluation] = {}
-        # What each candidate sets, address -> value.
+        # What each candidate sets, address -> value, in the order in which they were proposed.
         self._planned: dict[Point, dict[str, Any]] = {KEEP: {}}
         # The plan in use as a point of the search, if it is one.
         self._point_in_use: Point | None = None
-        # The candidates in the order in which they were proposed; the plan in use is the first.
-        self._proposed: dict[Point, None] = {KEEP: None}
 
     def decision(self) -> Decision:
         """Try candidates until the budget is spent or the method has finished."""
@@ -183,9 +181,7 @@ class DecisionRun:
         count = max(1, len(points)) if self._reasoner.task.pruning is None else _ROUND
         evaluations = []
         for k in range(0, len(points), count):
-            batch = points[k : k + count]
-            self._proposed |= dict.fromkeys(p for p in batch if (p, 0) not in self._results and p != self._point_in_use)
-            evaluations += self._evaluator.evaluate(batch)
+            evaluations += self._evaluator.evaluate(points[k : k + count])
         self._evaluations |= zip(points, evaluations, strict=True)
         return evaluations
 
@@ -234,8 +230,8 @@ class DecisionRun:
 
     def _conclude(self, end: str, message: str) -> Decision:
         problem = self._problem
-        begun = {point for point, _ in self._results} | {KEEP}
-        tried = [point for point in self._proposed if point in begun]
+        begun = {point for point, _ in self._results} - {self._point_in_use} | {KEEP}
+        tried = [point for point in self._planned if point in begun]
         candidates = tuple(self._candidate(number, point) for number, point in enumerate(tried))
         eligible = [candidate for candidate in candidates if candidate.status == ELIGIBLE]
         sign = self._sign
