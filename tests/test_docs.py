@@ -20,7 +20,7 @@ PAGES = [*AT_THE_ROOT, *sorted((ROOT / "docs").rglob("*.md"))]
 # The same programs with fewer rollouts.
 SHORTER = {
     "crater": {"horizon=6.0": "horizon=6.0, candidates=3, executor='serial'"},
-    "studies": {"run(rollouts=40)": "run(rollouts=16)"},
+    "studies": {"run(rollouts=40)": "run(rollouts=16)", "rollouts=60": "rollouts=24"},
 }
 
 

@@ -10,5 +10,8 @@ def test_is_stored_with_text_and_plots() -> None:
 
 
 @pytest.mark.slow
-def test_runs_as_it_is_stored() -> None:
-    check_runs("steering")
+def test_runs_in_a_shorter_version() -> None:
+    check_runs(
+        "steering",
+        shorter={'solver="bayesian", seed=1).run(rollouts=120': 'solver="bayesian", seed=1).run(rollouts=20'},
+    )
