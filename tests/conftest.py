@@ -53,9 +53,9 @@ def memory_given_back() -> Iterator[None]:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-# Folders (and the modules in them, all of a kind) that need one Python only. A single module says so by
-# `pytestmark = pytest.mark.one_python`, a single test by the marker itself.
-ONE_PYTHON = ("cli", "notebooks", "visualization")
+# Folders (and the modules in them, all of a kind) that need one Python only; of the forest, its scenario passes the
+# checks on both. A single module says so by `pytestmark = pytest.mark.one_python`, a single test by the marker itself.
+ONE_PYTHON = ("cli", "diagrams/forest", "notebooks", "visualization")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

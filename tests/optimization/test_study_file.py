@@ -14,6 +14,9 @@ from tests.optimization.studies import DAMPING, pendulum_problem
 from vtbdrake.optimization import Study, StudyError
 from vtbdrake.optimization.study_file import Mark, StudyFile
 
+# Files and SQL.
+pytestmark = pytest.mark.one_python
+
 
 def test_a_full_disk_ends_a_study_and_keeps_what_is_finished(tmp_path):
     path = tmp_path / "a.db"

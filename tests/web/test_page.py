@@ -30,6 +30,7 @@ PURPLE = np.array([156, 0, 200])  # the recorded course
 
 READY = "body[data-session=open][data-frame]"
 
+# One Python for what does not look at the scene: Meshcat is another one in another Drake.
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 
@@ -130,6 +131,7 @@ def test_dragged_slider_previews_and_its_release_commits(page: Page, running: Vi
     assert angle(running.session) == value
 
 
+@pytest.mark.one_python
 def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None:
     with view(LimitedPendulumScenario()) as running, opened_page(browser, running.url, ready=READY) as opened:
         watch(opened, "u.angle")
@@ -150,6 +152,7 @@ def test_dragged_dial_previews_and_its_release_commits(browser: Browser) -> None
             assert running.session.snapshot()["u.angle"] == pytest.approx(expected, abs=0.03)
 
 
+@pytest.mark.one_python
 def test_text_that_is_refused_gives_way_to_the_present_value(browser: Browser) -> None:
     scenario = LimitedPendulumScenario()
     with view(scenario, values={"u.angle": 0.5}) as running, opened_page(browser, running.url, ready=READY) as page:
@@ -231,6 +234,7 @@ def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: 
     assert float(running.session.snapshot().values[MASS]) == 0.9
 
 
+@pytest.mark.one_python
 def test_scrubbed_history_goes_back(page: Page, running: View) -> None:
     page.click("#vtb-play")
     drawn(page, "Number(vtb.history.max) > 0.6")
@@ -286,6 +290,7 @@ def test_robot_that_has_moved_away_is_in_view(browser: Browser) -> None:
             assert np.linalg.norm(np.subtract(target, place)) < 0.3 * distance
 
 
+@pytest.mark.one_python
 def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View, browser: Browser) -> None:
     page.select_option("#vtb-sense-joint_position", "real")
     drawn(page, "vtb.switches.textContent.includes('nothing feeds real.sense.joint_position')")
@@ -307,6 +312,7 @@ def test_refused_switch_and_a_second_browser_are_told(page: Page, running: View,
     page.wait_for_selector("#vtb-take", state="detached")
 
 
+@pytest.mark.one_python
 def test_page_of_another_origin_cannot_use_the_server(page: Page, running: View, browser: Browser) -> None:
     hostile = browser.new_page()
     hostile.goto("data:text/html,<title>hostile</title>")
@@ -343,6 +349,7 @@ def test_saved_snapshot_opens_with_the_same_camera(page: Page, running: View, br
         second.close()
 
 
+@pytest.mark.one_python
 def test_tab_that_stands_still_catches_up_and_holds_nobody_up(page: Page, running: View, browser: Browser) -> None:
     page.click("#vtb-play")
     drawn(page, "parseFloat(vtb.clock.textContent) > 0.1")
@@ -364,12 +371,14 @@ def test_tab_that_stands_still_catches_up_and_holds_nobody_up(page: Page, runnin
     drawn(page, f"vtb.clock.textContent === ({time!r}).toFixed(3) + ' s' && vtb.rate.textContent === 'paused'")
 
 
+@pytest.mark.one_python
 def test_closed_session_is_told(page: Page, running: View) -> None:
     running.close()
     drawn(page, "document.body.dataset.session === 'ended'")
     assert "the session has ended" in page.inner_text("#vtb-messages")
 
 
+@pytest.mark.one_python
 def test_testbed_is_driven_by_keys_and_gamepad(browser: Browser, tmp_path: Path) -> None:
     study = tmp_path / "tilt.db"
     # A gamepad that the test holds: Chromium asks for it in each poll.
