@@ -2,6 +2,7 @@
 
 import logging
 import os
+import pickle
 import queue
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from pathlib import Path
 import dask
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster, get_task_stream
+from distributed import Client, LocalCluster, get_task_stream, get_worker
 
 from benchmarks.cluster import Waiting, cost
 from benchmarks.dask_cluster import ROOT, dask_cluster
@@ -24,7 +25,8 @@ from tests.rollout.waiting_study import ROLLOUTS, SLOTS, waiting_study
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, QualityError, RolloutTask, SerialExecutor, Start, WorkerError, make_executor
 from vtbdrake.rollout import cluster as cluster_module
-from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor
+from vtbdrake.rollout.cluster import ADDRESS, DaskExecutor, run_on_dask
+from vtbdrake.rollout.pickled_task import pack
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
 THETA = "sim.sys.Pendulum.theta.position"
@@ -164,6 +166,23 @@ def test_closed_executor_leaves_no_processes_on_the_workers(cluster):
     assert any(cluster.client.run(_children_of_this_process).values())
     executor.close()
     assert not any(cluster.client.run(_children_of_this_process).values())
+
+
+def _run_after_teardown(points):
+    worker = get_worker()
+    (name,) = [name for name in worker.plugins if "vtbdrake" in name]
+    worker.plugins[name].teardown(worker)
+    try:
+        return [pickle.loads(answer) for answer in run_on_dask(name, [0, 1], points, [b"", b""], 60.0)]
+    finally:
+        worker.plugins[name].setup(worker)
+
+
+def test_worker_that_is_being_closed_does_not_go_on_with_its_chunk(cluster):
+    with DaskExecutor(cluster.client) as executor:
+        list(executor.run(TASK, _points(1)))
+        answers = cluster.client.submit(_run_after_teardown, [pack(point) for point in _points(2)], pure=False).result()
+    assert [(index, type(outcome)) for index, outcome in answers] == [(0, WorkerError), (1, WorkerError)]
 
 
 def _children_of_this_process():

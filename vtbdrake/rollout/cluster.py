@@ -278,6 +278,8 @@ class _Children:
         self._executors: dict[tuple[int, float], ProcessExecutor] = {}
 
     def get(self, time_limit: float) -> ProcessExecutor:
+        if not self.users:  # The rest of a chunk must not keep a worker that is being closed.
+            raise WorkerError("the Dask worker is being closed, or its task was removed")
         key = (threading.get_ident(), time_limit)
         if key not in self._executors:
             self._executors[key] = ProcessExecutor(1, time_limit=time_limit)
