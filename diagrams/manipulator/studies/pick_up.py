@@ -154,7 +154,7 @@ def pick_up(
         raise RuntimeError(f"a false alarm: {monitor.alarms[0]}")
     machine.write(load.values())
     begin = loop.time
-    loop.run(until=lambda: refit.calibrating, seconds=10.0 * SECONDS)
+    loop.run(until=lambda: refit.calibrating, cycles=round(10.0 * SECONDS / loop.period))
     if not refit.calibrating:
         raise RuntimeError(f"no alarm within {loop.time - begin:g} s")
     posted = loop.time
