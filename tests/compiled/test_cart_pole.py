@@ -8,17 +8,19 @@ from dataclasses import replace
 import casadi
 import numpy as np
 import pytest
+from pydrake.systems.framework import Context
 
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError, rollouts
 from vtbdrake.compiled.rollouts import CompiledBatch
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutTask, SerialExecutor
 from vtbdrake.rollout.executor import Parameters
-from vtbdrake.testbed import Scenario
+from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 HORIZON, SAMPLE_PERIOD = 1.0, 0.03
 OUTPUTS = ("plant.state", "dps.force", "dps.env.discrete_state_0", "sim.sys.cart_pole.pole_pin.position", "time")
+ANGLE = "sim.sys.cart_pole.pole_pin.position"
 MASS, DAMPING, BIAS = (
     "sim.sys.cart_pole.pole.mass",
     "sim.sys.cart_pole.pole_pin.damping",
@@ -148,6 +150,61 @@ def test_slope_is_that_of_differences() -> None:
     np.testing.assert_allclose(exact[1:], differences, rtol=1e-5, atol=1e-8)
 
 
+INERTIA = "sim.sys.cart_pole.pole.inertia"
+
+
+def with_inertia() -> tuple[VirtualTestbed, Context]:
+    """Return a testbed, and a context in which the pole is a body that swings, not a point."""
+    testbed = SCENARIOS["exact"].build()
+    context = testbed.default_context()
+    testbed.write(context, {INERTIA: [0.02, 0.05, 0.04, 0.001, 0.002, 0.003], ANGLE: 1.0})
+    return testbed, context
+
+
+@pytest.mark.parametrize("values", [{MASS: 2.0}, {MASS: 2.0, f"{INERTIA}[1]": 0.03}, {f"{INERTIA}[1]": 0.03}])
+def test_mass_scales_the_inertia(values: dict[str, float]) -> None:
+    testbed, context = with_inertia()
+    rollouts = testbed.compiled(
+        horizon=0.3, parameters=[MASS, INERTIA], outputs=["plant.state"], context=context, compile=False
+    )
+    computed = rollouts(values).outputs["plant.state"][0, -1]
+    testbed.write(context, values)
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(0.3)
+    np.testing.assert_allclose(computed, testbed.read(context, "plant.state"), rtol=1e-11, atol=1e-11)
+
+
+def test_writes_mass_and_inertia() -> None:
+    testbed, context = with_inertia()
+    rollouts = testbed.compiled(horizon=0.1, parameters=[MASS, INERTIA], context=context, compile=False, check=False)
+    (z,) = rollouts.filled(rollouts.z_of(context), {MASS: 2.0})
+    rollouts.walker.write(z, context)
+    np.testing.assert_allclose(rollouts.walker.read(context), z, rtol=1e-14)
+    assert testbed.read(context, INERTIA)[0] == pytest.approx(0.04)
+
+
+def test_inertia_is_that_of_a_rigid_body() -> None:
+    testbed, context = with_inertia()
+    rollouts = testbed.compiled(horizon=0.1, parameters=[INERTIA], context=context, compile=False, check=False)
+    with pytest.raises(ValueError, match="not that of any rigid body"):
+        rollouts({f"{INERTIA}[0]": [0.02, 0.2]})
+
+
+def test_context_of_another_testbed_is_refused() -> None:
+    rollouts, other = compiled(SCENARIOS["exact"], check=False), SCENARIOS["exact"].build().default_context()
+    with pytest.raises(ValueError, match="no context of this testbed"):
+        rollouts(context=other)
+    with pytest.raises(ValueError, match="no context of this testbed"):
+        compiled(SCENARIOS["exact"], context=other)
+
+
+def test_expressions_have_the_shape_of_their_variable() -> None:
+    rollouts = compiled(SCENARIOS["exact"], check=False)
+    for wrong in (casadi.MX.sym("plan", 4), casadi.SX.sym("plan", 11)):
+        with pytest.raises(ValueError, match=r"u.plan takes a casadi.MX of the shape \(11, 1\), or numbers, not .X of"):
+            rollouts.expressions({"u.plan": wrong})
+
+
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
@@ -171,6 +228,11 @@ def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
         ({"outputs": "plant.velocity"}, "no variable and no port 'plant.velocity'"),
         ({"parameters": "u.goal"}, "there is no variable 'u.goal'"),
         ({"parameters": ["sim.sense.joint_position.latency"]}, "a latency is compiled in"),
+        ({"workers": 0}, "at least one worker, not 0"),
+        ({"workers": 1.5}, "a whole number, not 1.5"),
+        ({"compile": "yes"}, "compile must be True or False, not 'yes'"),
+        ({"check": "no"}, "check must be True or False, not 'no'"),
+        ({"outputs": ["plant.net_actuation"]}, "net_actuation, which is not compiled: use its state"),
     ],
 )
 def test_refuses_arguments_that_make_no_sense(options: dict, reason: str) -> None:
@@ -182,7 +244,7 @@ def test_refuses_values_that_do_not_fit() -> None:
     rollouts = compiled(SCENARIOS["exact"])
     with pytest.raises(ValueError, match=r"shape \(11,\)"):
         rollouts({"u.plan": np.zeros(10)})
-    with pytest.raises(ValueError, match=r"lies in \[-1e\+09"):
+    with pytest.raises(ValueError, match=r"lie in \[-1e\+09"):
         rollouts({"u.plan": np.full(11, 100.0)})
     with pytest.raises(ValueError, match="2 of .*bias.*, 3 of u.plan"):
         rollouts({BIAS: np.zeros((2, 2)), "u.plan": plans(3)})

@@ -296,7 +296,10 @@ def test_ports_of_systems_with_dots_in_their_names() -> None:
 
 @pytest.mark.parametrize(
     ("value", "reason"),
-    [("a", "part0.value takes numbers, not 'a'"), (np.empty((0, 1)), "there are no values of part0.value")],
+    [
+        ("a", "part0.value must be a number or several, not 'a'"),
+        (np.empty((0, 1)), "there are no values of part0.value"),
+    ],
 )
 def test_values_that_are_none_are_named(value: object, reason: str) -> None:
     rollouts = compiled(alone(ConstantVectorSource([1.0]), ZeroOrderHold(0.1, 1)))

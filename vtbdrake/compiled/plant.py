@@ -59,7 +59,9 @@ class PlantEquations(Equations):
                 return _part_of_state(self._plant, instance, x)
         if port == "reaction_forces" and not self._plant.has_sampled_output_ports():
             return self._reactions(at)
-        raise refusal(self._plant, f"has the output port {port}, which is not compiled")
+        raise refusal(
+            self._plant, f"has the output port {port}, which is not compiled: use its state, or keep it in Drake"
+        )
 
     def derived(self, name: str, at: At) -> Expression | None:
         address, _, entry = name.rpartition(".")

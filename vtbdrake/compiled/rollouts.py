@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
-from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.argument_checks import as_addresses, as_array, as_flag, as_number, as_whole
 from vtbdrake.arrays import Array
 from vtbdrake.compiled.equations import UnsupportedTestbedError
 from vtbdrake.compiled.plant import OVERRUN
@@ -25,7 +25,7 @@ from vtbdrake.compiled.walker import MEMORY, Walker
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.lru import LruDict
 from vtbdrake.state import Variables
-from vtbdrake.testbed.addressed import making
+from vtbdrake.testbed.addressed import check_root, making
 from vtbdrake.testbed.instants import sample_instants, sample_times
 
 _log = logging.getLogger(__name__)
@@ -105,6 +105,12 @@ class CompiledRollouts:
         for name, time in {"horizon": horizon, "sample period": sample_period}.items():
             if not 0.0 < as_number(f"the {name}", time) < inf:
                 raise ValueError(f"the {name} is a positive time in seconds, not {time}")
+        if as_whole("the number of workers", workers) < 1:
+            raise ValueError(f"compiled rollouts need at least one worker, not {workers}")
+        if compile is not None:
+            as_flag("compile", compile)
+        as_flag("check", check)
+        check_root(diagram, context)
         self.parameters = parameters = as_addresses("what varies", parameters)
         self.outputs = as_addresses("what to record", outputs)
         self._measures = dict(measures or {})
@@ -153,9 +159,12 @@ class CompiledRollouts:
             context: The root context from which the rollouts begin, by default the one that was compiled.
 
         Raises:
-            ValueError: An address cannot be varied, or a value has another shape, is not finite or out of bounds.
+            ValueError: An address cannot be varied, or a value has another shape, is not finite, out of bounds, or
+                impossible in another way; or the context is another Diagram's.
             UnsupportedTestbedError: The context differs from the compiled one in what is compiled in.
         """
+        if values is not None and not isinstance(values, Mapping):
+            raise ValueError(f"give what varies as {{address: values, ...}}, not as {values!r}")
         start = self.walker.context if context is None else context
         return self.from_z(self.filled(self.z_of(start), values or {}), start.get_time())
 
@@ -163,6 +172,7 @@ class CompiledRollouts:
         """Return the vector of state and parameters of a root context, shape (nz,)."""
         if context is self.walker.context:
             return self._z0.copy()
+        check_root(self.walker.diagram, context)
         self.walker.check(context)
         return self.walker.read(context)
 
@@ -176,21 +186,22 @@ class CompiledRollouts:
         batch = np.repeat(z[np.newaxis], counts.pop() if counts else 1, axis=0)
         for address, array in arrays.items():
             batch[:, self.walker.place(address)] = array
+        self.walker.settle(z, batch, arrays)
         return batch
 
     def _checked(self, address: str, value: ArrayLike) -> Array:
         """Return the values of a variable, of one rollout or of n, as an array of shape (1 or n, size)."""
         variable = self.walker.variables[address]
-        try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{address} takes numbers, not {value!r}") from error
+        array = as_array(address, value)
         many = array.ndim == len(variable.shape) + 1
         if array.shape[many:] != variable.shape:
             raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
         lower, upper = variable.bounds
-        if not (np.isfinite(array) & (array >= lower) & (array <= upper)).all():
-            raise ValueError(f"{address} is finite and lies in {variable.bounds_text()}")
+        allowed = np.isfinite(array) & (array >= lower) & (array <= upper)
+        if not allowed.all():
+            raise ValueError(
+                f"{address} must be finite and lie in {variable.bounds_text()}, but one value is {array[~allowed][0]}"
+            )
         if not array.size and many:
             raise ValueError(f"there are no values of {address}: give one, or one for each of the rollouts")
         return array.reshape(len(array) if many else 1, -1)
@@ -222,10 +233,11 @@ class CompiledRollouts:
             start += size
         return CompiledBatch(self.times, outputs, final, valid)
 
-    def expressions(self, values: Mapping[str, casadi.MX]) -> dict[str, casadi.MX]:
+    def expressions(self, values: Mapping[str, Any]) -> dict[str, casadi.MX]:
         """Return the outputs of one rollout as expressions, for CasADi's solvers and its derivatives.
 
-        They are interpreted, and so slower than a call.
+        They are interpreted, and so slower than a call. A mass does not scale an inertia that ``parameters`` names:
+        give both.
 
         Args:
             values: Address -> an expression of its value, a column; the rest is as in the compiled context.
@@ -234,11 +246,19 @@ class CompiledRollouts:
             Address -> the recorded values, shape (size, m): one column per sample.
 
         Raises:
-            ValueError: An address cannot be varied.
+            ValueError: An address cannot be varied, or a value is no expression of its shape.
         """
         z = casadi.MX(self._z0)
         for address, value in values.items():
-            z[self.walker.place(address)] = value
+            place = self.walker.place(address)
+            size = place.stop - place.start
+            shape = getattr(value, "shape", None) or np.shape(value)
+            if isinstance(value, casadi.SX) or shape not in ((), (size,), (size, 1)):
+                raise ValueError(
+                    f"{address} takes a casadi.MX of the shape ({size}, 1), or numbers, not {type(value).__name__} of "
+                    f"{shape}"
+                )
+            z[place] = value
         _, recorded = self.function(z, *self.arguments())
         samples = [k for k, i in enumerate(self.schedule_at(self.walker.context.get_time())) if i.is_sample]
         sizes = [int(np.prod(shape, dtype=int)) for shape in self._shapes.values()]

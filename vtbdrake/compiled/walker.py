@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -123,6 +123,7 @@ class Walker:
             raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
         self.timings = tuple(dict.fromkeys(when for each in self.equations.values() for when, _ in each.updates()))
         self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
+        self._extras = {self._address(b): b.entries for b in self.blocks.values() if b.kind == EXTRA}
         self.size = max((block.entries.stop for block in self.blocks.values()), default=0)
         self.draws = tuple(self._reserved())
         self.noise = self.draws[-1][-1].stop if self.draws else 0
@@ -154,13 +155,40 @@ class Walker:
 
     def write(self, z: Array, context: Context) -> None:
         """Set a root context to z."""
+        self._write_extras(z, context)
         for block in self.blocks.values():
-            if block.kind == EXTRA:
-                variable = self.variables[self._address(block)]
-                variable.set(context, z[block.entries].reshape(variable.shape))
-            elif block.kind != MEMORY:
+            if block.kind not in (MEMORY, EXTRA):
                 leaf_context = self._systems[block.path].GetMyMutableContextFromRoot(context)
                 write_group(leaf_context, block.kind, int(block.name), z[block.entries])
+
+    def settle(self, begin: Array, z: Array, values: Mapping[str, Array]) -> None:
+        """Set what a value changes beside itself, such as the inertia that a mass scales, and check inertias.
+
+        Args:
+            begin: The vector of state and parameters without the values, shape (size,).
+            z: The vectors with the values, shape (n, size).
+            values: Address -> values, of shape (1 or n, size of the variable).
+
+        Raises:
+            ValueError: A value is impossible: an inertia is not that of a rigid body.
+        """
+        extras = self._extras
+        values = {address: value for address, value in values.items() if address.partition("[")[0] in extras}
+        if not values or all(self.variables[address].refuse is None for address in extras):
+            return
+        context = self.context.Clone()
+        for k, row in enumerate(z):
+            self._write_extras(begin, context)
+            shapes = {address: self.variables[address].shape for address in values}
+            self.variables.write(
+                context, {a: value[k if len(value) > 1 else 0].reshape(shapes[a]) for a, value in values.items()}
+            )
+            for address, entries in extras.items():
+                row[entries] = np.ravel(self.variables[address].get(context))
+
+    def _write_extras(self, z: Array, context: Context) -> None:
+        extras = self._extras.items()
+        self.variables.write(context, {a: z[entries].reshape(self.variables[a].shape) for a, entries in extras})
 
     def check(self, context: Context) -> None:
         """Check that a root context differs from the compiled one only in z, and there not in what is compiled in.
@@ -222,11 +250,10 @@ class Walker:
             if entries is not None:
                 return entries
         base, _, entry = address.partition("[")
-        for block in self.blocks.values():
-            if block.kind == EXTRA and self._address(block) == base:
-                start = block.entries.start + int(entry.rstrip("]") or 0)
-                return slice(start, start + size)
-        return None
+        if base not in self._extras:
+            return None
+        start = self._extras[base].start + int(entry.rstrip("]") or 0)
+        return slice(start, start + size)
 
     def can_vary(self, address: str) -> bool:
         """Return whether a variable can be varied, see `place`."""
@@ -416,10 +443,8 @@ class Walker:
 
     def _read_compiled_in(self, context: Context) -> dict[str, Any]:
         probe = context.Clone()
-        for block in self.blocks.values():
-            if block.kind == EXTRA:  # These may differ.
-                address = self._address(block)
-                self.variables[address].set(probe, self.variables[address].get(self.context))
+        # These may differ.
+        self.variables.write(probe, {address: self.variables[address].get(self.context) for address in self._extras})
         systems = {path: equations.system for path, equations in self.equations.items()}
         return {
             path: equations.compiled_in(systems[path].GetMyContextFromRoot(probe))

@@ -46,6 +46,24 @@ def making() -> AbstractContextManager[object]:
     return _NOTHING if threading.current_thread() is threading.main_thread() else _MAKING
 
 
+_NO_CONTEXT = (
+    "this is no context of this testbed, but of another one (or another build, or of a part), or none at all: make one "
+    "with default_context(); a snapshot takes a state from one testbed to another"
+)
+
+
+def check_root(diagram: Diagram, context: Context) -> None:
+    """Reject a context that is not the root context of a Diagram.
+
+    Raises:
+        ValueError: The context is another Diagram's, or none.
+    """
+    try:
+        diagram.ValidateContext(context)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(_NO_CONTEXT) from error
+
+
 class _CenicSimulator(Simulator):
     """Drake's Simulator, but where CENIC would end the process, it raises: for a step of length zero."""
 
@@ -171,10 +189,7 @@ class AddressedDiagram:
         try:
             return self._validated(context)
         except (RuntimeError, TypeError) as error:
-            raise ValueError(
-                "this is no context of this testbed, but of another one (or another build, or of a part), or none at "
-                "all: make one with default_context(); a snapshot takes a state from one testbed to another"
-            ) from error
+            raise ValueError(_NO_CONTEXT) from error
 
     def _validated(self, context: Context) -> Context:
         try:
