@@ -371,16 +371,26 @@ def test_auto_tells_once_why_nothing_is_compiled(
     assert caplog.text.count("rollouts are simulated in Drake: ") == 1 and reason in caplog.text
 
 
-def test_auto_takes_drake_without_a_compiler(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("compiler", "cache", "reason"),
+    [("no-compiler", "cache", "no-compiler"), ("cc", "file", "name another folder in the environment variable XDG_")],
+)
+def test_auto_takes_drake_if_no_machine_code_can_be_made(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    compiler: str,
+    cache: str,
+    reason: str,
 ) -> None:
-    monkeypatch.setenv("CC", "no-compiler")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("CC", compiler)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
     task = RolloutTask(SCENARIO, 0.1, Quality(height, "plant.state"))
     with caplog.at_level("INFO"):
         results = outcomes(task, points(2), auto(COMPILE_FROM))
     assert [result.computed for result in results] == 2 * ["drake"]
-    assert "rollouts are simulated in Drake: " in caplog.text and "no-compiler" in caplog.text
+    assert "rollouts are simulated in Drake: " in caplog.text and reason in caplog.text
 
 
 def test_what_is_not_compiled_runs_in_the_executor_that_is_given() -> None:

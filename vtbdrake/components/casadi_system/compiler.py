@@ -53,10 +53,16 @@ def compiled(function: casadi.Function) -> casadi.Function:
     recipe = "\n".join((source, *command, platform.system(), platform.machine(), "with its digest"))
     library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
     with _ONE_AT_A_TIME:
-        if not _is_whole(library):
-            if library.exists():
-                _log.warning("%s is damaged, and compiled again", library)
-            compile_library(source, library)
+        try:
+            if not _is_whole(library):
+                if library.exists():
+                    _log.warning("%s is damaged, and compiled again", library)
+                compile_library(source, library)
+        except OSError as error:
+            raise CompilerError(
+                f"compiled libraries cannot be kept in {library.parent} ({error}): name another folder in the "
+                "environment variable XDG_CACHE_HOME"
+            ) from error
         try:
             return casadi.external(function.name(), str(library))
         except RuntimeError as error:
