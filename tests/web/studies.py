@@ -46,12 +46,12 @@ def drive_cart(path: Path) -> DrivenTrial:
         return session.store_trial(path, by="Ada")
 
 
-def run_elsewhere(path: Path, *, rollouts: int) -> subprocess.Popen[bytes]:
+def run_elsewhere(path: Path, *, rollouts: int, solver: str = "CMA-ES") -> subprocess.Popen[bytes]:
     """Begin the study, or go on with it, in a process of its own; return when its file is there and taken."""
     code = f"""
 from pathlib import Path
 from tests.web.studies import cart_pole_problem
-with cart_pole_problem().study({str(path)!r}, solver="CMA-ES") as study:
+with cart_pole_problem().study({str(path)!r}, solver={solver!r}) as study:
     study.run(rollouts={rollouts}, executor="serial", progress=False)
 """
     runner = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
