@@ -245,6 +245,18 @@ def test_dead_runner_is_told_and_another_process_goes_on(tmp_path: Path) -> None
         reader.until("died", done + 20)
 
 
+def test_study_with_more_trials_than_a_page_reads_in_its_share_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vtbdrake.web.study_feed._SHARE", 1e-9)  # What is read takes too long.
+    problem = cart_pole_problem()
+    with problem.study(tmp_path / "a.db", solver="random") as study, study.view() as view, page(view) as socket:
+        reader = Reader(socket).until("new", 0)
+        for rollouts in (4, 8, 12):
+            study.run(rollouts=rollouts, executor="serial", progress=False)
+            reader.until("ended", rollouts)
+
+
 @pytest.mark.slow
 def test_running_study_is_steered(tmp_path: Path) -> None:
     path = tmp_path / "a.db"

@@ -24,7 +24,8 @@ from vtbdrake.optimization.study_file import Mark, StudyFile
 from vtbdrake.rollout.task import FAILED
 
 _POLL = 0.2  # s
-_SHARE = 0.004  # of a core, that the reading takes at most
+_SHARE = 0.004  # of a core, that the reading takes at most, unless somebody would wait too long
+_LONGEST_WAIT = 2.0  # s; the trials of a fast study must be read anyway, sooner or later
 _SIGN_OF_LIFE = 1.0  # s between two looks at whether a process runs the study
 _RATE_OVER = 60  # rollouts over which their rate is measured
 _FAILURES = 40  # different reasons that are listed
@@ -173,7 +174,7 @@ class StudyFeed:
         while not self._closed.wait(wait):
             begin = time.thread_time()
             changed = self._read_if_changed()
-            wait = max(_POLL, (time.thread_time() - begin) / _SHARE)
+            wait = min(max(_POLL, (time.thread_time() - begin) / _SHARE), _LONGEST_WAIT)
             now = time.monotonic()
             if not changed and now < next_look:
                 continue
