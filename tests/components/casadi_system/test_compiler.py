@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import textwrap
 from functools import partial
 from pathlib import Path
@@ -131,6 +132,27 @@ def test_a_compiler_that_fails_leaves_nothing_behind(cache, monkeypatch):
     assert list((cache / "cache" / "vtbdrake" / "casadi").iterdir()) == []
     monkeypatch.setenv("CC", "cc")
     np.testing.assert_allclose(_eval(CasadiSystem(_function(), compile=True), np.zeros(3), np.ones(3))[3], 1.0)
+
+
+def test_ctrl_c_ends_all_processes_of_a_compiler_and_leaves_nothing_behind(cache, monkeypatch):
+    compiler, goes_on, temporary = cache / "slow_cc", cache / "goes_on", cache / "tmp"
+    temporary.mkdir()
+    os.mkfifo(goes_on)
+    compiler.write_text(
+        f"#!/bin/sh\nmktemp\n(kill -INT $PPID; sleep 1; echo goes on) > {goes_on} 2> /dev/null &\nwait\n"
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    child = os.open(goes_on, os.O_RDONLY | os.O_NONBLOCK)
+    with pytest.raises(KeyboardInterrupt):
+        CasadiSystem(_function(), compile=True)
+    os.set_blocking(child, True)
+    assert os.read(child, 100) == b""  # It has ended without a word.
+    os.close(child)
+    assert not list(temporary.iterdir())
+    assert not list((cache / "cache").rglob("law*"))
 
 
 def _without_the_end(contents: bytes, size: int) -> bytes:

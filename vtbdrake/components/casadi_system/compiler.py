@@ -9,9 +9,12 @@ import platform
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import casadi
@@ -126,8 +129,30 @@ def compile_library(source: str, library: Path) -> None:
     with tempfile.TemporaryDirectory() as folder, whole_file(library) as partial:
         c_file = Path(folder) / "function.c"
         c_file.write_text(source, encoding="utf-8")
-        result = subprocess.run([*command, str(c_file), "-o", str(partial), "-lm"], capture_output=True, text=True)
-        if result.returncode:
-            raise CompilerError(f"{shlex.join(command)} failed ({result.returncode}): {result.stderr.strip()}")
+        returncode, complaint = _run([*command, str(c_file), "-o", str(partial), "-lm"], folder)
+        if returncode:
+            raise CompilerError(f"{shlex.join(command)} failed ({returncode}): {complaint.strip()}")
         contents = partial.read_bytes()
         partial.write_bytes(contents + _digest(contents))
+
+
+def _run(command: Sequence[str], folder: str) -> tuple[int, str]:
+    """Run a compiler, with its own files in a folder; return its exit code and what it wrote to stderr.
+
+    Ctrl-C ends the processes that it has started, too: ``cc`` alone would leave the compilation and its files behind.
+    """
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": folder},
+        process_group=0,
+    ) as process:
+        try:
+            complaint = process.communicate()[1]
+        except BaseException:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            raise
+    return process.returncode, complaint
