@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+import pickle
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import casadi
@@ -225,6 +227,9 @@ def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
     [
         ({"horizon": 0.0}, "the horizon is a positive time in seconds, not 0.0"),
         ({"sample_period": np.inf}, "the sample period is a positive time in seconds, not inf"),
+        ({"sample_period": 1e-9}, r"1e\+09 samples and updates, but at most 1e\+07 fit into memory"),
+        ({"sample_period": 1e-320}, "has inf samples and updates"),
+        ({"horizon": 1e5}, r"e\+07 samples and updates"),
         ({"outputs": "plant.velocity"}, "no variable and no port 'plant.velocity'"),
         ({"parameters": "u.goal"}, "there is no variable 'u.goal'"),
         ({"parameters": ["sim.sense.joint_position.latency"]}, "a latency is compiled in"),
@@ -238,6 +243,15 @@ def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
 def test_refuses_arguments_that_make_no_sense(options: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         compiled(SCENARIOS["errors"], **options)
+
+
+@pytest.mark.parametrize("send", [pickle.dumps, copy.deepcopy])
+def test_is_not_sent_but_its_scenario(send: Callable[[object], object]) -> None:
+    rollouts = compiled(SCENARIOS["errors"], check=False)
+    with pytest.raises(TypeError, match="send the scenario, build it and compile it there"):
+        send(rollouts)
+    with pytest.raises(TypeError, match="a VirtualTestbed cannot be pickled or copied: send its scenario"):
+        send(SCENARIOS["errors"].build())
 
 
 def test_refuses_values_that_do_not_fit() -> None:

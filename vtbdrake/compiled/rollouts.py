@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, NoReturn
 
 import casadi
 import numpy as np
@@ -35,6 +35,9 @@ _UNROLLED = 16
 # As many rollouts, with arguments and results of so many bytes, are made in one call of a function at most; functions
 # are kept of so many sizes, with their memory.
 _MOST_ROLLOUTS, _MOST_BYTES, _MAX_SIZES = 128, 8_000_000, 16
+
+# Samples and updates of a rollout; ten million take about 5 GB.
+_MOST_INSTANTS = 1e7
 
 _NO_UPDATE = -1.0
 
@@ -126,6 +129,13 @@ class CompiledRollouts:
             self._record = casadi.Function("record", [self._z, self._time, self._w], [self._recorded], {"cse": True})
         for address in parameters:
             self.walker.place(address)
+        instants = horizon / sample_period + sum(horizon / timing.period for timing in self.walker.timings)
+        if instants > _MOST_INSTANTS:
+            raise ValueError(
+                f"a rollout of {horizon:g} s, with a sample each {sample_period:g} s, has {instants:.3g} samples and "
+                f"updates, but at most {_MOST_INSTANTS:g} fit into memory when it is compiled: take a longer sample "
+                "period, or a shorter horizon"
+            )
         self.times = sample_times(horizon, sample_period)
         by_default = [(timing.period, timing.offset) for timing in self.walker.timings]
         self._timings = by_default if timings is None else list(timings)
@@ -147,6 +157,12 @@ class CompiledRollouts:
             from vtbdrake.compiled.check import check_rollouts
 
             check_rollouts(self, self.walker.context)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "compiled rollouts cannot be pickled or copied: send the scenario, build it and compile it there; machine "
+            "code that is there already is found"
+        )
 
     def __call__(
         self, values: Mapping[str, ArrayLike] | None = None, *, context: Context | None = None

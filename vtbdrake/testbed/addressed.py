@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig, SimulatorStatus
@@ -149,6 +149,9 @@ class AddressedDiagram:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scenario!r}, {len(self._variables)} variables)"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(f"a {type(self).__name__} cannot be pickled or copied: send its scenario, and build it there")
 
     # -- contexts and simulators
 
