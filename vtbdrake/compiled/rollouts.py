@@ -268,13 +268,16 @@ class CompiledRollouts:
         for address, value in values.items():
             place = self.walker.place(address)
             size = place.stop - place.start
-            shape = getattr(value, "shape", None) or np.shape(value)
-            if isinstance(value, casadi.SX) or shape not in ((), (size,), (size, 1)):
+            try:
+                expression = casadi.MX(value)
+            except NotImplementedError:  # An SX, or no number.
+                expression = casadi.MX(0, 0)
+            if expression.shape not in ((1, 1), (size, 1)):
                 raise ValueError(
                     f"{address} takes a casadi.MX of the shape ({size}, 1), or numbers, not {type(value).__name__} of "
-                    f"{shape}"
+                    f"{getattr(value, 'shape', None) or np.shape(value)}"
                 )
-            z[place] = value
+            z[place] = expression
         _, recorded = self.function(z, *self.arguments())
         samples = [k for k, i in enumerate(self.schedule_at(self.walker.context.get_time())) if i.is_sample]
         sizes = [int(np.prod(shape, dtype=int)) for shape in self._shapes.values()]
