@@ -326,9 +326,11 @@ def test_a_function_compiled_from_cython_changes_with_its_source(edited, tmp_pat
     (tmp_path / f"used_by_a_test{EXTENSION_SUFFIXES[0]}").touch()  # It is found, and never imported.
     (tmp_path / "used_by_a_test.pyx").write_text("cdef double something():\n    return 1.0\n")
     monkeypatch.syspath_prepend(tmp_path)
+    written = "vtbdrake_diagrams.space_climber.conditioning"  # The name that Cython has written into the library.
+    monkeypatch.setitem(sys.modules, written, types.ModuleType(written))
     module = importlib.import_module("conditioning")
-    monkeypatch.delitem(sys.modules, "conditioning")
-    monkeypatch.setitem(sys.modules, "conditioning", module)
+    del sys.modules["conditioning"]
+    monkeypatch.setitem(sys.modules, written, module)
     functions = [value for value in vars(module).values() if "cython_function" in type(value).__name__]
     function, other = functions[:2]
     before, unreadable = digest(function)
