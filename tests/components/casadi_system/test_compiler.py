@@ -138,8 +138,10 @@ def test_ctrl_c_ends_all_processes_of_a_compiler_and_leaves_nothing_behind(cache
     compiler, goes_on, temporary = cache / "slow_cc", cache / "goes_on", cache / "tmp"
     temporary.mkdir()
     os.mkfifo(goes_on)
+    # It complains at more length than a pipe holds, so that somebody listens to it before it sends Ctrl-C.
     compiler.write_text(
-        f"#!/bin/sh\nmktemp\n(kill -INT $PPID; sleep 1; echo goes on) > {goes_on} 2> /dev/null &\nwait\n"
+        "#!/bin/sh\nmktemp\nhead -c 200000 /dev/zero >&2\n"
+        f"(kill -INT $PPID; sleep 1; echo goes on) > {goes_on} 2> /dev/null &\nwait\n"
     )
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
