@@ -192,6 +192,7 @@ class Reasoner:
         if self._search.executor == "compiled":
             executor.prepare(self.task, points)
         elif not executor.suits(self.task, points):
+            executor.close()
             return None
         _log.info("decisions are computed in the compiled testbed, which was compared with Drake's")
         return executor
