@@ -112,6 +112,12 @@ def test_world_that_becomes_nan_in_a_step_fails_with_the_address(process, scheme
         assert float(t) == pytest.approx(end, rel=2e-3)
 
 
+def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_step(process):
+    failed = result(process, "radau3", root="of input", slow=0.004)
+    (t,) = re.fullmatch(NO_STEP, failed.message).groups()
+    assert float(t) == 0.25
+
+
 @pytest.fixture
 def quick_look(monkeypatch):
     monkeypatch.setattr(step_watch, "PERIOD", 0.05)

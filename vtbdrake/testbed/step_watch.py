@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import IntegratorBase, Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Integrator
 
@@ -110,22 +110,23 @@ class StepWatch:
                 now.attempts - self._begin.attempts >= _ATTEMPTS
                 or now.evaluations - self._attempt.evaluations >= self._most_evaluations
             ):
-                self._last_state = _state_before_attempts(context)
+                self._last_state = self._state_before_attempts(integrator, context)
                 integrator.reset_context(self._refused)
 
-
-def _state_before_attempts(context: Context) -> tuple[float, np.ndarray]:
-    """Return the time and the state that the attempts of another thread begin with."""
-    # It tries a step, often with NaN in the state, and takes it back, in turns.
-    samples = []
-    for _ in range(1000):
-        now, state = context.get_time(), context.get_continuous_state_vector().CopyToVector()
-        if np.isfinite(state).all():
-            samples.append((now, state))
-        if len(samples) == 20:
-            break
-        time.sleep(1e-4)  # Systems in Python go on meanwhile.
-    return min(samples, key=lambda sample: sample[0], default=(now, state))
+    def _state_before_attempts(self, integrator: IntegratorBase, context: Context) -> tuple[float, np.ndarray]:
+        """Return the time and the state that the attempts of another thread begin with."""
+        # It tries a step, often with NaN in the state, and takes it back, in turns: look on for several attempts,
+        # however long that thread is held up in the midst of one.
+        samples = []
+        end = integrator.get_num_derivative_evaluations() + self._most_evaluations
+        for _ in range(10_000):
+            now, state = context.get_time(), context.get_continuous_state_vector().CopyToVector()
+            if np.isfinite(state).all():
+                samples.append((now, state))
+            if integrator.get_num_derivative_evaluations() >= end:
+                break
+            time.sleep(1e-4)  # Systems in Python go on meanwhile.
+        return min(samples, key=lambda sample: sample[0], default=(now, state))
 
 
 class _Watcher:
