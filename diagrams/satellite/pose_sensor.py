@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, State
+from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.target_tracker import pose_of_state
@@ -70,6 +70,7 @@ class PoseSensor(SampledSensor):
 
 # The covariance of poses with a deviation of 1 m: an error of 1 m is one of 2 rad, see `PoseSensor`.
 _COVARIANCE = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0])
+_NOTHING = PoseEstimate.missing()
 
 
 class PoseReader(AddressedSystem):
@@ -85,9 +86,9 @@ class PoseReader(AddressedSystem):
         - estimate
 
     ``history`` is that of a `BaseEstimator`; ``estimate`` is a PoseEstimate of X_IT. A pose that arrives was measured
-    one period of the DPS before, plus the parameter ``latency`` (s), whenever the sensor samples. A period later the
-    history reaches that time, and the estimate is made. A pose that equals the last one in all digits is taken for one
-    that did not arrive: sensors have noise.
+    one period of the DPS before, plus the parameter ``latency`` (s), whenever the sensor samples. It waits for a
+    period, in which the history reaches that time, and then shows an estimate; else none is shown. A pose that equals
+    the last one in all digits is taken for one that did not arrive: sensors have noise.
     """
 
     def __init__(self, *, period: float, latency: float = 0.0, deviation: float = 0.01) -> None:
@@ -102,9 +103,6 @@ class PoseReader(AddressedSystem):
         self._period = period
         self._pose = self.DeclareVectorInputPort("target_pose", 7)
         self._history = self.DeclareVectorInputPort("history", HISTORY * POSE)
-        estimate = self.DeclareAbstractState(Value(PoseEstimate.missing()))
-        self.DeclareStateOutputPort("estimate", estimate)
-        self._estimate = int(estimate)
         self._last = self.declare_discrete_state(
             last_pose=Quantity(np.zeros(7), "1, m"),
             last_time=Quantity(0.0, "s"),
@@ -113,25 +111,29 @@ class PoseReader(AddressedSystem):
         self._settings = self.declare_parameters(
             latency=Quantity(latency, "s", (0.0, 1.0)), deviation=Quantity(deviation, "m", (0.0, 10.0))
         )
-        self.timings = ((period, 0.0),)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclareAbstractOutputPort(
+            "estimate",
+            lambda: Value(PoseEstimate.missing()),
+            self._calc,
+            prerequisites_of_calc={self.xd_ticket(), self.pn_ticket(), self._history.ticket()},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> EventStatus:
-        last, pose = self._last.view(context), self._pose.Eval(context)
-        waiting, differs = last.waiting, pose.tolist() != last.last_pose.tolist()
-        if not (differs or waiting):
-            return EventStatus.DidNothing()
-        settings = self._settings.view(context)
-        taken = context.get_time() - self._period - settings.latency
+    def _calc(self, context: Context, output: AbstractValue) -> None:
+        last = self._last.view(context)
+        if not last.waiting:
+            output.set_value(_NOTHING)
+            return
+        X_IB: RigidTransform = pose_at(self._history.Eval(context), last.last_time)
+        covariance = self._settings.view(context).deviation ** 2 * _COVARIANCE
+        output.set_value(PoseEstimate.of(X_IB @ pose_of_state(last.last_pose), covariance, time=last.last_time))
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        last, pose = self._last.mutable(state), self._pose.Eval(context)
+        last.waiting = 0.0
+        if pose.tolist() == last.last_pose.tolist():
+            return
+        taken = context.get_time() - self._period - self._settings.view(context).latency
         # Nothing was measured before the start; times are rounded.
-        is_new = differs and taken > -0.5 * self._period
-        if waiting:
-            X_IB: RigidTransform = pose_at(self._history.Eval(context), last.last_time)
-            covariance = settings.deviation**2 * _COVARIANCE
-            estimate = PoseEstimate.of(X_IB @ pose_of_state(last.last_pose), covariance, time=last.last_time)
-            state.get_mutable_abstract_state(self._estimate).set_value(estimate)
-        following = self._last.mutable(state.get_mutable_discrete_state())
-        following.waiting = is_new
-        if is_new:
-            following.last_pose, following.last_time = pose, max(taken, 0.0)
-        return EventStatus.Succeeded()
+        if taken > -0.5 * self._period:
+            last.last_pose, last.last_time, last.waiting = pose, max(taken, 0.0), 1.0
