@@ -236,6 +236,18 @@ def test_compiled_rollouts_give_the_same_estimates() -> None:
     assert compiled.rollouts == by_drake.rollouts and str(compiled) == str(by_drake)
 
 
+def test_loss_that_is_not_finite_is_named() -> None:
+    with pytest.raises(CalibrationError, match="at every point .* its loss failed: the loss of swing . is nan"):
+        calibrate_by_rollouts(
+            CartPoleScenario(),
+            swings(0.2),
+            [Parameter(DAMPING, 0.05, 0.6)],
+            lambda times, measured, simulated: np.nan,
+            points=2,
+            executor="compiled",
+        )
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -147,7 +147,7 @@ def calibrate_by_rollouts(
 
     Raises:
         CalibrationError: Nothing is varied, a window does not fit the others, there are fewer than eight recordings, or
-            all rollouts fail.
+            all rollouts fail, or have losses that are not finite.
         ValueError: An address does not exist, or a range exceeds its bounds.
     """
     if not parameters:
@@ -281,6 +281,9 @@ class _Scores:
                 return _WindowScore(nan, nan, True)
             motions.append({address: np.asarray(result.record[address])[:n] for address in window.record})
         to_recording = np.array([self._loss(window.times, window.record, motion) for motion in motions])
+        if not np.isfinite(to_recording).all():
+            self.message = f"the loss of {window.source} is {to_recording[~np.isfinite(to_recording)][0]}"
+            return _WindowScore(nan, nan, True)
         count = len(motions)
         if count == 1:
             return _WindowScore(float(to_recording[0]), float(to_recording[0]), False)
@@ -328,7 +331,7 @@ def _search(scores: _Scores, windows: Sequence[Window], *, solver: str, points: 
     finally:
         search.close()
     if best is None:
-        raise CalibrationError(f"at every point a rollout failed: {scores.message}")
+        raise CalibrationError(f"at every point a rollout or its loss failed: {scores.message}")
     return best[1]
 
 
@@ -432,7 +435,7 @@ class _Surface:
         self._terms, self._table = self._terms_at(u[rows]), table[rows]
         self.points = len(self._terms)
         if self.points < self._terms.shape[1]:
-            raise CalibrationError(f"around the best point too many rollouts fail: {scores.message}")
+            raise CalibrationError(f"around the best point too many rollouts or losses fail: {scores.message}")
 
     def _terms_at(self, u: Array) -> Array:
         """Return the terms (points, m) of a quadratic at points (points, n) of the cube."""
