@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from math import inf
 from operator import itemgetter
@@ -151,6 +153,30 @@ def test_begins_at_starts() -> None:
     assert {result.computed for result in by_drake} == {"drake"}
     assert_same(results, expected)
     assert {result.computed for result in results} == {"compiled"}
+
+
+def test_each_thread_gets_the_rollouts_of_its_start() -> None:
+    testbed = SCENARIO.build()
+    starts = []
+    for angle in (0.3, 0.8, 1.3, 1.8):
+        context = testbed.default_context()
+        testbed.write(context, {ANGLE: angle})
+        starts.append(Start.of(testbed, context))
+    task = RolloutTask(SCENARIO, 0.1, Quality(lambda angle: angle, ANGLE, reading="end"))
+    with SerialExecutor() as serial:
+        expected = [next(iter(serial.run(task, [{}], start=start)))[1].h for start in starts]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # s; so that threads take turns in the midst of everything.
+    try:
+        with CompiledExecutor(testbed, compile=False) as executor, ThreadPoolExecutor(len(starts)) as pool:
+
+            def run_often(start: Start) -> list[float]:
+                return [next(iter(executor.run(task, [{}], start=start)))[1].h for _ in range(200)]
+
+            for values, each in zip(pool.map(run_often, starts), expected, strict=True):
+                np.testing.assert_allclose(values, each, rtol=1e-11)
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def test_what_diverges_is_told_by_drake() -> None:

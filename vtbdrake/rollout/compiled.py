@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 import time
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from math import inf, nan
@@ -43,6 +44,7 @@ class CompiledExecutor(Executor):
     the next time. Qualities that work with CasADi's numbers (sums, products, numpy's functions; no branches) are
     compiled, too; others get the recorded samples. A rollout that the compiled testbed cannot make (a joint reaches its
     stop, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was made.
+    Several threads may call it at once, if that is true of ``drake``.
 
     Args:
         testbed: A testbed to use for tasks of its scenario; others are built.
@@ -67,6 +69,7 @@ class CompiledExecutor(Executor):
         self._workers = checked_workers(workers)
         self._compile = compile
         self._compiled: LruDict[Hashable, _CompiledTask] = LruDict(max_testbeds)
+        self._lock = threading.Lock()
 
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
@@ -126,14 +129,15 @@ class CompiledExecutor(Executor):
     def _of(self, task: RolloutTask, fields: Parameters, points: Sequence[Parameters]) -> _CompiledTask:
         key = (id(task), values_key(fields))
         addresses = frozenset[str]().union(*points) - {f"{FIELD}{name}" for name in fields}
-        compiled = self._compiled.use(key)
-        if compiled is None or not compiled.varies(addresses):
-            if compiled is not None:
-                addresses |= compiled.addresses
-            with Interruptible():
-                testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
-                compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
-            self._compiled.add(key, compiled)
+        with self._lock:  # What one thread compiles, others wait for.
+            compiled = self._compiled.use(key)
+            if compiled is None or not compiled.varies(addresses):
+                if compiled is not None:
+                    addresses |= compiled.addresses
+                with Interruptible():
+                    testbed = self._testbeds.get(task.scenario.with_fields(fields) if fields else task.scenario)
+                    compiled = _CompiledTask(task, testbed, addresses, workers=self._workers, compile=self._compile)
+                self._compiled.add(key, compiled)
         return compiled
 
 
@@ -230,6 +234,7 @@ class _CompiledTask:
         self._duration = inf  # Of a rollout of the last batch, in seconds.
         self._varies: dict[frozenset[str], bool] = {}
         self._last_start: tuple[Start | None, np.ndarray, float] | None = None
+        self._lock = threading.Lock()
 
     def warm_up(self) -> None:
         """Make a rollout that begins with the periodic events, and one between them: there are more instants in it."""
@@ -280,21 +285,25 @@ class _CompiledTask:
         return 0 if left <= 0.0 else sys.maxsize if left == inf else max(1, int(left / self._duration))
 
     def _begin(self, start: Start | None) -> tuple[np.ndarray, float]:
-        if self._last_start is None or self._last_start[0] is not start:
-            walker = self._rollouts.walker
-            is_compiled = start is not None and self._is_compiled(start)
-            # Other variables change more than their own value: a mass scales an inertia.
-            if start is not None and is_compiled and all(walker.variables[a].place for a in start.values):
-                z = self._z0.copy()
-                z[self._into] = start.contents.numbers[self._from]
-                self._last_start = start, self._rollouts.filled(z, start.values)[0], start.time
-            else:
-                with Interruptible():
-                    self._start_context.set(start)
-                    context = self._start_context.context
-                    z = walker.read(context) if is_compiled else self._rollouts.z_of(context)
-                    self._last_start = start, z, context.get_time()
-        return self._last_start[1:]
+        with self._lock:  # Threads share the context of the starts, and the last start.
+            if self._last_start is None or self._last_start[0] is not start:
+                self._last_start = start, *self._z_of(start)
+            return self._last_start[1:]
+
+    def _z_of(self, start: Start | None) -> tuple[np.ndarray, float]:
+        """Return the vector of state and parameters of a start, and its time."""
+        walker = self._rollouts.walker
+        is_compiled = start is not None and self._is_compiled(start)
+        # Other variables change more than their own value: a mass scales an inertia.
+        if start is not None and is_compiled and all(walker.variables[a].place for a in start.values):
+            z = self._z0.copy()
+            z[self._into] = start.contents.numbers[self._from]
+            return self._rollouts.filled(z, start.values)[0], start.time
+        with Interruptible():
+            self._start_context.set(start)
+            context = self._start_context.context
+            z = walker.read(context) if is_compiled else self._rollouts.z_of(context)
+            return z, context.get_time()
 
     def _is_compiled(self, start: Start) -> bool:
         """Return whether a start has no part in which it could differ from what is compiled in."""
