@@ -1,6 +1,8 @@
 """All executors give the same results, in threads and processes."""
 
+import copy
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -27,6 +29,7 @@ from vtbdrake.rollout import (
     WorkerError,
 )
 from vtbdrake.rollout.cluster import DaskExecutor
+from vtbdrake.rollout.compiled import CompiledExecutor
 from vtbdrake.rollout.executor import run_rollouts, watched
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,6 +72,18 @@ def test_a_module_that_workers_do_not_have_is_named(monkeypatch):
     task = RolloutTask(AcrobotScenario(), 0.1, Quality(module.f, SHOULDER))
     with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="No module named 'only_here'"):
         list(executor.run(task, [{}]))
+
+
+@pytest.mark.parametrize(
+    "make", [SerialExecutor, lambda: ThreadExecutor(1), lambda: ProcessExecutor(1), CompiledExecutor]
+)
+@pytest.mark.parametrize("copied", [pickle.dumps, copy.copy])
+def test_an_executor_cannot_be_copied_to_another_process(make, copied):
+    with (
+        make() as executor,
+        pytest.raises(TypeError, match=r"a \w+Executor cannot be pickled or copied: send the task"),
+    ):
+        copied(executor)
 
 
 def test_progress_is_shown_in_a_kernel_only(monkeypatch):

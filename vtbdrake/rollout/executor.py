@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, NoReturn
 
 from tqdm.auto import tqdm
 
@@ -95,6 +95,9 @@ class Executor(Closing):
     def close(self) -> None:
         """Release threads, processes and testbeds."""
         return
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(f"a {type(self).__name__} cannot be pickled or copied: send the task, and make one there")
 
 
 class SerialExecutor(Executor):
