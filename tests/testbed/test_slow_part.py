@@ -136,6 +136,19 @@ def test_the_memory_goes_from_each_sample_to_the_next(latency):
     assert rig.read("y") == pytest.approx(sum(expected_samples(1.001, latency=latency)))
 
 
+@pytest.mark.parametrize("request_at", [0.0, 0.5])
+def test_only_a_request_leads_to_updates(request_at):
+    rig = Rig(lambda t, request: t, latency=0.03, on_request=True)
+    request, part_context = rig.part.GetInputPort("request"), rig.part.GetMyMutableContextFromRoot(rig.context)
+    request.FixValue(part_context, 0.0)
+    rig.advance(request_at)
+    assert rig.simulator.get_num_unrestricted_updates() == 0
+    request.FixValue(part_context, 1.0)
+    rig.advance(request_at + 1.001)
+    assert rig.simulator.get_num_unrestricted_updates() == 2  # The sample, and its result.
+    assert rig.read("taken") == 1.0 and rig.read("sampled_at") == pytest.approx(request_at, abs=PERIOD + 1e-9)
+
+
 def test_at_first_it_shows_what_was_declared():
     rig = Rig(latency=0.03, initial={"y": [7.0]})
     assert rig.read("y") == 7.0 and rig.read("valid") == 0.0 and rig.read("sampled_at") == -np.inf

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, InputPort, State
+from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, EventStatus, InputPort, State
 
 from vtbdrake.arrays import immutable
 from vtbdrake.state import AddressedSystem, Codec, Quantity
@@ -373,19 +373,21 @@ class SlowPart(AddressedSystem):
 
     # -- while time runs
 
-    def _sample(self, context: Context, state: State) -> None:
+    def _sample(self, context: Context, state: State) -> EventStatus:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
         progress: Progress = value.get_value()
         tick = self._tick(context, 0.0)
         # After an exception in one of them, the events of an instant are repeated.
-        if progress.find(tick) is None and self._is_wanted(context, progress):
-            sample = {name: port.Eval(context) for name, port in self._inputs.items()}
-            if self._read_dps is not None:
-                sample[_DPS] = self._read_dps(self._root_of(context))
-            if self._request is not None:
-                self._take_request(context, state)
-            work = Work(tick, WorkStatus.WAITING, encode(sample, self.function.inputs))
-            value.set_value(replace(progress, under_way=(*progress.under_way, work)))
+        if progress.find(tick) is not None or not self._is_wanted(context, progress):
+            return EventStatus.DidNothing()
+        sample = {name: port.Eval(context) for name, port in self._inputs.items()}
+        if self._read_dps is not None:
+            sample[_DPS] = self._read_dps(self._root_of(context))
+        if self._request is not None:
+            self._take_request(context, state)
+        work = Work(tick, WorkStatus.WAITING, encode(sample, self.function.inputs))
+        value.set_value(replace(progress, under_way=(*progress.under_way, work)))
+        return EventStatus.Succeeded()
 
     def _is_wanted(self, context: Context, progress: Progress) -> bool:
         if self._request is None:
@@ -402,13 +404,13 @@ class SlowPart(AddressedSystem):
         reference: RootReference = self._root.Eval(context) if self._root.HasValue(context) else RootReference()
         return reference.find(self, context)
 
-    def _show(self, context: Context, state: State) -> None:
+    def _show(self, context: Context, state: State) -> EventStatus:
         value = state.get_mutable_abstract_state().get_mutable_value(int(self._progress))
         progress: Progress = value.get_value()
         tick = self._tick(context, self.latency)
         work = progress.find(tick)
         if work is None:
-            return
+            return EventStatus.DidNothing()
         if work.status == WorkStatus.WAITING:
             progress = progress.having(tick, self.function({**work.arrays, **progress.memory}))
             work = progress.find(tick)
@@ -421,6 +423,7 @@ class SlowPart(AddressedSystem):
             self._set_numbers(state, {_MISSED: [self._number(context, _MISSED) + 1.0], _VALID: [0.0]})
             progress = progress.after(work, shown=progress.shown)
         value.set_value(progress)
+        return EventStatus.Succeeded()
 
     def _tick(self, context: Context, delay: float) -> int:
         """Return the number of the sample that was taken ``delay`` seconds ago."""
