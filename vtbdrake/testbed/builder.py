@@ -12,6 +12,7 @@ from vtbdrake.argument_checks import as_addresses
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.integrator import controls_error
+from vtbdrake.testbed.kept_meshcats import keep_meshcat
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, BeliefRule, VirtualTestbed, check_mode
@@ -284,6 +285,8 @@ class VirtualTestbedBuilder:
             parameters = MeshcatVisualizerParams(prefix=prefix or "visualizer")
             MeshcatVisualizer.AddToBuilder(self.diagram_builder, self.scene_graph, meshcat, parameters)
         diagram = self.build_diagram("vtb")
+        if meshcat is not None:
+            keep_meshcat(meshcat, diagram)
         return VirtualTestbed(
             self,
             self._dps,

@@ -26,6 +26,7 @@ from vtbdrake.components.rendering import RenderingError
 from vtbdrake.failures import one_line
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed.kept_meshcats import keep_meshcat
 from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.still import Still
@@ -173,8 +174,13 @@ def _read(name: str) -> str:
 
 
 def make_meshcat() -> Meshcat:
-    """Start a Meshcat server that listens on this machine only (Drake's default listens on all interfaces)."""
-    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    """Start a Meshcat server that listens on this machine only (Drake's default listens on all interfaces).
+
+    In the main thread, a server that nothing uses any more ends when the next one is made.
+    """
+    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    keep_meshcat(meshcat)
+    return meshcat
 
 
 def show_motion(
