@@ -196,10 +196,13 @@ def test_dps_that_reasons_decides_acts_and_is_replayed(tmp_path: Path) -> None:
         _, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 0, errors
     log = read_log(log_file)
-    decided = [i for i, change in log.changes if change.kind == "result" and "decision" in change.values[PLANNER]]
+    results = [(i, change.values[PLANNER]) for i, change in log.changes if change.kind == "result"]
+    first, decision = next((i, values["decision"]) for i, values in results if "decision" in values)
     force = log.actuation["force"][:, 0]
-    (first,) = decided[:1]
-    # The mass is at rest at the origin until the decision acts.
-    assert np.nanmax(np.abs(force[:first])) < 1e-9 < 0.1 < np.abs(force[first:]).max()
+    # The mass is at rest at the origin until the decision acts: then its spring pulls. A computer that is busy may have
+    # time for the plan in use alone, which is to stay.
+    assert np.nanmax(np.abs(force[:first])) < 1e-9
+    pushes = force[first:][np.abs(force[first:]) > 1e-9]
+    np.testing.assert_allclose(pushes[:1], 9.0 * decision[decision != 0.0])
     report = replay(log)
     assert report.identical and report.digests > 0, report
