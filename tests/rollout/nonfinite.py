@@ -1,6 +1,5 @@
 """A DPS that commands NaN or infinity after a quarter of a second, and continuous worlds that become NaN then."""
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,9 +74,9 @@ def compiled_law(bad, *, sampled):
 class Tank(LeafSystem):
     """The level x of a tank, in m, whose rate is a root that ends at t = 0.25 s: that of a negative number is NaN."""
 
-    def __init__(self, root, slow):
+    def __init__(self, root):
         super().__init__()
-        self._root, self._slow = root, slow
+        self._root = root
         self.DeclareContinuousState(BasicVector([0.0625]))
         self.DeclarePeriodicDiscreteUpdateEvent(1.0, 0.25, lambda context, discrete: discrete.set_value([-1.0]))
         self.DeclareDiscreteState(BasicVector([1.0]))
@@ -91,8 +90,6 @@ class Tank(LeafSystem):
             # NaN from an event on, at the beginning of a step.
             "of input": lambda: np.sqrt(context.get_discrete_state_vector().value()[0]),
         }[self._root]
-        if context.get_time() > 0.25:
-            time.sleep(self._slow)
         with np.errstate(invalid="ignore"):
             derivatives.get_mutable_vector().SetFromVector([root()])
 
@@ -111,7 +108,6 @@ class NonfiniteScenario(Scenario):
     in_world: bool = False
     # There is a `Tank` in the world.
     root: str = ""
-    slow: float = 0.0  # what each look at its rate takes after 0.25 s, in s
 
     def interface(self):
         return Interface(
@@ -131,7 +127,7 @@ class NonfiniteScenario(Scenario):
             builder.connect(source.get_output_port(), hold.get_input_port())
             builder.connect(hold.get_output_port(), tank.get_input_port())
         elif self.root:
-            builder.add("env", "tank", Tank(self.root, self.slow))
+            builder.add("env", "tank", Tank(self.root))
         if self.plant:
             plant, _ = builder.add_plant(MultibodyPlantConfig(time_step=self.time_step))
             Parser(plant).AddModelsFromString(PENDULUM, "urdf")

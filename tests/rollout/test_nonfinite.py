@@ -5,7 +5,9 @@ import os
 import re
 import signal
 import threading
+import time
 from math import inf
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LinearSystem
 
 from tests.interruptions import hanging_fails
-from tests.rollout.nonfinite import NonfiniteScenario, compiled_law
+from tests.rollout.nonfinite import NonfiniteScenario, Tank, compiled_law
 from tests.testbeds import AcrobotScenario, PendulumScenario
 from vtbdrake.rollout import (
     ProcessExecutor,
@@ -112,15 +114,43 @@ def test_world_that_becomes_nan_in_a_step_fails_with_the_address(process, scheme
         assert float(t) == pytest.approx(end, rel=2e-3)
 
 
-def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_step(process):
-    failed = result(process, "radau3", root="of input", slow=0.004)
-    (t,) = re.fullmatch(NO_STEP, failed.message).groups()
-    assert float(t) == 0.25
-
-
 @pytest.fixture
 def quick_look(monkeypatch):
     monkeypatch.setattr(step_watch, "PERIOD", 0.05)
+
+
+def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_step(quick_look, monkeypatch):
+    begun, held_up, looks, looked = threading.Event(), threading.Event(), [], threading.Condition()
+    state_before_attempts, derivatives_of = step_watch.StepWatch._state_before_attempts, Tank.DoCalcTimeDerivatives
+
+    def look_from_the_midst(self, integrator, context):
+        begun.set()
+        held_up.wait()
+        return state_before_attempts(self, integrator, context)
+
+    def look_again(seconds):
+        with looked:
+            looks.append(seconds)
+            looked.notify()
+        time.sleep(seconds)
+
+    def hold_up(self, context, derivatives):
+        x = context.get_continuous_state_vector().CopyToVector()
+        if begun.is_set() and not held_up.is_set() and context.get_time() > 0.25 and np.isfinite(x).all():
+            with looked:
+                held_up.set()
+                end = len(looks) + 25
+                looked.wait_for(lambda: len(looks) >= end)
+        derivatives_of(self, context, derivatives)
+
+    monkeypatch.setattr(step_watch, "time", SimpleNamespace(sleep=look_again))
+    monkeypatch.setattr(step_watch.StepWatch, "_state_before_attempts", look_from_the_midst)
+    monkeypatch.setattr(Tank, "DoCalcTimeDerivatives", hold_up)
+    config = SimulatorConfig(integration_scheme="radau3", max_step_size=0.05, accuracy=1e-3)
+    task = RolloutTask(NonfiniteScenario(config, root="of input"), 1.0, Quality(abs, "time"))
+    ((_, failed),) = SerialExecutor().run(task, [{}])
+    (t,) = re.fullmatch(NO_STEP, failed.message).groups()
+    assert float(t) == 0.25
 
 
 @pytest.mark.parametrize("executor", [SerialExecutor, lambda: ThreadExecutor(2)], ids=["serial", "threads"])
