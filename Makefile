@@ -19,18 +19,19 @@ STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 
 .DEFAULT_GOAL := help
-.PHONY: help python setup demo demo-control test verify check docs dist answers bench clean stale
+.PHONY: help python setup demo demo-control test test-all verify check docs dist answers bench clean stale
 
 help:
 	@echo "make demo                          the space climber, from the question to the answer"
 	@echo "make demo-control                  an arm, from the simulation to the machine, at 1 kHz; the machine killed, and back"
-	@echo "make test [ARGS='-k name']         the tests"
+	@echo "make test [ARGS='-k name']         the quick tests: all but those marked slow"
+	@echo "make test-all [ARGS='-k name']     all tests"
 	@echo "make verify                        the cases with known answers among them, with their errors in a table"
-	@echo "make check                         ruff, mypy, and the public interface against that of the newest release"
+	@echo "make check                         ruff, mypy, scripts of pages, the public interface against that of the newest release, sizes and circles"
 	@echo "make docs                          the documentation site, in build/docs/"
 	@echo "make answers [ONLY=O4] [FULL=1]    every application's question and answer; writes answers.json"
 	@echo "make bench [ONLY=name] [PAGE=1]    every claim of speed; writes benchmarks/results.json, and docs/benchmarks.md"
-	@echo "make dist                          source distribution and wheel, in dist/, tried in an empty environment"
+	@echo "make dist [PYTHONS=python3.12]     source distribution and a wheel per Python, in dist/, tried in empty environments"
 	@echo "make setup                         only the environment that the others need"
 	@echo "make clean                         remove environments, caches and results"
 	@echo
@@ -50,9 +51,14 @@ demo-control: $(STAMP)
 # In the order of the folders: by default, files of few tests come last, and the longest of them keep one worker busy in the
 # end. One worker more than processors: some tests wait for other processes, for sockets and for the clock. A worker that
 # crashes ends the run at once: another one in its place would leave tests out, and wait for ever at the end.
+PYTEST = $(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --max-worker-restart 0 \
+	--dist loadfile --no-loadscope-reorder --durations 50 --durations-min 1
+
 test: $(STAMP)
-	$(RUN) -m pytest --numprocesses $$(($$(nproc) + 1)) --maxprocesses 4 --max-worker-restart 0 \
-		--dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: $(STAMP)
+	$(PYTEST) $(ARGS)
 
 verify: $(STAMP)
 	$(RUN) -m tests.verification $(ARGS)
@@ -62,6 +68,8 @@ check: $(STAMP)
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
 	$(RUN) tools/public_api.py
+	tools/javascript/check.sh
+	$(RUN) tools/house.py
 
 # Warnings are errors: a link that leads nowhere, a page that is not in docs/index.md.
 docs: $(STAMP)
@@ -69,7 +77,7 @@ docs: $(STAMP)
 	@echo "build/docs/index.html"
 
 dist: $(STAMP)
-	tools/dist.sh $(VENV)
+	tools/dist.sh $(VENV) $(PYTHONS)
 
 answers: $(STAMP)
 	$(RUN) -m vtbdrake_diagrams.answers $(ONLY) $(if $(filter-out 0,$(FULL)),--full)
@@ -84,6 +92,6 @@ stale:
 
 clean:
 	rm -rf .venv .venv-* build dist docs/_api *.egg-info out answers.json benchmarks/results.json
-	rm -rf .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf tools/javascript/node_modules .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find vtbdrake \( -name '*.so' -o -name 'lcmt_vtb_*.py' \) -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,11 +1,16 @@
-"""The part of the build that pyproject.toml cannot declare: the modules of every .pyx and of every .lcm."""
+"""The part of the build that pyproject.toml cannot declare: which modules there are."""
 
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+from sysconfig import get_path
 
 import numpy as np
 from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
+from setuptools.errors import CompileError
 
 _ROOT = Path(__file__).parent
 _PACKAGES = ("vtbdrake", "vtbdrake_diagrams")
@@ -30,7 +35,54 @@ def make_message_types(source: Path) -> None:
 for path in sorted((_ROOT / "vtbdrake").rglob("*.lcm")):
     make_message_types(path)
 
+# numpy's distributions, for compiled code that draws random numbers.
+_NPYRANDOM = {"libraries": ["npyrandom", "m"], "library_dirs": [str(Path(np.__file__).parent / "random" / "lib")]}
+_DRAWS = {Path("vtbdrake/components/sensors/noise_kernel.pyx")}
+
+# Modules of testbeds that read recordings, which are not part of vtbdrake: they stay in the repository.
+_READ_RECORDINGS = {
+    *(path.parent / path.stem for path in sorted(Path("vtbdrake_diagrams").glob("*/reality.py"))),
+    *(Path("vtbdrake_diagrams/park") / name for name in ("mower", "survey")),
+    *(Path("vtbdrake_diagrams/recorded_arms") / name for name in ("pendulum", "subjects")),
+}
+
+
+class BuildPy(build_py):
+    """Leaves out the modules that read recordings, in the source distribution and in the wheel."""
+
+    def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:
+        """Return package, name and file of each module of a package."""
+        modules = super().find_package_modules(package, package_dir)
+        return [module for module in modules if Path(*package.split("."), module[1]) not in _READ_RECORDINGS]
+
+
+class BuildExt(build_ext):
+    """Looks for a C compiler with Python's headers before Cython translates the modules, which takes a minute."""
+
+    command_name = "build_ext"  # By which an editable installation finds the options below.
+
+    def build_extensions(self) -> None:
+        """Compile the modules.
+
+        Raises:
+            SystemExit: There is no C compiler, or Python's headers are missing; the last line of the output says so.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            source = Path(folder, "has_headers.c")
+            source.write_text("#include <Python.h>\n")
+            try:
+                self.compiler.compile([str(source)], output_dir=folder, include_dirs=[get_path("include")])
+            except CompileError as error:
+                version = f"{sys.version_info.major}.{sys.version_info.minor}"
+                raise SystemExit(
+                    f"vtbdrake compiles modules: it needs a C compiler and the headers of Python {version} ({error}): "
+                    f"apt-get install gcc libc6-dev python{version}-dev, or install a wheel, which needs neither"
+                ) from None
+        super().build_extensions()
+
+
 setup(
+    cmdclass={"build_py": BuildPy, "build_ext": BuildExt},
     ext_modules=[
         Extension(_SHARED, ["vtbdrake/_cyutility.c"], extra_compile_args=["-O2", "-g0"]),
         *(
@@ -43,6 +95,7 @@ setup(
                 # The same rounding on every processor: no product and sum in one. No debug information, which takes a
                 # quarter of the time to compile.
                 extra_compile_args=["-O2", "-g0", "-ffp-contract=off"],
+                **(_NPYRANDOM if source in _DRAWS else {}),
             )
             for source in _SOURCES
         ),

@@ -31,7 +31,7 @@ BUDGETS, SHORT_BUDGETS = (30, 100, 400), (30, 100)
 SEEDS, SHORT_SEEDS = range(10), range(5)
 # Below this part of a typical gap, an optimum counts as found.
 SOLVED = 1e-4
-# A row is good up to this ratio; so many of all rows shall be, none above the largest, and in none `auto` the worst.
+# A row is good up to this ratio; this share of all rows shall be, none above the largest, and in none `auto` the worst.
 GOOD, GOAL, LARGEST = 1.5, 28 / 33, 5.0
 # The penalty of a violation of 1, far above the multiplier of the constraint.
 PENALTY = 10.0
@@ -440,7 +440,7 @@ def auto_regret() -> list[Benchmark]:
 
 
 def auto_regret_full() -> list[Benchmark]:
-    """Return the median gap of `auto` over that of the best of the others, row by row, and in how many it is good."""
+    """Return the median gap of `auto` over the best other gap, row by row, and the share of good rows."""
     return _regret("auto_regret_full", BUDGETS, SEEDS)
 
 

@@ -1,4 +1,4 @@
-"""Processor time of the calibration of an arm (18 numbers, a recording at 1 kHz) beside that of MuJoCo's sysid."""
+"""Processor time of the calibration of an arm (18 numbers, a recording at 1 kHz) beside MuJoCo's sysid."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 import vtbdrake as vtb
 from benchmarks.measure import LOWER, Benchmark
 from tests.verification.mjcf import mjcf
-from vtbdrake.arrays import Array
 from vtbdrake.calibration import calibrate
+from vtbdrake.common.arrays import Array
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 from vtbdrake_diagrams.manipulator.studies.self_test import DELAY, PARAMETERS, PAYLOAD, POSITION, TORQUE, arm, motion
@@ -31,7 +31,7 @@ SYSID, SYSID_ENVIRONMENT = "mujoco[sysid]==4.0.0", Path(__file__).parents[1] / "
 
 
 def calibration_time() -> Benchmark:
-    """Processor time to calibrate, relative to that of MuJoCo's sysid with the same recording."""
+    """Processor time to calibrate, relative to MuJoCo's sysid with the same recording."""
     scenario = arm()
     testbed = scenario.build()
     default = testbed.default_context()

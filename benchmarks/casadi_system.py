@@ -41,7 +41,7 @@ def casadi_system(repeats: int = 11, ticks: int = 1000) -> list[Benchmark]:
                     name=f"{name}{suffix}",
                     value=ratio(times, theirs),
                     unit="1",
-                    goal=None if results else 0.5,
+                    goal=None if results else 0.3,
                     better=LOWER,
                     against=f"the same {system} in numpy",
                     note=f"{micros[0]} and {micros[1]} us per tick, n = {repeats}; results {difference:.1g} apart",

@@ -25,7 +25,7 @@ TIMES = np.linspace(0.0, 15.0, 151)
 
 
 def cluster_projection() -> list[Benchmark]:
-    """The throughput of rollouts over that of workers that do nothing else, from the first rollout to the last.
+    """The throughput of rollouts over the one of workers that do nothing else, from the first rollout to the last.
 
     A real network, and the building of the testbeds, are left out.
     """
@@ -47,7 +47,7 @@ def cluster_projection() -> list[Benchmark]:
 
 
 def _elapsed(slots: int, each: int) -> float:
-    """Return how long a cluster of so many slots needs for its rollouts, so many for each, in s."""
+    """Return the time in s that a cluster of ``slots`` slots needs for ``each`` rollouts per slot."""
     task = RolloutTask(SpaceClimberScenario(), 15.0, Quality(abs, MASS))
     points = [{MASS: float(mass)} for mass in np.linspace(0.0, 20.0, each * slots)]
     with dask_cluster(workers=PROCESSES, threads=slots // PROCESSES) as cluster, Waiting(cluster.client) as executor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import resource
 import tempfile
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import HIGHER, LOWER, Benchmark, interleaved, ratio
+from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.recording import DrivenScenario, Log, Series
 from vtbdrake.rollout import RolloutTask, SerialExecutor
 from vtbdrake.rollout.executor import run_rollouts
@@ -29,7 +31,7 @@ TOLERANCE = 1e-9
 
 
 def compiled_testbed(repeats: int = 10) -> list[Benchmark]:
-    """Compare the rollouts per second of a compiled testbed with those of Drake, on one core each."""
+    """Compare the rollouts per second of a compiled testbed with Drake's, on one core each."""
     random = np.random.default_rng(0)
     cart_pole = CartPoleScenario().mental()
     plans = np.column_stack([np.zeros(32), random.uniform(-60.0, 60.0, (32, cart_pole.knots))])
@@ -75,6 +77,33 @@ def _compared(
         against="the same rollouts in Drake, on one core each",
         note=f"ms per rollout of {horizon:g} s: {1e3 * np.median(compiled) / count:.3g}, in Drake "
         f"{1e3 * np.median(by_drake) / count:.3g}; states {apart:.1g} apart; n = {repeats}",
+    )
+
+
+def seeds_varied(repeats: int = 10, rollouts: int = 400) -> Benchmark:
+    """Compare rollouts that differ in the seeds of all sensors with rollouts of one seed."""
+    errors = ErrorModel(noise=0.01, drift=0.01, dropout=0.1)
+    scenario = CartPoleScenario(position_errors=errors, velocity_errors=errors)
+    seeds = ["sim.sense.joint_position.seed", "sim.sense.joint_velocity.seed"]
+    compiled = scenario.build().compiled(
+        horizon=2.0, sample_period=0.05, parameters=seeds, outputs=[STATE], compile=True, check=False
+    )
+    same, begin = dict.fromkeys(seeds, np.zeros(rollouts)), itertools.count()
+
+    def of_many_seeds() -> None:
+        values = np.arange(rollouts, dtype=float) + rollouts * next(begin)  # New ones: the last call's are kept.
+        compiled(dict.fromkeys(seeds, values))
+
+    of_one, of_many = interleaved(partial(compiled, same), of_many_seeds, repeats=repeats)
+    return Benchmark(
+        name="seeds_varied",
+        value=ratio(of_many, of_one),
+        unit="1",
+        goal=1.5,
+        better=LOWER,
+        against="the same rollouts, all of one seed",
+        note=f"us per rollout of 2 s: {1e6 * np.median(of_many) / rollouts:.3g}, of one seed "
+        f"{1e6 * np.median(of_one) / rollouts:.3g}; n = {repeats}",
     )
 
 
@@ -159,7 +188,7 @@ def compile_time(repeats: int = 5) -> list[Benchmark]:
 
 
 def _processor_time(function: Callable[[], Any]) -> float:
-    """Return the seconds of processor time of a call, with that of the compiler."""
+    """Return the seconds of processor time of a call, the compiler's included."""
     kinds = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
     before = [resource.getrusage(kind) for kind in kinds]
     function()

@@ -37,10 +37,10 @@ FINE = SimulatorConfig(integration_scheme="cenic", max_step_size=0.045, accuracy
 
 
 def crater_decision(repeats: int = 3) -> list[Benchmark]:
-    """Wall time of a decision among 7 headings, over that of its bare rollouts on the same cores.
+    """Wall time of a decision among 7 headings, over the time of its bare rollouts on the same cores.
 
-    The rollouts are short, so that many repeats fit, and what the decision adds counts for more than in those of 300 s.
-    The bare rollouts begin at the same belief, in processes that get one after the other, as they become free; they
+    The rollouts are short, so that many repeats fit, and what the decision adds counts for more than in rollouts of 300
+    s. The bare rollouts begin at the same belief, in processes that get one after the other, as they become free; they
     are the same to the last bit, which is checked. All workers are warm: started, testbed built. Printed only: one
     decision of the whole horizon, beside one without ending rollouts that are stuck.
     """

@@ -45,8 +45,8 @@ def dask_cluster(*, workers: int = 2, threads: int = 1, allowed_failures: int = 
             command = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", *options]
             command += ["--scheduler-file", str(file)]
             stack.callback(_end, subprocess.Popen(command, env=environment, stdout=log, stderr=log))
-        client = stack.enter_context(Client(scheduler_file=str(file), timeout=60, set_as_default=False))
-        client.wait_for_workers(workers, timeout=60)
+        client = stack.enter_context(Client(scheduler_file=str(file), timeout=300, set_as_default=False))
+        client.wait_for_workers(workers, timeout=300)
         yield DaskCluster(client.scheduler.address, client, f"http://127.0.0.1:{port}")
 
 

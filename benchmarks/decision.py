@@ -31,7 +31,7 @@ def _begin_in_workers(reasoner: Reasoner, testbed: VirtualTestbed, context: Cont
 
 
 def decision_overhead_compiled(decisions: int = 200, rollouts: int = 32) -> Benchmark:
-    """Milliseconds of processor time that a decision of the cart-pole takes beyond its compiled rollouts.
+    """Processor time that a decision of the cart-pole takes beyond its compiled rollouts, over the time of these.
 
     All is done by the process that decides: the belief, the method, the rollouts of the mental testbed, the choice. The
     cart-pole decides again and again, a sample of its DPS later each time, and takes the plan.
@@ -58,14 +58,14 @@ def decision_overhead_compiled(decisions: int = 200, rollouts: int = 32) -> Benc
     ours = times[:, 0] - times[:, 1]
     return Benchmark(
         name="decision_overhead_compiled",
-        value=float(np.median(ours)),
-        unit="ms",
-        goal=1.0,
+        value=float(np.median(ours / times[:, 1])),
+        unit="1",
+        goal=0.5,
         better=LOWER,
         against="the compiled rollouts of the same decisions",
-        absolute="a tenth of the period of a reasoner at 100 Hz",
-        note=f"processor time, {spread(ours, unit='ms')}; a decision takes {np.median(times[:, 0]):.3g} ms, its "
-        f"{rollouts} rollouts of {scenario.duration:g} s {np.median(times[:, 1]):.2g} ms",
+        note=f"processor time beyond the rollouts {spread(ours, unit='ms')}; a decision takes "
+        f"{np.median(times[:, 0]):.3g} ms, its {rollouts} rollouts of {scenario.duration:g} s "
+        f"{np.median(times[:, 1]):.2g} ms",
     )
 
 
@@ -132,7 +132,7 @@ def decision_overhead(decisions: int = 100, horizon: float = 0.2) -> Benchmark:
         better=LOWER,
         against="the bare rollouts of the same decisions",
         note=f"the goal was 1 ms; "
-        f"{spread(ours, unit='ms')}, of which {1e3 * np.median(bare):.2f} ms without the method and its choice; "
+        f"{spread(ours, unit='ms')}, {1e3 * np.median(bare):.2f} ms of it without the method and its choice; "
         f"{1e3 * np.median(processor_times):.2f} ms of processor time in the process that decides; "
         f"a decision takes {1e3 * np.median(taken):.3g} ms, with {ROLLOUTS} rollouts of {horizon:g} s on "
         f"{WORKERS} workers, which take {np.median(rolled_out):.3g} ms; {costs}, "

@@ -6,8 +6,8 @@ import numpy as np
 import scipy.spatial
 
 from benchmarks.measure import LOWER, Benchmark, ratio, seconds
+from vtbdrake.common.validity_domain import DomainWatch, ValidityDomain
 from vtbdrake.testbed import DpsAlone
-from vtbdrake.validity_domain import DomainWatch, ValidityDomain
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.studies.validity import FEATURES
 

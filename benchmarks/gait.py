@@ -65,7 +65,7 @@ def time_to_target(seeds: int = 3) -> list[Benchmark]:
 
 
 def time_to_target_full(seeds: int = 10) -> list[Benchmark]:
-    """Wall time of differential evolution over that of a study, each until it reaches the target; medians over seeds.
+    """Wall time of differential evolution over a study's, each until it reaches the target; medians over seeds.
 
     The time of a search that does not reach the target is infinite.
 

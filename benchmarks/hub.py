@@ -22,7 +22,7 @@ from vtbdrake.lcm.hub import Hub
 ROOT = Path(__file__).resolve().parents[1]
 
 TIMEOUT_MS = 10_000
-SIZE = 200  # bytes, about those of a robot's state
+SIZE = 200  # bytes, about as in a robot's state
 
 # Another process that sends back what it gets.
 _ECHO = """
@@ -47,10 +47,10 @@ while data := client.recv(65536):
 
 
 def hub_round_trip_p50(messages: int = 4000, naive_messages: int = 40, rounds: int = 8) -> list[Benchmark]:
-    """Time from a client's publication to its arrival at the same client, through the hub, over that of a TCP echo.
+    """Time from a client's publication to its arrival at the same client, through the hub, over a TCP echo's.
 
     Medians, in turns. The client is an unmodified `lcm.LCM`; the echo is of bare bytes. Printed only: the time through
-    a naive hub, that to another client and back (twice through the hub), and that of this package's own client.
+    a naive hub, to another client and back (twice through the hub), and with this package's own client.
     """
     times: dict[str, list[float]] = {"hub": [], "tcp": [], "naive": [], "echo": [], "own": []}
     with Hub(port=0) as hub, _naive_hub() as naive_url, contextlib.ExitStack() as stack:

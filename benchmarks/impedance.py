@@ -1,7 +1,7 @@
 """Cartesian impedance control of a seven-joint arm with gravity compensation, once in numpy and once in CasADi.
 
-tau = J' (K e - D J v) + g(q), with e the position and orientation error of the hand. The arm's measures are those of
-a KUKA LBR iiwa, its masses rounded.
+tau = J' (K e - D J v) + g(q), with e the position and orientation error of the hand. The arm's measures come from a
+KUKA LBR iiwa, its masses rounded.
 """
 
 from __future__ import annotations

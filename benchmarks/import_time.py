@@ -22,7 +22,8 @@ EVERYTHING = "from vtbdrake import *"
 def import_time(repeats: int = 9, longer: int = 3, warm_up: int = 1) -> list[Benchmark]:
     """Time of ``import vtbdrake`` against ``import pydrake``.
 
-    Printed only: all public names against the parts of pydrake that they use, and against ``import pydrake.all``.
+    All public names are compared with the parts of pydrake that they use, and, without a goal, with
+    ``import pydrake.all``.
 
     Args:
         repeats: Repeats of the first, which takes the shortest time.
@@ -32,7 +33,7 @@ def import_time(repeats: int = 9, longer: int = 3, warm_up: int = 1) -> list[Ben
     parts = f"import {', '.join(pydrake_modules())}"
     comparisons = {
         "import_time": ("import vtbdrake", "import pydrake", 1.2, repeats),
-        "import_time_names": (EVERYTHING, parts, None, longer),
+        "import_time_names": (EVERYTHING, parts, 2.0, longer),
         "import_time_all": (EVERYTHING, "import pydrake.all", None, longer),
     }
     rows = []

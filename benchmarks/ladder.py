@@ -44,17 +44,17 @@ COMMANDED = "dps.joint_position"
 
 
 def rollout_ladder(repeats: int = 40) -> Benchmark:
-    """Processor time of a rollout of the cart-pole's mental copy over that of its plant in plain Drake."""
+    """Processor time of a rollout of the cart-pole's mental copy over its plant's in plain Drake."""
     return _ladder("rollout_ladder", _cart_pole(), seconds=SWING, repeats=repeats, goal=None)
 
 
 def rollout_ladder_climber(repeats: int = 20) -> Benchmark:
-    """Processor time of a rollout of the climber over that of its robot in plain Drake, with a recorded gait."""
+    """Processor time of a rollout of the climber over its robot's in plain Drake, with a recorded gait."""
     return _ladder("rollout_ladder_climber", _climber(), seconds=WALK, repeats=repeats, goal=1.45)
 
 
 def capture_ladder(repeats: int = 2) -> Benchmark:
-    """Processor time of a rollout of the satellite, with its pose sensor, over that of its plant alone in plain Drake.
+    """Processor time of a rollout of the satellite, with its pose sensor, over its plant's alone in plain Drake.
 
     The plant makes the same motion, in as many steps: its servos follow what the DPS commands in the testbed, sample by
     sample. What the testbed adds is its sensors and its DPS, eight systems in Python at 50 Hz, as they run aboard.
@@ -176,7 +176,7 @@ def _rollout(task: RolloutTask) -> Rung:
 
 
 def _ladder(name: str, rungs: dict[str, Rung], *, seconds: float, repeats: int, goal: float | None) -> Benchmark:
-    """Return the time of the rung that takes longest over that of the first."""
+    """Return the time of the rung that takes longest over the first one's."""
     times: dict[str, list[float]] = {rung: [] for rung in rungs}
     for _ in range(repeats):
         for rung, prepare in rungs.items():

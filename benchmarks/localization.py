@@ -25,8 +25,8 @@ def localization_update_p50(scans: int = 40, pairs: int = 20, starts: int = 10) 
     """CPU time from a scan of 20,000 points to the pose on an accurate map, and of starts without a guess.
 
     An update is the whole function of the slow part ``localizer``: de-skewing, ground, trunks, and the filter, with the
-    conversion of scan and memory from and to arrays. Beside it, that of a pair of images, and the matching of one scan
-    with maps of 1, 10 and 100 ha.
+    conversion of scan and memory from and to arrays. Beside it, the update by a pair of images, and the matching of one
+    scan with maps of 1, 10 and 100 ha.
     """
     # More than half of the rays go into the sky, or to where nothing returns.
     scanner = scanner_config()
@@ -71,7 +71,7 @@ def _update(name: str, scenario: ForestScenario, count: int, *, goal: float | No
 
 
 def _start(hectares: int, starts: int) -> Benchmark:
-    """CPU time of the matching of one scan with a map of so many hectares, which a row of stands of 1 ha makes."""
+    """CPU time of the matching of one scan with a map of ``hectares`` hectares, which a row of stands of 1 ha makes."""
     stands = [Stand(seed=k) for k in range(hectares)]
     side = stands[0].length
     maps = [map_landmarks(stand.map(ACCURATE)).seen_from([k * side, 0.0, 0.0]) for k, stand in enumerate(stands)]

@@ -115,14 +115,14 @@ def loop_misses(cycles: int = 6_000, rounds: int = 10) -> Benchmark:
 
 
 def cycle_overhead(cycles: int = 4000, rounds: int = 8) -> list[Benchmark]:
-    """Time of a cycle less that of the DPS's step, over that step, in the full loop, with the DPS alone. Medians.
+    """Time of a cycle less the time of the DPS's step, over that step, in the full loop, with the DPS alone. Medians.
 
     A cycle receives the last messages, checks them, steps the DPS (`Simulator.AdvanceTo` and its output), applies the
     guards, counts, and sends messages. Printed only: the time of a step of the full testbed with both switches on real
-    against that of the DPS alone, in turns.
+    against a step of the DPS alone, in turns.
 
     Most messages are received shortly before a cycle is due. That is part of the processor time of the loop's thread,
-    less that of the steps, in the note; so is the time for which it polls the clock.
+    less the time of the steps, in the note; so is the time for which it polls the clock.
     """
     overheads: list[float] = []
     worked = 0.0
@@ -180,7 +180,7 @@ def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
         granted = rig.granted()
     of, to = (float(np.percentile(late, 99)) for late in (theirs, ours))
     their_misses = sum(late >= PERIOD for late in theirs)
-    against = "ours; Drake's LCM systems with set_target_realtime_rate(1.0) over it"
+    against = "Drake's LCM systems at a real-time rate of 1, over ours"
     return [
         Benchmark(
             name="loop_against_drake",
@@ -188,7 +188,7 @@ def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
             unit="1",
             goal=None,
             better=HIGHER,
-            against=f"{against}, p99 from the deadline to the end",
+            against=f"{against}: p99 to the end",
             note=f"ours: {percentiles(histogram(ours))}; Drake: {percentiles(histogram(theirs))}; {granted}",
         ),
         Benchmark(
@@ -197,7 +197,7 @@ def loop_against_drake(cycles: int = 5000, rounds: int = 10) -> list[Benchmark]:
             unit="1",
             goal=None,
             better=HIGHER,
-            against=f"{against}, misses (+ 1)",
+            against=f"{against}: misses (+ 1)",
             note=f"in {cycles} cycles: ours {our_misses}, Drake {their_misses}",
         ),
     ]

@@ -24,7 +24,7 @@ from vtbdrake_diagrams.manipulator.arm import JOINTS
 from vtbdrake_diagrams.manipulator.safety import CONTINUITY
 
 HUB_PRIORITY, PRIORITY, MACHINE_PRIORITY = 72, 75, 70
-"""Of SCHED_FIFO; the second is the controller's, the bare C loop's and the echo's."""
+"""Priorities of SCHED_FIFO; the second is the controller's, the bare C loop's and the echo's."""
 
 # Hub and controller share a processor, so that a command need not wake up another one. The others are the machine's.
 CPUS = {max(os.sched_getaffinity(0))}

@@ -34,8 +34,8 @@ for _ in watch(sys.argv[1], sys.argv[2:], every=10):
 def recording_cost(cycles: int = 6_000, rounds: int = 12) -> list[Benchmark]:
     """Lateness of the 1 kHz loop's commands with a recorder and a live watch, over that without, in turns.
 
-    The lateness is the time from each deadline until the commands have left; the ratio is that of the 99th percentiles,
-    each the median of those of the rounds: one round that this computer disturbs does not decide. The watch is in
+    The lateness is the time from each deadline until the commands have left; the ratio compares the 99th percentiles,
+    each the median over the rounds: one round that this computer disturbs does not decide. The watch is in
     another process. Printed only: the same to the end of the cycle, when a cycle is recorded and the watched values are
     read, and the ratio of misses.
 
@@ -120,9 +120,9 @@ def _check_complete(recorder: Recorder, watcher: subprocess.Popen[bytes]) -> Non
 
 
 def replay_cost(simulated: float = 15.0, repeats: int = 5) -> Benchmark:
-    """Processor time of replaying the loop's log, over that of the DPS's own steps in a bare loop, in turns.
+    """Processor time of replaying the loop's log, over the time of the DPS's own steps in a bare loop, in turns.
 
-    The log is that of the arm on the machine, with the bridge's messages; the replay reads it, compares, and must be
+    The log comes from the arm on the machine, with the bridge's messages; the replay reads it, compares, and must be
     identical. The bare loop feeds the recorded values. Both build the DPS first.
 
     Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import textwrap
 import time
 from collections.abc import Callable, Sequence
 from datetime import date
@@ -47,6 +48,7 @@ BENCHMARKS: Registry = {
     "replay_cost": "benchmarks.recording:replay_cost",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
     "log_replay": "benchmarks.compiled_testbed:log_replay",
+    "seeds_varied": "benchmarks.compiled_testbed:seeds_varied",
     "calibration_time": "benchmarks.calibration:calibration_time",
     "domain_query": "benchmarks.domain_query:domain_query",
     "dps_alone_start": "benchmarks.dps_alone:dps_alone_start",
@@ -72,10 +74,16 @@ BENCHMARKS: Registry = {
     "click_p95": "benchmarks.view:click_p95",
     "preview_latency": "benchmarks.view:preview_latency",
     "localization_update_p50": "benchmarks.localization:localization_update_p50",
+    "growth_sweep": "benchmarks.growth:growth_sweep",
+    "growth_study_append": "benchmarks.growth:growth_study_append",
+    "growth_log_open": "benchmarks.growth:growth_log_open",
+    "growth_testbed_systems": "benchmarks.growth:growth_testbed_systems",
+    "growth_campaign": "benchmarks.growth:growth_campaign",
+    "bare_to_browser": "benchmarks.first_picture:bare_to_browser",
 }
 
-# They take minutes each; without names, the others run.
-ONLY_BY_NAME = ("calibration_time", "auto_regret_full", "time_to_target_full")
+# They take minutes each, or need a wheel; without names, the others run.
+ONLY_BY_NAME = ("calibration_time", "auto_regret_full", "time_to_target_full", "bare_to_browser")
 
 FIELDS = ("name", "value", "unit", "goal", "better", "holds", "against")
 
@@ -133,7 +141,11 @@ Measured on {date}: {machine}.
 def results_page(results: Sequence[Benchmark | Crash], *, only: Sequence[str] = ()) -> str:
     """Return docs/benchmarks.md: the table in Markdown, with machine and date."""
     rows = [_crash_row(r) if isinstance(r, Crash) else _row(r) for r in results]
-    notes = [f"* {r.name}: {_notes(r)}" for r in results if isinstance(r, Benchmark) and _notes(r)]
+    notes = [
+        textwrap.fill(f"* {r.name}: {_notes(r)}", 120, subsequent_indent="  ", break_on_hyphens=False)
+        for r in results
+        if isinstance(r, Benchmark) and _notes(r)
+    ]
     return _PAGE.format(
         by_name=", ".join(f"`{name}`" for name in ONLY_BY_NAME),
         only=f"; this one has only the rows of\n`ONLY='{' '.join(only)}'`" if only else "",

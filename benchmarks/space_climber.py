@@ -146,7 +146,7 @@ def rollout_rtf(repeats: int = 5) -> list[Benchmark]:
             goal=None,
             better=HIGHER,
             against=f"accuracy {REFERENCE.accuracy:g}: {reference:.4f} m walked in {HORIZON:g} s",
-            note=f"the goal was 70 times real time, now it is that of rollout_ladder_climber; "
+            note=f"the goal was 70 times real time, now see rollout_ladder_climber;  "
             f"{study}. First mass that tips: {ours:g} kg, with the reference {fine:g} kg",
         ),
         Benchmark(name="rollout_distance_error", value=error, unit="1", goal=0.01, better=LOWER,

@@ -21,16 +21,16 @@ from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.measure import LOWER, Benchmark, interleaved, interleaved_values, spread
 from tests.chromium import running_browser
-from tests.web.studies import cart_pole_problem
+from tests.web.study.studies import cart_pole_problem
 from vtbdrake.optimization.records import Outcome, Trial
-from vtbdrake.optimization.study_file import StudyFile
+from vtbdrake.optimization.study.study_file import StudyFile
 from vtbdrake.web import view_study
 
 ROOT = Path(__file__).resolve().parents[1]
 OPEN_GOAL, COST_GOAL = 1.0, 1.01
 TRIALS, FEW = 10_000, 10
 
-# A study of the climber's gait on all cores, which prints its CPU time, with that of its workers, and its wall time.
+# A study of the climber's gait on all cores, which prints its CPU time, its workers' included, and its wall time.
 _STUDY = """
 import resource, sys, time
 import vtbdrake as vtb
@@ -84,7 +84,7 @@ def study_page_open(repeats: int = 3) -> Benchmark:
 
 
 def study_page_cost(rollouts: int = 200, repeats: int = 2) -> Benchmark:
-    """CPU time of a study and of the process of its page, over that of the study, which runs on all cores.
+    """CPU time of a study and of the process of its page, over the study's alone, which runs on all cores.
 
     The page's process is ``vtbdrake study open``, with a client that reads as a browser does. Both are measured while
     the study runs. Printed beside it: the same study without a page. The CPU times of two equal studies differ by more
@@ -126,7 +126,7 @@ def study_page_cost(rollouts: int = 200, repeats: int = 2) -> Benchmark:
 
 
 def _recorded(path: Path, count: int) -> Path:
-    """Write a study of so many trials, as if it had run."""
+    """Write a study of ``count`` trials, as if it had run."""
     with cart_pole_problem().study(path, solver="random") as study:
         addresses = [parameter.address for parameter in study.parameters]
     file, rng = StudyFile(path), np.random.default_rng(0)

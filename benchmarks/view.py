@@ -18,11 +18,12 @@ from pydrake.systems.framework import Context
 
 from benchmarks.measure import HIGHER, LOWER, Benchmark, spread
 from benchmarks.view_client import CHROMIUM, STAMP, click, client, preview, read_states, read_states_in_chromium
-from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.web import View
-from vtbdrake.web.server import Server
-from vtbdrake.web.session import Session, SessionConfig
+from vtbdrake.web.live.player import Player, SessionConfig
+from vtbdrake.web.live.session_server import Server
+from vtbdrake.web.live.simulation_session import PlayedSession, SimulationSession
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
@@ -33,44 +34,56 @@ _LONGEST = 3600.0  # s, for a client
 _DELAY = 4  # frames by which each ghost is behind the one before
 
 
-class CrowdedSession(Session):
-    """A session with ghosts, which follow its robot one behind the other, and a stamp of the time of each frame."""
+class _CrowdedPlayer(Player):
+    """Draws ghosts, which follow the robot one behind the other, and a stamp of the time of each frame."""
 
-    def _build(self) -> None:
-        self._ghosts: list[tuple[Drawing, Context]] = []
+    def __init__(self, scenario: Scenario, config: SessionConfig) -> None:
+        super().__init__(scenario, config, None)
         self._past: deque[np.ndarray] = deque(maxlen=_DELAY * GHOSTS)
         self.drawn = 0
-        super()._build()
+        self._crowd: list[tuple[Drawing, Context]] = []
         for k in range(GHOSTS):
-            context = self._testbed.default_context()
-            path = f"crowd/{k}"
-            ghost = Drawing(self._meshcat, self._testbed, context, path, tint="#0072b2", parts=Parts.MOVING)
-            self._ghosts.append((ghost, context))
+            context = self.testbed.default_context()
+            path, meshcat = f"crowd/{k}", self.scene.meshcat
+            ghost = Drawing(meshcat, self.testbed, context, path, tint="#0072b2", parts=Parts.MOVING)
+            self._crowd.append((ghost, context))
 
-    def _draw(self) -> None:
-        super()._draw()
-        plant = self._testbed.plant
+    def _draw(self, now: float) -> tuple[str, ...]:
+        warnings = super()._draw(now)
+        plant = self.testbed.plant
         assert plant is not None
-        self._past.appendleft(plant.GetPositions(plant.GetMyContextFromRoot(self._context)))
-        for k, (ghost, context) in enumerate(self._ghosts):
+        self._past.appendleft(plant.GetPositions(plant.GetMyContextFromRoot(self.context)))
+        for k, (ghost, context) in enumerate(self._crowd):
             late = min(_DELAY * k, len(self._past) - 1)
             plant.SetPositions(plant.GetMyMutableContextFromRoot(context), self._past[late])
             ghost.pose(context)
-        self._meshcat.SetTransform(STAMP, RigidTransform([time.monotonic(), 0.0, 0.0]))
+        self.scene.meshcat.SetTransform(STAMP, RigidTransform([time.monotonic(), 0.0, 0.0]))
         self.drawn += 1
+        return warnings
+
+
+class CrowdedSession(PlayedSession[_CrowdedPlayer]):
+    """A simulation with ghosts and stamps."""
+
+    def __init__(self, scenario: Scenario, *, config: SessionConfig | None = None) -> None:
+        super().__init__(scenario, config=config, problem=None)
+
+    def _make_stage(self) -> _CrowdedPlayer:
+        return _CrowdedPlayer(self.scenario, self.config)
+
+    @property
+    def drawn(self) -> int:
+        """Return the number of frames that were drawn."""
+        return self._stage.drawn
 
     def processor_time(self) -> float:
         """Return the processor time of the thread that simulates and draws, in s."""
         assert self._thread.ident is not None
         return time.clock_gettime(time.pthread_getcpuclockid(self._thread.ident))
 
-    def _drop(self) -> None:
-        self._ghosts.clear()  # Meshcat ends in this thread.
-        super()._drop()
-
 
 @contextmanager
-def _served(session: Session) -> Iterator[View]:
+def _served(session: PlayedSession[Any]) -> Iterator[View[PlayedSession[Any]]]:
     with View(session, Server(session)) as running:
         yield running
 
@@ -187,7 +200,7 @@ def click_p95(clicks: int = 200) -> Benchmark:
     """
     with (
         _rollouts_on_all_cores() as count,
-        _served(Session(CartPoleScenario())) as running,
+        _served(SimulationSession(CartPoleScenario())) as running,
         client(click, running.url, ANGLE, clicks, 0.02) as result,
     ):
         times = np.array(result())
@@ -197,7 +210,10 @@ def click_p95(clicks: int = 200) -> Benchmark:
 
 def preview_latency(drags: int = 60) -> Benchmark:
     """Measure the time from a draft at a slider to the first pose of its ghost at the client, of the cart-pole."""
-    with _served(Session(CartPoleScenario())) as running, client(preview, running.url, ANGLE, drags, 0.1) as result:
+    with (
+        _served(SimulationSession(CartPoleScenario())) as running,
+        client(preview, running.url, ANGLE, drags, 0.1) as result,
+    ):
         times = np.array(result())
     return _latency("preview_latency", times, goal=0.25, against="")
 

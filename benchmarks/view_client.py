@@ -10,11 +10,12 @@ from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context
 from typing import Any, TypeVar
-from urllib.parse import parse_qs, urlsplit
 
 import msgpack  # type: ignore[import-untyped]
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
+
+from tests.web.serving.entrance import entered
 
 STAMP = "/drake/stamp"
 """A path whose transform has the time on the monotonic clock, in s, at which the state was drawn."""
@@ -32,17 +33,8 @@ def client(function: Callable[..., _T], *arguments: Any):  # type: ignore[no-unt
 
 
 def open_socket(url: str, path: str = "session") -> ClientConnection:
-    """Connect as a page does: to the session, or with an empty path to Meshcat."""
-    parts = urlsplit(url)
-    token = parse_qs(parts.query)["token"][0]
-    headers = {"Cookie": f"vtbdrake-{parts.port}={token}"}
-    return connect(
-        f"ws://{parts.netloc}/{path}",
-        additional_headers=headers,
-        max_size=None,
-        open_timeout=_PATIENCE,
-        compression=None,
-    )
+    """Connect as a page at this address, see `entered`, does: to the session, or with an empty path to Meshcat."""
+    return connect(f"{url.replace('http', 'ws', 1)}{path}", max_size=None, open_timeout=_PATIENCE, compression=None)
 
 
 def read_states(url: str, seconds: float) -> dict[str, Any]:
@@ -50,6 +42,7 @@ def read_states(url: str, seconds: float) -> dict[str, Any]:
     arrivals: list[float] = []
     ages: list[float] = []
     counts = {"messages": 0, "frames": 0}
+    url = entered(url)
     threading.Thread(target=_read_frames, args=(url, counts), daemon=True).start()
     with open_socket(url, "") as meshcat:
         end = time.monotonic() + seconds
@@ -125,7 +118,7 @@ class _Steering:
 
 def click(url: str, address: str, count: int, pause: float) -> list[float]:
     """Set a variable again and again, with a pause in s; return the times in s until each was confirmed."""
-    page = _Steering(url)
+    page = _Steering(entered(url))
     page.command("play")
     times = []
     for k in range(count):
@@ -136,6 +129,7 @@ def click(url: str, address: str, count: int, pause: float) -> list[float]:
 
 def preview(url: str, address: str, count: int, pause: float) -> list[float]:
     """Drag a slider again and again; return the times in s from each draft to the first pose of its ghost."""
+    url = entered(url)
     page, shown = _Steering(url), threading.Event()
 
     def watch() -> None:

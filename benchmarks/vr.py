@@ -7,24 +7,22 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from http.cookiejar import CookieJar
 from math import inf
 from typing import Any
-from urllib.parse import urlsplit
 
 import lcm
 import numpy as np
 from drake import lcmt_scope
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from benchmarks.loop_rig import HUB_PRIORITY, MACHINE_PRIORITY
 from benchmarks.measure import LOWER, Benchmark
+from benchmarks.view_client import open_socket
+from tests.web.serving.entrance import entered
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.monitoring.live.client import LiveClient
@@ -42,7 +40,7 @@ CHANNEL = "ARM_HAND"
 
 @dataclass
 class QuickArm(ManipulatorScenario):
-    """An arm whose commanded pose is that of the hand at once, so that each pose is told from the one before."""
+    """An arm whose commanded pose is the hand's at once, so that each pose is told from the one before."""
 
     led_by_hand: bool = True
     release_time: float = 0.1
@@ -92,11 +90,7 @@ class Headset:
     """A page that sends poses."""
 
     def __init__(self, url: str, stack: ExitStack) -> None:
-        cookies = CookieJar()
-        urllib.request.build_opener(urllib.request.HTTPCookieProcessor(cookies)).open(url, timeout=PATIENCE).close()
-        header = "; ".join(f"{cookie.name}={cookie.value}" for cookie in cookies)
-        address = f"ws://{urlsplit(url).netloc}/vr"
-        self._socket = stack.enter_context(connect(address, additional_headers={"Cookie": header}))
+        self._socket = stack.enter_context(open_socket(entered(url), "vr"))
         self.close = self._socket.close
 
     def send(self, message: dict[str, Any]) -> None:
@@ -165,7 +159,7 @@ def _loop(url: str) -> Iterator[None]:
 
 
 def vr_pose_to_command() -> list[Benchmark]:
-    """Time from a pose that a headset's page sends to its command u on the bus of the loop, and to that of a release.
+    """Time from a pose that a headset's page sends to its command u on the loop's bus, and to a release's command.
 
     The page is a client without a browser; the server shows the loop, which controls a machine process. The loop takes
     a command of the bus in its next period. If the loop latches on a busy computer, all is measured once more.

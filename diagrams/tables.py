@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.state.archive import whole_file
 
 # Name of a row -> the function that produces it: itself, or as "package.module:function", imported when it is its turn.

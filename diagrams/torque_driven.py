@@ -10,9 +10,9 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough, ZeroOrderHold
 
+from vtbdrake.common.settings import setting
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import ErrorModel, JointEncoders
-from vtbdrake.settings import setting
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 if TYPE_CHECKING:

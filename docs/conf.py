@@ -1,7 +1,7 @@
 """The documentation site: the Markdown pages as they are in the repository, and a reference from the docstrings.
 
 The source folder is the repository's root, so that links to ARCHITECTURE.md and CHANGELOG.md lead to the same pages
-here and on the forge. The links of docs/index.md become, by heading, the navigation of the site.
+here and on the forge. The lists of docs/index.md become, by heading, cards and the navigation of the site.
 """
 
 import ast
@@ -12,6 +12,8 @@ from importlib import import_module
 from importlib.metadata import version as version_of
 from inspect import getdoc
 from pathlib import Path
+from pkgutil import walk_packages
+from textwrap import dedent
 from typing import Any
 
 import yaml
@@ -21,15 +23,22 @@ from sphinx.domains.python._object import PyObject
 from sphinx.util.docutils import SphinxDirective
 
 import vtbdrake
-from vtbdrake.settings import declared_settings
+from vtbdrake.common.settings import declared_settings
 
 project = "vtbdrake"
 author = copyright = "The vtbdrake authors"
 version = release = version_of("vtbdrake")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_nb",  # with myst_parser
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
 root_doc = "docs/index"
-include_patterns = ["ARCHITECTURE.md", "CHANGELOG.md", "docs/**"]
+include_patterns = ["ARCHITECTURE.md", "CHANGELOG.md", "docs/**", "notebooks/*.ipynb"]
 exclude_patterns = [
     ".*",
     "venv*",
@@ -39,7 +48,6 @@ exclude_patterns = [
     "vtbdrake*",
     "diagrams",
     "benchmarks",
-    "notebooks",
     "tests",
     "tools",
 ]
@@ -52,7 +60,10 @@ html_static_path = ["_static"]
 html_css_files = ["wide.css"]
 html_copy_source = False
 
+nb_execution_mode = "off"  # notebooks show the outputs that tools/run_notebooks.py has stored in them
 myst_heading_anchors = 3
+myst_enable_extensions = ["colon_fence"]
+copybutton_exclude = ".linenos, .gp, .go"
 default_role = "py:obj"  # single backticks in docstrings
 highlight_language = "text"  # equations
 add_module_names = False
@@ -62,11 +73,30 @@ maximum_signature_line_length = 100
 napoleon_use_ivar = True
 
 API = Path(__file__).parent / "_api"  # written by each build
-# The command line, and the projects that it writes, have pages of their own; messages are made by lcm-gen; the names of
-# `live` are those of its parent.
-WITHOUT_PAGE = ("vtbdrake.cli", "vtbdrake.project", "vtbdrake.recording.lcm_types", "vtbdrake.monitoring.live")
+# The command line, and the projects that it writes, have pages of their own; messages are made by lcm-gen; the names
+# of `live` and of the folders of `web` are described with their parent.
+WITHOUT_PAGE = (
+    "vtbdrake.cli",
+    "vtbdrake.common",
+    "vtbdrake.project",
+    "vtbdrake.lcm.lcm_types",
+    "vtbdrake.recording.lcm_types",
+    "vtbdrake.monitoring.live",
+    "vtbdrake.web.",
+)
 # Modules beside the packages that users import from.
-MODULES = ("vtbdrake.deployment", "vtbdrake.settings", "vtbdrake.scan", "vtbdrake.spline")
+MODULES = (
+    "vtbdrake.common.settings",
+    "vtbdrake.common.scan",
+    "vtbdrake.common.spline",
+)
+
+# Classes with a page of their own.
+CLASSES = ("vtbdrake.testbed.VirtualTestbedBuilder",)
+# The building blocks that are no components.
+BLOCKS = ("vtbdrake.testbed.slow_part", "vtbdrake.reasoning.onboard")
+BLOCKS_PAGE = "docs/building_blocks"
+BLOCKS_PLACE = "<!-- building blocks: on the site, the ports of each follow here -->"
 
 
 class PydrakeSystem(SphinxDirective):
@@ -123,13 +153,97 @@ def page_of_package(name: str, described: set[Any]) -> list[str]:
     return lines
 
 
+def blocks_by_kind() -> dict[str, dict[str, type]]:
+    """Return by folder and name the public systems whose docstrings declare their ports."""
+    components = import_module("vtbdrake.components")
+    names = [info.name for info in walk_packages(components.__path__, f"{components.__name__}.")]
+    kinds: dict[str, dict[str, type]] = {}
+    for name in [*sorted(names), *BLOCKS]:
+        folder = name.split(".")[2] if name.count(".") > 2 and name not in BLOCKS else "further"
+        for value in vars(import_module(name)).values():
+            is_own = isinstance(value, type) and value.__module__ == name and not value.__name__.startswith("_")
+            if is_own and ".. pydrake_system::" in (value.__doc__ or ""):
+                public = value.__name__.partition("_\N{MATHEMATICAL BOLD SCRIPT CAPITAL T}")[0]  # of a class template
+                systems = kinds.setdefault(folder.replace("_", " ").capitalize(), {})
+                systems.setdefault(public, value)
+    return dict(sorted(kinds.items(), key=lambda kind: (kind[0] == "Further", kind[0] != "Sensors")))
+
+
+def declared_ports(value: type) -> list[tuple[str, str, str]]:
+    """Return (input or output, name, remark) of the ports that the docstring of a system declares."""
+    text = re.search(r"\.\. pydrake_system::\n\n((?: +.*\n|\n)+?)(?=\n\S|\Z)", getdoc(value) or "")
+    declared = yaml.safe_load(dedent(text[1])) if text else {}
+    ports = []
+    for direction in ("input", "output"):
+        for line in declared.get(f"{direction}_ports") or ():
+            # YAML takes a line with a colon for a mapping.
+            text = ": ".join(next(iter(line.items()))) if isinstance(line, dict) else str(line)
+            name, remark = re.match(r"(<[^>]*>|\S+)\s*(.*)", text).groups()  # type: ignore[union-attr]
+            ports.append((direction, name, remark))
+    return ports
+
+
+def add_building_blocks(app: Sphinx, page: str, source: list[str]) -> None:
+    """Put a table of the ports of each building block into its page."""
+    if page != BLOCKS_PAGE:
+        return
+    lines = []
+    for kind, values in blocks_by_kind().items():
+        lines += [f"### {kind}", ""]
+        for public, value in values.items():
+            summary = (getdoc(value) or "").partition("\n\n")[0].replace("\n", " ").replace("`", "")
+            lines += [f"#### {public}", "", f"{{py:obj}}`{value.__module__}.{public}`: {summary}", ""]
+            lines += ["| port | | |", "|---|---|---|"]
+            lines += [f"| `{name}` | {direction} | {remark} |" for direction, name, remark in declared_ports(value)]
+            lines += [""]
+    source[0] = source[0].replace(BLOCKS_PLACE, "\n".join(lines))
+
+
+def cards(text: str) -> str:
+    """Return a list of links, one per entry, as a grid of cards; entries that are no link with a text stay a list."""
+    entries = re.findall(r"^\* (.*(?:\n  .*)*)", text, re.MULTILINE)
+    shown, others = [], []
+    for entry in entries:
+        link = re.match(r"\[((?:[^\]]|\n)+)\]\(([^)#:]+)\.(?:md|ipynb)\)[:,]?\s*((?:.|\n)*)", entry)
+        if link is None:
+            others.append(f"* {entry}")
+            continue
+        title, page, rest = (re.sub(r"\s+", " ", part) for part in link.groups())
+        rest = re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", rest)
+        shown += [f":::{{grid-item-card}} {title}", f":link: {page}", ":link-type: doc", "", rest, ":::", ""]
+    grid = ["::::{grid} 1 2 3 3", ":gutter: 2", "", *shown, "::::"] if shown else []
+    return "\n".join(["", *grid, "", *others, ""])
+
+
+def write_llms_txt(app: Sphinx, error: Exception | None) -> None:
+    """Write llms.txt: the pages of the site with their titles, for programs that read."""
+    if error is not None or app.builder.format != "html":
+        return
+    lines = ["# vtbdrake", "", "> Virtual testbeds on Drake: develop, optimize, reason and control with one model.", ""]
+    for title, names in (("Pages", "docs/"), ("Reference", "docs/_api/")):
+        lines += [f"## {title}", ""]
+        for page in sorted(app.env.found_docs):
+            if page.startswith(names) and page.startswith("docs/_api/") == (title == "Reference"):
+                lines.append(f"- [{app.env.titles[page].astext()}]({page}.html)")
+        lines.append("")
+    Path(app.outdir, "llms.txt").write_text("\n".join(lines), "utf-8")
+
+
+def page_of_class(name: str, described: set[Any]) -> list[str]:
+    """Return the page of a class, which no other page describes."""
+    module, _, class_name = name.rpartition(".")
+    described.add(getattr(import_module(module), class_name))
+    return [*underlined(class_name), f".. autoclass:: {name}", "   :members:", ""]
+
+
 def write_reference() -> None:
-    """Write the pages of the reference where they have changed, and remove those of packages that are gone."""
+    """Write the pages of the reference where they have changed, and remove the pages of packages that are gone."""
     root = Path(vtbdrake.__file__).parents[1]
     folders = [path.parent.relative_to(root) for path in sorted((root / "vtbdrake").rglob("*/__init__.py"))]
     names = [name for name in map(".".join, (folder.parts for folder in folders)) if not name.startswith(WITHOUT_PAGE)]
     described: set[Any] = set()
-    pages = {"vtbdrake": page_of_names()} | {name: page_of_package(name, described) for name in [*names, *MODULES]}
+    pages = {"vtbdrake": page_of_names()} | {name: page_of_class(name, described) for name in CLASSES}
+    pages |= {name: page_of_package(name, described) for name in [*names, *MODULES]}
     API.mkdir(exist_ok=True)
     for path in API.glob("*.rst"):
         if path.stem not in pages:
@@ -150,13 +264,16 @@ def import_types() -> None:
 
 
 def add_navigation(app: Sphinx, page: str, source: list[str]) -> None:
-    """Add a table of contents, which only the sidebar shows, for each heading of the first page."""
+    """Make cards of the lists of the first page, and a table of contents, which only the sidebar shows, per heading."""
     if page != root_doc:
         return
     tables = {}
-    for section in re.split(r"^## ", source[0], flags=re.MULTILINE)[1:]:
+    begin, *sections = re.split(r"^## ", source[0], flags=re.MULTILINE)
+    source[0] = begin
+    for section in sections:
         caption, _, text = section.partition("\n")
-        tables[caption] = list(dict.fromkeys(re.findall(r"\]\(([^)#:]+)\.md\)", text)))
+        source[0] += f"## {caption}\n{cards(text)}\n"
+        tables[caption] = list(dict.fromkeys(re.findall(r"\]\(([^)#:]+)\.(?:md|ipynb)\)", text)))
     pages = sorted(path.stem for path in API.glob("*.rst"))
     tables["API reference"] = [f"{name.removeprefix('vtbdrake.')} <_api/{name}>" for name in pages]
     for caption, entries in tables.items():
@@ -217,6 +334,8 @@ def setup(app: Sphinx) -> None:
     app.add_directive("pydrake_system", PydrakeSystem)
     app.connect("env-get-outdated", lambda *_: [root_doc])  # its navigation depends on the reference
     app.connect("source-read", add_navigation)
+    app.connect("source-read", add_building_blocks)
+    app.connect("build-finished", write_llms_txt)
     app.connect("autodoc-process-docstring", mend_docstring, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", mend_signature)
     app.connect("autodoc-skip-member", is_field_of_named_tuple)

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # How long an example takes depends on what else the computer does.
 settings.register_profile("patient", deadline=None)
+settings.register_profile("patient and quick", deadline=None, max_examples=25)
 settings.load_profile("patient")
 
 # What a shell starts in the background ignores Ctrl-C, and so would all that the tests interrupt.
@@ -28,14 +30,24 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Try fewer examples where the slow tests are left out, unless a test says how many it needs."""
+    if config.option.markexpr == "not slow":
+        settings.load_profile("patient and quick")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Collect without the garbage collector. Later it leaves out what is there now, half a million objects."""
+    """Collect without the garbage collector. Later it leaves out what is there now, half a million objects.
+
+    It then looks at the rest a tenth as often as by default.
+    """
     gc.disable()
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(7_000, 10, 10)
         gc.enable()
 
 
@@ -53,6 +65,23 @@ def memory_given_back() -> Iterator[None]:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+LONGEST_FILE = 20.0
+"""Seconds that the tests of one file should take at most: a worker runs a file as a whole."""
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """List the files whose tests took long, set-up and tear-down included."""
+    seconds = Counter[str]()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if isinstance(report, pytest.TestReport):
+                seconds[report.location[0]] += report.duration
+    if long := [(name, total) for name, total in seconds.most_common() if total > LONGEST_FILE]:
+        terminalreporter.section(f"files that took more than {LONGEST_FILE:g} s")
+        for name, total in long:
+            terminalreporter.write_line(f"{total:7.1f} s {name}")
+
+
 # Folders (and the modules in them, all of a kind) that need one Python only; of the forest, its scenario passes the
 # checks on both. A single module says so by `pytestmark = pytest.mark.one_python`, a single test by the marker itself.
 ONE_PYTHON = ("cli", "diagrams/forest", "notebooks", "visualization")
@@ -60,9 +89,17 @@ ONE_PYTHON = ("cli", "diagrams/forest", "notebooks", "visualization")
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     folders = [Path(__file__).parent / name for name in ONE_PYTHON]
+    files = {item.path for item in items}
+    one_python = {path for path in files if any(folder in path.parents for folder in folders)}
+    quick: set[str] = set()  # Tests that have shown a quick case.
     for item in items:
-        if any(folder in item.path.parents for folder in folders):
+        if item.path in one_python:
             item.add_marker(pytest.mark.one_python)
+        if item.get_closest_marker("slow_cases") and not item.get_closest_marker("slow"):
+            name = item.nodeid.partition("[")[0]
+            if name in quick:
+                item.add_marker(pytest.mark.slow)
+            quick.add(name)
 
 
 # Message types of a user, made by lcm-gen.

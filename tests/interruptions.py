@@ -55,7 +55,7 @@ def interrupt(operation: Callable[[], Any], *modules: ModuleType, at: Place) -> 
 
     def press(place: Place) -> None:
         if place == at:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)  # It is postponed where the code postpones it.
 
     with hanging_fails(at), _traced(modules, press):
         try:

@@ -5,11 +5,15 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
+import click
 import pytest
 
 import vtbdrake
+from vtbdrake.cli import main
 
 pytestmark = pytest.mark.one_python
 
@@ -17,10 +21,15 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOTS = [ROOT, ROOT / "vtbdrake"]
 AT_THE_ROOT = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CHANGELOG.md")]
 PAGES = [*AT_THE_ROOT, *sorted((ROOT / "docs").rglob("*.md"))]
-# The same programs with fewer rollouts.
+# Pages at the root that are no part of the site.
+BESIDE_THE_SITE = [ROOT / name for name in ("AGENTS.md", "CONTRIBUTING.md", "SECURITY.md")]
+# The same programs with fewer and shorter rollouts.
 SHORTER = {
-    "crater": {"horizon=6.0": "horizon=6.0, candidates=3, executor='serial'"},
-    "studies": {"run(rollouts=40)": "run(rollouts=16)", "rollouts=60": "rollouts=24"},
+    "campaigns": {"horizon: 4.0": "horizon: 1.0"},
+    "crater": {"horizon=6.0": "horizon=2.0, candidates=3, executor='serial'"},
+    "machine": {"seconds=2.0": "seconds=0.5"},
+    "studies": {"run(rollouts=40)": "run(rollouts=16)", "rollouts=60": "rollouts=24", "horizon=5.0": "horizon=2.0"},
+    "tutorial": {"horizon=3.0, threshold": "horizon=1.0, threshold"},
 }
 
 
@@ -37,14 +46,29 @@ def program(page: Path) -> str:
     return "\n".join(kept)
 
 
-WITH_PROGRAM = [
-    pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem == "README" else [])
-    for page in PAGES
-    if program(page).strip()
-]
+# One is run in the quick suite, too: it needs no worker processes.
+QUICK = "recordings"
+WITH_PROGRAM = [page for page in PAGES if program(page).strip()]
 
 
-@pytest.mark.parametrize("page", WITH_PROGRAM)
+@pytest.mark.parametrize("page", WITH_PROGRAM, ids=lambda page: page.stem)
+def test_program_of_a_page_names_what_is_there(page: Path) -> None:
+    """Names that a program imports of the package and the testbeds exist; a quick test beside the one that runs it."""
+    for node in ast.walk(ast.parse(program(page))):
+        if isinstance(node, ast.Import):
+            assert all(find_spec(name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module.startswith("vtbdrake"):
+            module = import_module(node.module)
+            missing = [name.name for name in node.names if not hasattr(module, name.name)]
+            assert not [name for name in missing if not find_spec(f"{node.module}.{name}")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[] if page.stem == QUICK else [pytest.mark.slow]) for page in WITH_PROGRAM],
+    ids=lambda page: page.stem,
+)
 def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
     script = tmp_path / f"{page.stem}.py"
     text = program(page)
@@ -68,7 +92,14 @@ def test_program_of_a_page_runs(page: Path, tmp_path: Path) -> None:
         assert block in done.stdout
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_for_coding_assistants_is_short_and_names_commands() -> None:
+    text = (ROOT / "AGENTS.md").read_text("utf-8")
+    commands = re.findall(r"(?:^    |`)vtbdrake ([a-z]+)\b", text, re.MULTILINE)
+    assert len(text.splitlines()) <= 60 and len(re.findall(r"^    vtbdrake .* --json$", text, re.MULTILINE)) == 5
+    assert len(commands) > 7 and set(commands) <= set(main.list_commands(click.Context(main)))
+
+
+@pytest.mark.parametrize("page", [*PAGES, *BESIDE_THE_SITE], ids=lambda page: page.stem)
 def test_links_and_paths_of_a_page_exist(page: Path) -> None:
     text = page.read_text("utf-8")
     links = [link for link in re.findall(r"\]\(([^)#]+)", text) if "://" not in link]
@@ -80,8 +111,37 @@ def test_links_and_paths_of_a_page_exist(page: Path) -> None:
 
 def test_index_lists_every_page() -> None:
     index = ROOT / "docs" / "index.md"
-    links = {(index.parent / link).resolve() for link in re.findall(r"\]\(([^)#:]+\.md)\)", index.read_text("utf-8"))}
-    assert links == {*PAGES} - {index, ROOT / "README.md"}
+    found = re.findall(r"\]\(([^)#:]+\.(?:md|ipynb))\)", index.read_text("utf-8"))
+    links = {(index.parent / link).resolve() for link in found}
+    assert links == {*PAGES, *(ROOT / "notebooks").glob("*.ipynb")} - {index, ROOT / "README.md"}
+
+
+def lines_outside_code(page: Path) -> list[tuple[int, str]]:
+    """Return the lines of a page outside of code blocks, with their numbers, which begin with 1."""
+    lines, inside = [], False
+    for number, line in enumerate(page.read_text("utf-8").split("\n"), start=1):
+        if re.match(r"\s*(?:[*-] |\d+\. )?```", line):
+            inside = not inside
+        elif not inside:
+            lines.append((number, line))
+    return lines
+
+
+def cells(row: str) -> list[str]:
+    """Return the texts that a reader sees in a row of a table: without link targets and backticks."""
+    texts = [re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", cell) for cell in re.split(r"(?<!\\)\|", row.strip())[1:-1]]
+    return [text.replace("`", "").strip() for text in texts]
+
+
+@pytest.mark.parametrize("page", [*PAGES, *BESIDE_THE_SITE], ids=lambda page: page.stem)
+def test_page_has_short_lines_and_short_cells(page: Path) -> None:
+    """Lines of at most 120 columns outside code and tables, unless a link is longer; table cells of at most 80."""
+    lines = lines_outside_code(page)
+    rows = [(number, line) for number, line in lines if line.lstrip().startswith("|")]
+    too_long = [(n, len(line)) for n, line in lines if len(line) > 120 and (n, line) not in rows and "](" not in line]
+    assert not too_long, f"{page.name} has lines above 120 columns: {too_long}"
+    too_wide = [(n, cell) for n, row in rows for cell in cells(row) if len(cell) > 80]
+    assert not too_wide, f"{page.name} has table cells above 80 characters, make the table a list: {too_wide}"
 
 
 def texts_of_the_package() -> list[str]:
@@ -97,9 +157,10 @@ def texts_of_the_package() -> list[str]:
     return texts
 
 
+@pytest.mark.slow
 def test_quoted_errors_are_those_of_the_code() -> None:
     texts = "\n".join(texts_of_the_package())
-    quoted = re.findall(r"^\| `(.*?)` \|", (ROOT / "docs" / "errors.md").read_text("utf-8"), re.MULTILINE)
+    quoted = re.findall(r"^\* `(.*?)`", (ROOT / "docs" / "errors.md").read_text("utf-8"), re.MULTILINE)
     assert len(quoted) > 30
     patterns = [".*".join(map(re.escape, message.strip("… ").split("…"))) for message in quoted]
     assert not [message for message, pattern in zip(quoted, patterns, strict=True) if not re.search(pattern, texts)]

@@ -1,18 +1,27 @@
 """Imports inside vtbdrake point one way, and importing it stays light."""
 
 import ast
-import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.one_python
+from tools.house import (
+    MAX_CIRCLE,
+    ROOT,
+    circles,
+    import_graph,
+    import_lines,
+    imports,
+    layer_graph,
+    module_name,
+    source_files,
+    syntax_trees,
+    within_layers,
+)
+from vtbdrake import upper_layers
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "vtbdrake"
+pytestmark = pytest.mark.one_python
 
 # What each layer may import besides itself:
 # state <- testbed <- rollout <- optimization <- reasoning; testbed <- control <- lcm <- recording, monitoring, machine.
@@ -28,7 +37,7 @@ BELOW: dict[str, set[str]] = {
     "monitoring": {"state", "testbed", "control", "lcm"},
     "machine": {"state", "testbed", "control", "lcm"},
     "deployment": {"state", "testbed", "control", "lcm", "recording", "monitoring"},
-    "station": {"state", "testbed", "control", "lcm", "monitoring", "deployment"},
+    "station": {"state", "testbed", "components", "control", "lcm", "monitoring", "deployment"},
     "components": {"state"},
     "compiled": {"state", "testbed", "components"},
     "calibration": {
@@ -44,118 +53,67 @@ BELOW: dict[str, set[str]] = {
         "machine",
     },
 }
-# Modules that need neither Drake nor the layers: how arguments are checked, how other processes start, how objects
-# travel to them, when the names of a package are imported, what a cache keeps, arrays, splines, laser scans, and where
-# a model is valid.
+BELOW["drake_workarounds"] = {"state"}
 for _layers in BELOW.values():
-    _layers.update({"argument_checks", "arrays", "child_process", "closing", "failures", "frames", "lazy"})
-    _layers.update({"lru", "pickling", "scan", "settings", "spline", "streams", "validity_domain"})
-BELOW["spline"] = {"argument_checks", "arrays", "spline_kernel"}
-BELOW["spline_kernel"] = {"state"}
-BELOW["scan"] = {"arrays"}
-BELOW["arrays"] = set()
-BELOW["closing"] = set()
-BELOW["validity_domain"] = {"argument_checks", "arrays"}
-BELOW["pickling"] = set()
-BELOW["streams"] = set()
-BELOW["frames"] = {"streams"}
-BELOW["child_process"] = {"pickling"}
-BELOW["argument_checks"] = set()
-BELOW["settings"] = set()
-BELOW["failures"] = set()
-BELOW["lazy"] = set()
-BELOW["lru"] = set()
-BELOW["drake_version"] = set()
-BELOW["state"].add("drake_version")
-BELOW["child_process"].add("drake_version")
-BELOW["project"] = {"state", "testbed", "components", "station", "failures"}
+    _layers |= {"common", "drake_workarounds"}
+BELOW["state"] = {"common"}
+BELOW["common"] = set()
+BELOW["project"] = {"state", "testbed", "components", "station", "common"}
 BELOW["visualization"] = set(BELOW)
-BELOW["web"] = set(BELOW)
+BELOW["campaigns"] = {"state", "testbed", "rollout", "optimization", "visualization", "common"}
 BELOW["testing"] = set(BELOW)
+BELOW["web"] = set(BELOW)
 BELOW["cli"] = set(BELOW)
 BELOW["__main__"] = {"cli"}
 TOP = {"visualization", "web", "testing", "cli"}
 
-# A method may delegate to an upper layer, which it imports when it is called: results plot and show themselves by
-# `visualization`, a scenario is deployed by `deployment`, what was calibrated is drawn by `calibration`; a testbed is
-# compiled by `compiled`, and shown by `web`, as a study is; `web` lets `testing` save a course as a test.
-MAY_DELEGATE: dict[str, set[str]] = {
-    "testbed": {"calibration", "compiled", "deployment", "visualization", "web"},
-    "web": {"testing"},
-    "optimization": {"visualization", "web"},
-    **{layer: {"visualization"} for layer in ("rollout", "reasoning", "calibration")},
-}
+# Methods of these find the layer above through the table `vtbdrake/upper_layers.pyi`.
+DELEGATE = {"testbed", "optimization", "reasoning", "calibration"}
+TABLE = "upper_layers"
 
 OUTSIDE = {"vtbdrake_diagrams", "diagrams", "benchmarks", "tests"}
 
 HEAVY = {"matplotlib.pyplot", "pandas", "casadi", "lcm", "tqdm.notebook", "cv2", "optuna", "distributed", "scipy.stats"}
 
 
-def imported_modules(tree: ast.Module, module: str, is_package: bool) -> Iterator[tuple[int, str, bool]]:
-    """Line, dotted name and whether it waits (for a call, or for ever: a type checker) of every import in `tree`."""
-
-    def visit(node: ast.AST, lazy: bool) -> Iterator[tuple[int, str, bool]]:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.Import):
-                yield from ((child.lineno, alias.name, lazy) for alias in child.names)
-            elif isinstance(child, ast.ImportFrom):
-                source = absolute(child)
-                yield from ((child.lineno, f"{source}.{alias.name}", lazy) for alias in child.names)
-            elif isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING"):
-                yield from visit(ast.Module(body=child.body, type_ignores=[]), True)
-                yield from visit(ast.Module(body=child.orelse, type_ignores=[]), lazy)
-            else:
-                yield from visit(child, lazy or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda))
-
-    def absolute(node: ast.ImportFrom) -> str:
-        if node.level == 0:
-            return node.module or ""
-        parts = module.split(".")
-        base = parts[: len(parts) - node.level + is_package]
-        return ".".join([*base, node.module] if node.module else base)
-
-    return visit(tree, False)
-
-
-def violations(source: str, module: str, is_package: bool = False) -> list[str]:
-    """The imports in `source`, the text of `module` (such as `vtbdrake.rollout.executor`), that break a layer."""
+def violations(tree: ast.AST, module: str, is_package: bool = False) -> list[str]:
+    """The imports in `tree`, the syntax tree of `module` (such as `vtbdrake.rollout.executor`), that break a layer."""
     parts = module.split(".")
     is_root = parts == ["vtbdrake"]
     layer = parts[1] if len(parts) > 1 else ""
-    if not is_root and layer not in BELOW:
+    if not is_root and layer not in {*BELOW, TABLE}:
         return [f"{module}: '{layer}' is no layer; give it a place in BELOW"]
     found = []
-    for line, name, lazy in imported_modules(ast.parse(source), module, is_package):
+    for entry in imports(tree, module, is_package):
+        line, name = entry.line, entry.name
         top, _, rest = name.partition(".")
         target = rest.partition(".")[0]
         if top in OUTSIDE:
             found.append(f"{module}:{line}: imports {name}, which is not part of the package")
         elif top != "vtbdrake" or is_root or target == layer:
             continue
+        elif target == TABLE:
+            if layer not in DELEGATE:
+                found.append(f"{module}:{line}: {layer} must not hand over to upper layers")
         elif target not in BELOW:
             if layer not in TOP:
                 found.append(f"{module}:{line}: imports {name} from the root, which imports every layer")
-        elif target not in BELOW[layer] and not (lazy and target in MAY_DELEGATE.get(layer, ())):
+        elif target not in BELOW[layer]:
             found.append(f"{module}:{line}: {layer} must not import {target}")
     return found
 
 
 def test_imports_point_one_way() -> None:
     found = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        is_package = parts[-1] == "__init__"
-        module = ".".join(parts[:-1] if is_package else parts)
-        found += violations(path.read_text(encoding="utf-8"), module, is_package)
+    for path, tree in syntax_trees().items():
+        found += violations(tree, module_name(path), path.stem == "__init__")
     assert not found, "\n".join(found)
 
 
 def test_imports_of_compiled_modules_point_one_way() -> None:
     found = []
-    for path in sorted(PACKAGE.rglob("*.pyx")):
-        imports = re.findall(r"^(?:from +\S+ +)?c?import +(?:\([^)]*\)|[^#\n]+)", path.read_text("utf-8"), re.MULTILINE)
-        source = "\n".join(line.replace("cimport", "import") for line in imports)
-        found += violations(source, ".".join(path.relative_to(ROOT).with_suffix("").parts))
+    for path in source_files(".pyx"):
+        found += violations(ast.parse(import_lines(path.read_text("utf-8"))), module_name(path))
     assert not found, "\n".join(found)
 
 
@@ -166,6 +124,10 @@ def test_imports_of_compiled_modules_point_one_way() -> None:
         ("vtbdrake.testbed.a", "from vtbdrake.rollout import Rollout"),
         ("vtbdrake.testbed.a", "from vtbdrake.components.sensors import Imu"),
         ("vtbdrake.testbed.a", "from vtbdrake.deployment import deploy"),
+        ("vtbdrake.testbed.a", "def deploy(self):\n    from vtbdrake.deployment import deploy"),
+        ("vtbdrake.optimization.a", "if TYPE_CHECKING:\n    from vtbdrake.visualization import Figure"),
+        ("vtbdrake.rollout.a", "def plot(self):\n    from vtbdrake.visualization import plot_rollout"),
+        ("vtbdrake.control.a", "from vtbdrake import upper_layers"),
         ("vtbdrake.control.a", "def f():\n    from vtbdrake.deployment import deploy"),
         ("vtbdrake.rollout.a", "from vtbdrake import optimization"),
         ("vtbdrake.rollout.a", "from ..optimization import Problem"),
@@ -186,30 +148,62 @@ def test_imports_of_compiled_modules_point_one_way() -> None:
     ],
 )
 def test_import_against_the_layers_is_found(module: str, source: str) -> None:
-    assert len(violations(source, module)) == 1
+    assert len(violations(ast.parse(source), module)) == 1
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
         ("vtbdrake.rollout.a", "from vtbdrake.testbed import Testbed\nfrom .b import c\nfrom . import d\nimport numpy"),
-        ("vtbdrake.rollout.a", "def plot(self):\n    from vtbdrake.visualization import plot_rollout"),
-        ("vtbdrake.testbed.a", "def deploy(self):\n    from vtbdrake.deployment import deploy"),
-        ("vtbdrake.optimization.a", "if TYPE_CHECKING:\n    from vtbdrake.visualization import Figure"),
+        ("vtbdrake.testbed.a", "from vtbdrake import upper_layers"),
+        ("vtbdrake.optimization.a", "if TYPE_CHECKING:\n    from vtbdrake.upper_layers import Scene"),
         ("vtbdrake.calibration.a", "from ..rollout import Rollout"),
         ("vtbdrake.cli.a", "import vtbdrake as vtb\nfrom vtbdrake import reasoning, control"),
         ("vtbdrake", "from vtbdrake.cli import main"),
     ],
 )
 def test_import_along_the_layers_passes(module: str, source: str) -> None:
-    assert violations(source, module) == []
+    assert violations(ast.parse(source), module) == []
 
 
 def test_relative_import_in_a_package_starts_at_the_package() -> None:
-    assert violations("from .b import c", "vtbdrake.rollout", is_package=True) == []
-    assert len(violations("from ..cli import main", "vtbdrake.rollout", is_package=True)) == 1
+    assert violations(ast.parse("from .b import c"), "vtbdrake.rollout", is_package=True) == []
+    assert len(violations(ast.parse("from ..cli import main"), "vtbdrake.rollout", is_package=True)) == 1
 
 
+def test_table_names_what_is_there() -> None:
+    for name in upper_layers.__all__:
+        assert getattr(upper_layers, name).__name__ == name
+
+
+def test_circles_are_found() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
+    assert circles(graph) == [["a", "b", "c"], ["d", "e"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def test_imports_in_functions_and_for_types_count() -> None:
+    source = "import a\nif TYPE_CHECKING:\n    import b\ndef f():\n    from .c import d\n"
+    places = {entry.name: entry.place for entry in imports(ast.parse(source), "vtbdrake.e", False)}
+    assert places == {"a": "module", "b": "types", "vtbdrake.c.d": "function"}
+
+
+def test_graph_leads_to_the_module_that_defines_a_name() -> None:
+    graph = import_graph()
+    assert "vtbdrake.testbed.scenario" in graph["vtbdrake.rollout.task"]
+    assert "vtbdrake.web.live.viewer" in graph["vtbdrake.cli.view"]
+
+
+def test_folders_import_each_other_in_no_circle() -> None:
+    assert circles(layer_graph(import_graph())) == []
+
+
+def test_few_files_of_a_folder_import_each_other_in_a_circle() -> None:
+    found = [group for group in circles(within_layers(import_graph())) if len(group) > MAX_CIRCLE]
+    assert not found, "\n".join(map(str, found))
+
+
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("use", ["vtbdrake", "vtbdrake.Problem, vtbdrake.Parameter, vtbdrake.Quality, vtbdrake.Study"])
 def test_import_loads_nothing_heavy(use: str) -> None:
     code = f"import sys, vtbdrake; {use}; print(*sorted({HEAVY!r} & set(sys.modules)))"

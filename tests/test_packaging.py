@@ -23,6 +23,10 @@ COMPILED = sorted(
 MESSAGE_TYPES = [path.relative_to(ROOT) for path in (ROOT / "vtbdrake").rglob("lcmt_vtb_*.py")]
 EXT_SUFFIX = get_config_var("EXT_SUFFIX")
 SHARED = Path("vtbdrake/_cyutility")  # Cython's own part of all modules
+# What reads recordings, which are not part of vtbdrake, is in the repository only.
+READS_RECORDINGS = re.compile(
+    r"vtbdrake_diagrams/(\w+/reality|park/(mower|survey)|recorded_arms/(pendulum|subjects))\.py"
+)
 
 
 def run(*arguments: str, cwd: Path, **environment: str) -> str:
@@ -35,7 +39,7 @@ def run(*arguments: str, cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy, modules compiled in place included, those of lcm-gen not: a build leaves its folders where it runs."""
+    """A copy, modules compiled in place included, lcm-gen's not: a build leaves its folders where it runs."""
     folder = tmp_path_factory.mktemp("build") / "checkout"
     for name in ("vtbdrake", "diagrams"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "lcmt_vtb_*.py"))
@@ -47,10 +51,11 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def files(checkout: Path) -> set[str]:
-    """The files of both packages, as they are kept in the repository, and what lcm-gen makes in a build."""
+    """The files of both packages but those that read recordings, and what lcm-gen makes in a build."""
     folders = (checkout / "vtbdrake", checkout / "vtbdrake_diagrams")
     paths = [path for folder in folders for path in folder.rglob("*") if path.is_file() and path.suffix != ".so"]
-    return {path.relative_to(checkout).as_posix() for path in paths} | {path.as_posix() for path in MESSAGE_TYPES}
+    kept = {path.relative_to(checkout).as_posix() for path in paths} | {path.as_posix() for path in MESSAGE_TYPES}
+    return {name for name in kept if not READS_RECORDINGS.fullmatch(name)}
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +85,17 @@ def content(wheel: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def metadata(content: dict[str, str]) -> Message:
-    return Parser().parsestr(content["vtbdrake-0.1.0.dist-info/METADATA"])
+def metadata(sdist: Path) -> Message:
+    """The metadata in the sdist, which a wheel has, too."""
+    return Parser().parsestr(text_in(sdist, "PKG-INFO"))
+
+
+def text_in(sdist: Path, name: str) -> str:
+    """Return the text of a file in the sdist."""
+    with tarfile.open(sdist) as archive:
+        file = archive.extractfile(f"vtbdrake-0.1.0/{name}")
+        assert file is not None
+        return file.read().decode()
 
 
 def test_compiled_modules_are_not_older_than_their_sources() -> None:
@@ -92,6 +106,7 @@ def test_compiled_modules_are_not_older_than_their_sources() -> None:
         )
 
 
+@pytest.mark.slow
 def test_sdist_holds_the_package_and_what_builds_it(sdist: Path, files: set[str]) -> None:
     with tarfile.open(sdist) as archive:
         names = {entry.name.partition("/")[2] for entry in archive if entry.isfile()}
@@ -99,6 +114,7 @@ def test_sdist_holds_the_package_and_what_builds_it(sdist: Path, files: set[str]
     assert names - made == files | {"pyproject.toml", "setup.py", "README.md", "LICENSE"}
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_package_compiled_and_nothing_else(content: dict[str, str], files: set[str]) -> None:
     names = {name for name in content if not name.startswith("vtbdrake-0.1.0.dist-info/")}
     rest = {file for file in files if not file.endswith((".pyx", ".pxd"))}
@@ -106,12 +122,14 @@ def test_wheel_holds_the_package_compiled_and_nothing_else(content: dict[str, st
     assert {"vtbdrake/py.typed", "vtbdrake_diagrams/py.typed"} <= names
 
 
+@pytest.mark.slow
 def test_wheel_is_for_this_python_and_platform(wheel: Path, content: dict[str, str]) -> None:
     python = "cp{}{}".format(*sys.version_info)
     assert f"-{python}-{python}-linux_" in wheel.name
     assert "Root-Is-Purelib: false" in content["vtbdrake-0.1.0.dist-info/WHEEL"]
 
 
+@pytest.mark.slow
 def test_compiled_modules_of_the_wheel_import(wheel: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
@@ -121,6 +139,7 @@ def test_compiled_modules_of_the_wheel_import(wheel: Path, tmp_path: Path) -> No
     assert found.split() == [str(tmp_path / source.with_suffix(EXT_SUFFIX)) for source in COMPILED]
 
 
+@pytest.mark.slow
 def test_first_program_of_the_readme_runs_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
     environment = tmp_path / "venv"
     run("-m", "venv", "--without-pip", str(environment), cwd=tmp_path)
@@ -154,6 +173,34 @@ def test_metadata(metadata: Message) -> None:
     assert metadata["Requires-Python"] == ">=3.11"
 
 
+def test_a_missing_compiler_is_said_before_cython_runs(checkout: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "setup.py",
+        "--quiet",
+        "build_ext",
+        f"--build-temp={tmp_path}",
+        f"--build-lib={tmp_path}",
+    ]
+    done = subprocess.run(command, cwd=checkout, env=os.environ | {"CC": "no-such-cc"}, capture_output=True, text=True)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()[-1:]
+    assert re.match(
+        r"vtbdrake compiles modules: .* C compiler.*no-such-cc.*: apt-get install gcc .*, or install a wheel", line
+    )
+    assert not list(tmp_path.rglob("*.c"))
+
+
+def test_the_extra_all_is_every_extra_for_users(metadata: Message) -> None:
+    requirements: dict[str, set[str]] = {}
+    for requirement in metadata.get_all("Requires-Dist", []):
+        package, _, extra = requirement.partition("; extra == ")
+        requirements.setdefault(extra.strip('"'), set()).add(package)
+    extras = set(metadata.get_all("Provides-Extra", [])) - {"all", "compiler", "dev", "docs"}
+    assert requirements["all"] == {f"vtbdrake[{','.join(sorted(extras))}]"}
+    assert {"perception", "web"} <= extras
+
+
 def test_optional_packages_are_extras(metadata: Message) -> None:
     requirements = metadata.get_all("Requires-Dist", [])
     always = {requirement.split(">")[0] for requirement in requirements if "extra ==" not in requirement}
@@ -167,11 +214,23 @@ def test_no_version_of_a_dependency_is_excluded_from_above(metadata: Message) ->
     assert not [requirement for requirement in requirements if re.search(r"[<~!]|==", requirement)]
 
 
-def test_entry_point_of_pytest_names_a_module(content: dict[str, str]) -> None:
-    entries = content["vtbdrake-0.1.0.dist-info/entry_points.txt"]
-    module = entries.partition("[pytest11]")[2].split()[2]
-    assert f"{module.replace('.', '/')}.py" in content
+ENTRY_POINTS = "vtbdrake.egg-info/entry_points.txt"
 
 
-def test_command_line_entry_point(content: dict[str, str]) -> None:
-    assert "vtbdrake = vtbdrake.cli:main" in content["vtbdrake-0.1.0.dist-info/entry_points.txt"]
+def test_entry_point_of_pytest_names_a_module(sdist: Path, files: set[str]) -> None:
+    module = text_in(sdist, ENTRY_POINTS).partition("[pytest11]")[2].split()[2]
+    assert f"{module.replace('.', '/')}.py" in files
+
+
+def test_command_line_entry_point(sdist: Path) -> None:
+    assert "vtbdrake = vtbdrake.cli:main" in text_in(sdist, ENTRY_POINTS)
+
+
+@pytest.mark.slow
+def test_wheel_has_the_metadata_and_entry_points_of_the_sdist(content: dict[str, str], sdist: Path) -> None:
+    assert content["vtbdrake-0.1.0.dist-info/entry_points.txt"] == text_in(sdist, ENTRY_POINTS)
+    wheel, source = (
+        Parser().parsestr(text) for text in (content["vtbdrake-0.1.0.dist-info/METADATA"], text_in(sdist, "PKG-INFO"))
+    )
+    for name in ("Name", "Version", "License-Expression", "License-File", "Requires-Python", "Requires-Dist"):
+        assert wheel.get_all(name) == source.get_all(name)

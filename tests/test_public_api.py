@@ -1,4 +1,4 @@
-"""The comparison of the public interface with that of the newest release finds what breaks a user's program."""
+"""The comparison of the public interface with the newest release's finds what breaks a user's program."""
 
 import subprocess
 import sys
@@ -29,6 +29,7 @@ def test_interface_breaks_no_program_of_the_newest_release() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_changes_that_break_programs_are_found(tmp_path: Path) -> None:
     (tmp_path / "vtbdrake").symlink_to(ROOT / "vtbdrake")
     folder = tmp_path / "tools"

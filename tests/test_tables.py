@@ -213,6 +213,7 @@ def test_a_slow_outlier_does_not_move_the_ratio() -> None:
     assert ratio(a, b) == 0.5
 
 
+@pytest.mark.slow
 def test_import_time_is_measured() -> None:
     rows = {row.name: row for row in import_time(repeats=1, longer=1, warm_up=0)}
     assert rows["import_time"].against == "import pydrake"

@@ -39,9 +39,9 @@ def study_page() -> Image.Image:
             page = browser.new_page(viewport=SIZE)
             page.goto(view.url)
             page.wait_for_selector("body[data-best][data-model]", state="attached", timeout=120_000)
-            page.evaluate("vtb.point(3)")
+            page.evaluate("vtb.rollouts.point({ trial: 3 })")
             page.wait_for_selector("body[data-pointed='3']", state="attached", timeout=120_000)
-            page.evaluate("vtb.setTime(2.0)")
+            page.evaluate("vtb.playback.setTime(2.0)")
             page.wait_for_selector("body[data-time='2']", state="attached", timeout=120_000)
             page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
             return Image.open(io.BytesIO(page.screenshot()))
@@ -49,4 +49,6 @@ def study_page() -> Image.Image:
 
 if __name__ == "__main__":
     picture = study_page().convert("RGB").resize((960, 600), Image.Resampling.LANCZOS)
-    picture.quantize(160).save(FOLDER / "study_page.png", optimize=True)
+    # Small colours, such as marks, have their place in the palette, too; shades between its colours are dithered.
+    palette = picture.quantize(256, Image.Quantize.MAXCOVERAGE)
+    picture.quantize(palette=palette).save(FOLDER / "study_page.png", optimize=True)

@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-EXTRAS=dev,docs,testing,web,perception,notebook,optuna,cluster,dataframe,recording
+EXTRAS=all,dev,docs
 # A shared library that the wheels expect from the system, and Debian's package of it. pydrake and lcm link to GLib;
 # everything else comes with the wheels or with any Debian.
 LIBRARIES=(libglib-2.0.so.0:libglib2.0-0)

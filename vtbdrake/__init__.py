@@ -4,7 +4,14 @@
 next to nothing.
 """
 
-import vtbdrake.child_process as _child_process  # noqa: F401  It notes the directory to which sys.path refers.
-from vtbdrake.lazy import lazy_names
+import sys as _sys
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+import vtbdrake.common.child_process as _child_process  # noqa: F401  It notes the directory to which sys.path refers.
+from vtbdrake.common.lazy_names import attach_names
+
+if "IPython" in _sys.modules:
+    from vtbdrake.common.notebook_errors import shorten_tracebacks as _shorten_tracebacks
+
+    _shorten_tracebacks()
+
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -30,7 +30,7 @@ def plan_of(scenario: CartPoleScenario, address: str) -> Trajectory:
 def reasoning(
     scenario: CartPoleScenario, address: str, budget: Budget, *, executor: str | Executor = "auto"
 ) -> dict[str, Any]:
-    """Return the arguments of a `Reasoner` that decides the plan at ``address``; the horizon is that of the plan."""
+    """Return the arguments of a `Reasoner` that decides the plan at ``address``; the horizon is the plan's."""
     return {
         "decision": [plan_of(scenario, address)],
         "quality": Quality(cost, of="plant.state", reading="integral", minimize=True),

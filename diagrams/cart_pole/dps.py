@@ -6,8 +6,8 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer, Saturation, ZeroOrderHold
 
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.spline_command import SplineCommand
-from vtbdrake.spline import Spline
 
 JOINTS = 2
 PERCEIVED = "dps.env.discrete_state_0"

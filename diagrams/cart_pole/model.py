@@ -18,7 +18,7 @@ CART_POLE_SDF = Path(__file__).parent / "models" / "cart_pole.sdf"
 NOTE = "Written by diagrams/cart_pole/model.py; change the cart-pole, not this file."
 JOINT_NAMES = ("cart_slider", "pole_pin")
 
-# SDFormat refuses inertias of zero. A joint that only slides does not feel that of the cart.
+# SDFormat refuses inertias of zero. A joint that only slides does not feel the cart's inertia.
 _CART_SIZE = (0.24, 0.12, 0.12)
 _TINY = "1e-20"
 

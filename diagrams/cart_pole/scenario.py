@@ -12,13 +12,13 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
+from vtbdrake.common.settings import setting
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.sensors import ErrorModel, JointEncoders, JointTachometers
-from vtbdrake.control import Zero
+from vtbdrake.control import RobotMode, Zero, acts_idle
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.settings import setting
-from vtbdrake.spline import Spline
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.cart_pole.dps import FORCE, JOINTS, PERCEIVED, make_dps
 from vtbdrake_diagrams.cart_pole.model import CART_POLE_SDF, JOINT_NAMES, CartPole
@@ -99,23 +99,32 @@ class CartPoleScenario(Scenario):
     def _plan_command(self) -> Signal:
         # A plan begins at a time of the DPS, which runs for thirty years at most.
         limit = np.append(1e9, np.full(self.knots, self.force_limit))
-        return Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit)
+        names = ["start", *(f"force {knot}" for knot in range(1, self.knots + 1))]
+        return Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit, entry_names=names)
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.
 
-        The cart-pole speaks the messages of Drake's acrobot, which has two joints and one drive, too; CART_POLE_PLAN
-        carries the plan if it is a command.
+        The cart-pole speaks the messages of Drake's acrobot, which has two joints and one drive, too. CART_POLE_ACTING
+        tells the force that acts, and CART_POLE_MODE whether it takes commands (see `RobotMode`): its own stop blocks
+        them. CART_POLE_PLAN carries the plan if it is a command.
         """
         joints = {"joint_position": ("theta1", "theta2"), "joint_velocity": ("theta1Dot", "theta2Dot")}
         deployment = Deployment(
             protocol=Protocol(
-                sense=[vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp")],
+                sense=[
+                    vector_map("CART_POLE_MODE", lcmt_scope, {"cart_pole_mode": "value"}),
+                    vector_map("CART_POLE_ACTING", lcmt_acrobot_u, {"force_acting": "tau"}, stamp="timestamp"),
+                    vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp"),
+                ],
                 act=[vector_map("CART_POLE_FORCE", lcmt_acrobot_u, {"force": "tau"}, stamp="timestamp")],
                 commands=[] if self.onboard else [vector_map("CART_POLE_PLAN", lcmt_scope, {"plan": "value"})],
+                reported={"force": "force_acting"},
+                robot_mode=RobotMode(carrier="cart_pole_mode"),
             ),
             period=self.period,
             guards={"fallback": {"force": Zero()}},
+            released_by=acts_idle({"force": 0.0}),
             continuity={"force": None},  # Nothing measures the force, which may jump.
             pace="joint_velocity",
         )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
 from vtbdrake.reasoning import Budget, Decision, Reasoner
@@ -33,7 +33,7 @@ def make_reasoner(
         scenario: The scenario of the running cart-pole.
         rollouts: Budget of a decision.
         executor: Where the rollouts run, see `SearchConfig`.
-        options: Further arguments of `Reasoner`, which replace those of `reasoning`.
+        options: Further arguments of `Reasoner`, which replace the arguments of `reasoning`.
     """
     arguments = reasoning(scenario, "u.plan", Budget(rollouts=rollouts), executor=executor)
     return Reasoner(scenario=scenario, **{**arguments, **options})
@@ -66,7 +66,7 @@ def swing_up(reasoner: Reasoner, scenario: CartPoleScenario, *, seconds: float =
 
     Args:
         reasoner: The reasoner, see `make_reasoner`.
-        scenario: The cart-pole; it may differ from that of the reasoner.
+        scenario: The cart-pole; it may differ from the reasoner's.
         seconds: Duration of the simulation in seconds.
         every: Time from one decision to the next, in seconds.
     """
@@ -117,7 +117,7 @@ def swing_up_on_machine(
     """Swing up the cart-pole of a machine in a process of its own, over LCM.
 
     The DPS decides the plan (``onboard=True``). The machine waits for each force, and the loop for each decision: the
-    clock is that of the simulated world, and the result does not depend on what else this computer does.
+    clock is the simulated world's, and the result does not depend on what else this computer does.
 
     Args:
         scenario: The cart-pole.

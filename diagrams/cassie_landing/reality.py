@@ -2,7 +2,7 @@
 
 ``python -m vtbdrake_diagrams.cassie_landing.reality FOLDER MODEL`` prints it. FOLDER is ``jumping_data`` of the
 repository DAIRLab/cassie_impact_dataset (BSD-3), MODEL the URDF, see `CassieLandingScenario`. A recording begins about
-5 ms before the impact and lasts 50 ms; its states are those of the robot's own estimator, from encoders and an IMU.
+5 ms before the impact and lasts 50 ms; its states come from the robot's own estimator, from encoders and an IMU.
 """
 
 from __future__ import annotations
@@ -14,21 +14,31 @@ import click
 import numpy as np
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.calibration import RolloutCalibration, Window, calibrate_by_rollouts
+from vtbdrake.common.arrays import Array
 from vtbdrake.rollout import RolloutTask, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cassie_landing.scenario import MOTORS, PERIOD, SAMPLES, CassieLandingScenario
 
-ROBOT, STATE, TABLE = "sim.sys.cassie", "plant.state", "dps.table"
+ROBOT = "sim.sys.cassie"
+"""The address of the robot."""
+STATE = "plant.state"
+"""The name of the measured states in a recording."""
+TABLE = "dps.table"
+"""The address of the torques that the DPS plays."""
 # The joints in the order of the recordings, behind the pelvis. The ankle springs have no encoder.
 JOINTS = (
     *MOTORS[:8], "knee_joint_left", "knee_joint_right", "ankle_joint_left", "ankle_joint_right",
     "ankle_spring_joint_left", "toe_left", "ankle_spring_joint_right", "toe_right",
 )  # fmt: skip
 _ENCODERS = [k for k, joint in enumerate(JOINTS) if not joint.startswith("ankle_spring")]
-_NQ, _BASE_Q, _BASE_V = 23, 7, 6
+# Number of positions, pelvis included.
+_NQ = 23
+# Number of positions of the pelvis: a quaternion and a point.
+_BASE_Q = 7
+# Number of velocities of the pelvis.
+_BASE_V = 6
 
 
 def landings(folder: Path, scenario: Scenario) -> list[Window]:
@@ -57,7 +67,7 @@ def _plant_rows(scenario: Scenario) -> Array:
 def _landing(folder: Path, number: str, rows: Array) -> Window:
     times, recorded, torques = (np.load(folder / f"{letter}_{number}.npy") for letter in "txu")
     grid = PERIOD * np.arange(SAMPLES)
-    # The times of the recording are those of messages.
+    # The times of the recording are the messages' times.
     samples = np.column_stack([np.interp(grid, times, column) for column in recorded.T])
     samples[:, :4] /= np.linalg.norm(samples[:, :4], axis=1, keepdims=True)
     latest = np.maximum(np.searchsorted(times, grid + 0.1 * PERIOD, side="right") - 1, 0)
@@ -77,7 +87,7 @@ def _landing(folder: Path, number: str, rows: Array) -> Window:
 def errors(rows: Array, measured: Array, simulated: Array) -> Array:
     """Return the means over time of the errors of states (n, 45).
 
-    These are that of the pelvis' velocity in m/s, and the root mean squares over the joints with encoders of their
+    These are the error of the pelvis' velocity in m/s, and the root mean squares over the joints with encoders of their
     positions in rad and velocities in rad/s.
     """
     e = (simulated - measured)[:, rows]

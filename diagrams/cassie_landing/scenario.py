@@ -15,12 +15,14 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPl
 from pydrake.multibody.tree import RevoluteSpring
 from pydrake.systems.framework import BasicVector, Context, System
 
-from vtbdrake.settings import setting
+from vtbdrake.common.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 
-SAMPLES, PERIOD = 100, 5e-4
-"""Samples of a recording, and the time between two, in s."""
+SAMPLES = 100
+"""Number of samples of a recording."""
+PERIOD = 5e-4
+"""Time between two samples, in s."""
 MOTORS = (
     "hip_roll_left", "hip_roll_right", "hip_yaw_left", "hip_yaw_right", "hip_pitch_left", "hip_pitch_right",
     "knee_left", "knee_right", "toe_left", "toe_right",
@@ -28,11 +30,16 @@ MOTORS = (
 """The joints with motors, in the order of the recordings."""
 
 # The robot beside its URDF, as the repository DAIRLab/dairlib has it (examples/Cassie/cassie_utils.cc): rotor inertias
-# in kg m^2, gear ratios, springs in N m/rad, and the rods that close the loops.
+# in kg m^2, gear ratios, and springs in N m/rad.
 _ROTORS = (*[6.1e-5] * 4, *[3.65e-4] * 4, *[4.9e-6] * 2)
 _GEARS = (*[25.0] * 4, *[16.0] * 4, *[50.0] * 2)
 _SPRINGS = {"knee_joint": 1500.0, "ankle_spring_joint": 1250.0}
-_ROD, _ROD_ON_HEEL, _ROD_ON_THIGH = 0.5012, np.array([0.11877, -0.01, 0.0]), np.array([0.0, 0.0, 0.045])
+# Length of the rods that close the loops, in m, from the same file.
+_ROD = 0.5012
+# Where a rod ends on the heel spring, in m.
+_ROD_ON_HEEL = np.array([0.11877, -0.01, 0.0])
+# Where it ends on the thigh, in m.
+_ROD_ON_THIGH = np.array([0.0, 0.0, 0.045])
 _RADIUS = 1e-4
 
 
@@ -70,7 +77,7 @@ class CassieLandingScenario(Scenario):
     """Agility Robotics' Cassie above a plane, in the moment of its landing; recorded torques drive it.
 
     Its model is not part of the project: ``model`` is the file examples/Cassie/urdf/cassie_v2.urdf of the repository
-    DAIRLab/dairlib (BSD-3). Of its shapes, only the two points of contact of each foot are used.
+    DAIRLab/dairlib (BSD-3). Only the two points of contact of each foot are used.
     """
 
     _PLACES: ClassVar[tuple[str, ...]] = ("model",)
@@ -117,7 +124,7 @@ class CassieLandingScenario(Scenario):
         builder.sim_actuator("torque", plant.get_actuation_input_port())
 
     def _material(self, *, rigid: bool = False) -> ProximityProperties:
-        """Return the contact properties of the feet; those of the plane with ``rigid``, which adds no compliance."""
+        """Return the contact properties of the feet; with ``rigid`` the plane's, which add no compliance."""
         properties = ProximityProperties()
         AddContactMaterial(
             point_stiffness=1e12 if rigid else self.stiffness,

@@ -19,15 +19,20 @@ from pydrake.systems.analysis import SimulatorConfig
 from scipy.spatial.transform import Rotation
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.calibration import RolloutCalibration, Window, calibrate_by_rollouts
+from vtbdrake.common.arrays import Array
 from vtbdrake.recording import Log, Series
 from vtbdrake.rollout import RolloutTask, make_executor
 from vtbdrake.rollout.executor import run_rollouts
 from vtbdrake.testbed import Scenario
 from vtbdrake_diagrams.cube_toss.scenario import PERIOD, CubeTossScenario
 
-POSITION, VELOCITY, STATE = "sim.sys.cube.position", "sim.sys.cube.velocity", "cube_state"
+POSITION = "sim.sys.cube.position"
+"""The address of the cube's pose."""
+VELOCITY = "sim.sys.cube.velocity"
+"""The address of the cube's velocities."""
+STATE = "cube_state"
+"""The name of the measured states in a recording."""
 EDGE = CubeTossScenario().edge
 FITTED = 50
 """Number of tosses of the fit."""
@@ -104,7 +109,7 @@ def window(toss: Log, *, starts: int = 1, samples: int | None = None) -> Window:
     Args:
         toss: The recording.
         starts: Number of starts; the first one is as measured.
-        samples: The first so many samples; None: all.
+        samples: Number of samples from the first on; None: all.
     """
     series = toss.sense[STATE]
     x = series.values[0]
@@ -178,7 +183,7 @@ def median_with_interval(values: Array, *, seed: int = 0) -> tuple[float, float,
 
 
 def split_tosses(tosses: Sequence[Log]) -> tuple[list[Log], list[Log]]:
-    """Return the tosses for the calibration, of which it fits `FITTED` and keeps a fifth back, and all others."""
+    """Return the tosses for the calibration, which fits `FITTED` and keeps a fifth back, and all others."""
     count = min(round(FITTED / 0.8), len(tosses) // 2)
     picked = set(np.random.default_rng(0).permutation(len(tosses))[:count])
     parts: tuple[list[Log], list[Log]] = ([], [])

@@ -21,7 +21,7 @@ from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
-from vtbdrake.settings import setting
+from vtbdrake.common.settings import setting
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 1.0 / 148.0
@@ -40,7 +40,7 @@ def _point_contact() -> MultibodyPlantConfig:
 class CubeTossScenario(Scenario):
     """A free cube above a plane, seen by motion capture; nothing drives it.
 
-    Edge, mass and moment are those of ContactNets' acrylic cube (S. Pfrommer, M. Halm, M. Posa, "ContactNets: Learning
+    Edge, mass and moment belong to ContactNets' acrylic cube (S. Pfrommer, M. Halm, M. Posa, "ContactNets: Learning
     discontinuous contact dynamics with smooth, implicit representations", CoRL 2020). With point contact, its eight
     corners touch, as a box on a plane has one point of contact only; with hydroelastic contact, it is a compliant box.
     """
@@ -93,7 +93,7 @@ class CubeTossScenario(Scenario):
         builder.sim_sensor("cube_state", plant.get_state_output_port())
 
     def _material(self, *, rigid: bool = False) -> ProximityProperties:
-        """Return the contact properties of the cube; those of the plane with ``rigid``, which adds no compliance."""
+        """Return the contact properties of the cube; with ``rigid`` the plane's, which add no compliance."""
         properties = ProximityProperties()
         friction = CoulombFriction(self.friction, self.friction)
         # Drake adds the relaxation times of both bodies, and combines stiffness and dissipation as springs in series.

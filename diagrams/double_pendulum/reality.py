@@ -16,13 +16,19 @@ import numpy as np
 import yaml
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.calibration import Calibration, JointModel, JointRecording, calibrate
+from vtbdrake.common.arrays import Array
 from vtbdrake.recording import DrivenScenario, Log
 from vtbdrake_diagrams.double_pendulum.scenario import JOINTS, LINKS, DoublePendulumScenario
 
-POSITION, TORQUE = "joint_position", "torque"
-PENDULUM, DRIVES = "sim.sys.pendulum", "sim.act.drives"
+POSITION = "joint_position"
+"""The name of the measured positions in a recording."""
+TORQUE = "torque"
+"""The name of the torques in a recording."""
+PENDULUM = "sim.sys.pendulum"
+"""The address of the pendulum."""
+DRIVES = "sim.act.drives"
+"""The address of its drives."""
 HORIZON = 0.5
 """Duration of a prediction, in s."""
 
@@ -30,7 +36,10 @@ HORIZON = 0.5
 _FIT_PERIOD = 0.01
 # The runs of the fit; the others are predicted.
 _FITTED = slice(0, None, 2)
-_LENGTH, _SUBSTEPS = 0.2, 4
+# Length of the upper link, in m.
+_LENGTH = 0.2
+# Steps of the integration within a period of a published model: its friction is steep.
+_SUBSTEPS = 4
 
 Derivative = Callable[[Array, Array], Array]
 
@@ -55,7 +64,7 @@ def recordings(folder: Path) -> list[Log]:
 
 
 def stand_in(count: int = 8, seconds: float = 5.0) -> list[Log]:
-    """Return recordings of a simulated pendulum whose numbers are near those of the real one, where that is missing."""
+    """Return recordings of a simulated pendulum whose numbers are near the real one's, where that is missing."""
     truth = {
         f"{PENDULUM}.lower.mass": 0.65,
         f"{DRIVES}.coulomb": [0.2, 0.15],
@@ -151,7 +160,7 @@ def published_prediction(p: dict[str, float], x: Array, times: Array, torques: A
     """Return the positions (n, 2) that a published model predicts from the state x (4,), by Runge-Kutta steps."""
     derivative, positions = published_model(p), [x[:2]]
     for h, tau in zip(np.diff(times), torques, strict=False):
-        for _ in range(_SUBSTEPS):  # Its friction is steep.
+        for _ in range(_SUBSTEPS):
             step = h / _SUBSTEPS
             k1 = derivative(x, tau)
             k2 = derivative(x + 0.5 * step * k1, tau)

@@ -10,14 +10,15 @@ from pydrake.geometry import Cylinder
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, RotationalInertia, SpatialInertia
 
-from vtbdrake.settings import setting
+from vtbdrake.common.settings import setting
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.torque_driven import TorqueDrivenScenario
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
 
-JOINTS, LINKS = ("shoulder", "elbow"), ("upper", "lower")
+JOINTS = ("shoulder", "elbow")
+LINKS = ("upper", "lower")
 GEAR_RATIO = 6.0
 _BLUE = np.array([0.2, 0.4, 0.7, 1.0])
 
@@ -40,7 +41,7 @@ class DoublePendulumScenario(TorqueDrivenScenario):
     moments: list[float] = setting(
         doc="Moments about the centre of mass.", unit="kg m^2", gt=0, default_factory=lambda: [0.01, 0.01]
     )
-    rotor_inertia: float = setting(5e-5, "Of each motor, before its gear.", unit="kg m^2", ge=0)
+    rotor_inertia: float = setting(5e-5, "The inertia of each motor, before its gear.", unit="kg m^2", ge=0)
 
     def validate(self) -> None:
         super().validate()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.planar import chord, compose, inverse
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.world.carrier import Carrier, standing_pose
@@ -33,7 +33,7 @@ def declare_belief(
     The carrier has the position and heading by the DPS, the height at which it stands there, and the measured roll and
     pitch; it rolls without slip. The driver is on the advised route, or else on the nearest one.
 
-    The belief holds for the time of the measured motion. The pose of the DPS, which is that of the present, is moved
+    The belief holds for the time of the measured motion. The pose of the DPS, which is the present one, is moved
     back by this motion.
 
     A carrier that is not localized has no belief: asking for it raises a ValueError.
@@ -41,7 +41,7 @@ def declare_belief(
     Args:
         builder: The builder of the testbed.
         carrier: The carrier.
-        ground: The elevation map of the DPS: that of the simulated ground.
+        ground: The elevation map of the DPS: the simulated ground's.
         routes: The routes by number.
         age: The age of the measured motion in s.
     """
@@ -65,7 +65,7 @@ def declare_belief(
     def velocity(heading: float, speed: float, turn_rate: float, roll: float, pitch: float) -> Array:
         yaw = float(heading) - age * float(turn_rate)
         R_WB = RollPitchYaw(float(roll), float(pitch), yaw).ToRotationMatrix().matrix()
-        # The estimated speed is that of the middle of the rear axle, which does not move sideways.
+        # The estimated speed is measured at the middle of the rear axle, which does not move sideways.
         return np.concatenate([[0.0, 0.0, float(turn_rate)], R_WB @ [float(speed), float(turn_rate) * rear, 0.0]])
 
     def curvature(speed: float, turn_rate: float) -> float:

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 
 from vtbdrake.components.localization.dead_reckoning import DeadReckoning, DriftModel
-from vtbdrake.components.sensors.calibration import make_calibration
+from vtbdrake.components.sensors.raw_values import make_calibration
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.fallback import Hold
 from vtbdrake.deployment import Deployment

@@ -18,7 +18,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, System
 from threadpoolctl import ThreadpoolController
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.localization.dead_reckoning import (
     MOTION,
@@ -40,7 +41,6 @@ from vtbdrake.components.localization.unit import (
     UnitState,
 )
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.scan import Scan
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed.slow_part import SlowPart
 
@@ -174,7 +174,7 @@ class PresentPose(AddressedSystem):
         output_ports:
         - pose_estimate
 
-    ``motion`` is that of a `DeadReckoning`; the other inputs are those of the slow part ``localizer``: the pose X_WH
+    ``motion`` comes from a `DeadReckoning`; the other inputs come from the slow part ``localizer``: the pose X_WH
     (3,) with its covariance (9,), the status, and the pose X_OH (3,) and the time (s) for which they hold. With the
     present pose in O, which continues with the last speed and turn rate of the axle until the time of the update,
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
 from vtbdrake.components.localization.constellation import ConstellationMap, Fix
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -38,22 +38,29 @@ CLOUDS = {"pine plantation": "treels/pine_plot.laz", "ponderosa, TLS": "spanner/
 """Clouds with the range noise of a terrestrial scanner."""
 MOBILE = {"ponderosa, mobile": "spanner/MLS_Clip.laz"}
 """Clouds that were scanned while walking, whose points scatter more."""
-_NOISE, _MOBILE_NOISE = 0.02, 0.03
+# Range noise of `CLOUDS`, in m.
+_NOISE = 0.02
+# Range noise of `MOBILE`, in m.
+_MOBILE_NOISE = 0.03
 ALONE = {"one pine": "treels/pine.laz"}
 """Clouds of single trees, which had no part in the choice of the detector's constants."""
 SCANNER = Scanner(rows=32, columns=1800, elevation=np.radians(40.0))
 _EYE = 2.0
 _BINS = (0.0, 5.0, 10.0, 15.0, 25.0)
-# A detection is right within this distance (m) of a stem; nearer than the second one to any ring, it is of a stem.
-_RIGHT, _STEM = 0.25, 0.6
+# A detection within this distance of a stem is right, in m.
+_RIGHT = 0.25
+# A detection within this distance of any ring belongs to a stem, in m.
+_STEM = 0.6
 # The `outline` (m) with which the detector runs a second time: covariances are linear in its square.
 _OUTLINE = 0.05
-# 95 % of the squared errors of positions and of diameters lie below.
-_POSITION_GATE, _DIAMETER_GATE = (chi_square_quantile(0.95, degrees) for degrees in (2, 1))
+# 95 % of the squared errors of positions lie below.
+_POSITION_GATE = chi_square_quantile(0.95, 2)
+# 95 % of the squared errors of diameters lie below.
+_DIAMETER_GATE = chi_square_quantile(0.95, 1)
 
 
 def rioja_map(inventories: dict[str, Any], *, deviation: float = 0.3, diameter: float = 0.03) -> Landmarks:
-    """Return the trees of all plots of La Rioja once, in one frame: that of plot 1.
+    """Return the trees of all plots of La Rioja once, in one frame: plot 1's.
 
     Overlapping plots repeat trees, to the millimetre: the shift of a plot is the multiple of the steps with which most
     of its trees coincide with those that are placed already.
@@ -289,7 +296,7 @@ class Errors:
 
     @classmethod
     def of(cls, full: Array, results: list[Detection], *, half: int) -> Errors:
-        """Return those of every other stem, in the order of x."""
+        """Return the values of every other stem, in the order of x."""
         order = full[:, 0].argsort()[half::2]
         parts: list[tuple[Array, ...]] = []
         for each in results:

@@ -12,6 +12,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 
+from vtbdrake.common.scan import Scan
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import HISTORY_LENGTH, DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
@@ -23,9 +25,7 @@ from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster_size
 from vtbdrake.components.world_model import GeoJsonError, WorldModel, load_geojson
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import image_array_map, scan_map
-from vtbdrake.scan import Scan
-from vtbdrake.settings import setting
+from vtbdrake.lcm.sensor_messages import image_array_map, scan_map
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import PERIOD, make_deployment, make_dps
 from vtbdrake_diagrams.forest.perception import Localizer, ScanLandmarks
@@ -41,8 +41,8 @@ PERCEPTIONS = ("scanner", "stereo")
 _LEAST_RANGE_NOISE = 0.005
 
 # Standard deviation of the error of the vertical in rad, per axis, which displaces the detections of a high sensor. It
-# lies between those of pitch that `drives` prints, for later than ten seconds after the start, for the forest and for
-# the plain; the first seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not
+# lies between the errors of pitch that `drives` prints, for later than ten seconds after the start, for the forest and
+# for the plain; the first seconds are worse. Constant errors, as of a misaligned scanner, are not simulated, and not
 # contained.
 _LEVELLING = 0.001
 
@@ -102,7 +102,7 @@ class CarrierScenario(Scenario):
         remedy="on the carrier",
     )
     scanner_tilt_deg: float = setting(0.0, "Tilt of the scanner towards the ground.", unit="deg", ge=-45.0, le=45.0)
-    # Errors of the IMU: noise, bias and drift are those of gyros (rad/s) and accelerometers (m/s^2) alike.
+    # Errors of the IMU: noise, bias and drift hold for gyros (rad/s) and accelerometers (m/s^2) alike.
     imu_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=2e-3, bias=5e-4, drift=1e-5))
     # Errors of the measured speed of the wheels in m/s.
     odometry_errors: ErrorModel = field(default_factory=lambda: ErrorModel(noise=0.02))
@@ -164,7 +164,7 @@ class CarrierScenario(Scenario):
         """Add ground, landmarks and clutter to a plant that is not finalized."""
 
     def global_map(self) -> WorldModel:
-        """Return the map that the DPS has: that of ``map_file``, which has errors as ``map`` says, or a survey.
+        """Return the map that the DPS has: the one in ``map_file``, which has errors as ``map`` says, or a survey.
 
         Features of a file without a covariance get the deviation of ``map``.
 
@@ -208,15 +208,15 @@ class CarrierScenario(Scenario):
         return [Signal("scan", model_value=Scan.empty(), max_age=5.0 * self.perception_period)]
 
     def interface(self) -> Interface:
-        last = len(self.routes()) - 1.0
+        routes = range(len(self.routes()))
         return Interface(
             sense=[
                 *self.perception_signals(),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-50.0, upper=50.0, max_age=5 * PERIOD),
                 Signal("odometry", size=1, unit="m/s", lower=-5.0, upper=5.0, max_age=5 * PERIOD),
             ],
-            act=[Signal("route", size=1, lower=0.0, upper=last, idle=float(self.route))],
-            commands=[Signal("route", size=1, lower=0.0, upper=last, default=float(self.route))],
+            act=[Signal("route", size=1, values=routes, idle=float(self.route))],
+            commands=[Signal("route", size=1, values=routes, default=float(self.route))],
         )
 
     @abstractmethod

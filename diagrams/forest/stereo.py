@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.dead_reckoning import body_rotation, carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
-from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.multibody.tree import Frame

@@ -40,7 +40,7 @@ class Arm:
     # From each joint to the next, and from the last one to the flange, along z (m).
     base_height: float = 0.1575  # [A] [P] gives 0.36 m from the floor to joint 2
     lengths: tuple[float, ...] = (0.2025, 0.2045, 0.2155, 0.1845, 0.2155, 0.081, 0.045)  # [P] in sums of two
-    # Which axis of the link a joint turns about; as those of the iiwa.
+    # Which axis of the link a joint turns about; as in the iiwa.
     axes: tuple[tuple[int, int, int], ...] = IIWA_AXES
     radii: tuple[float, ...] = (0.075, 0.075, 0.07, 0.07, 0.06, 0.06, 0.04)  # [A] of the links, solid cylinders
     base_mass: float = 5.4  # [D] 29.9 kg [P] less the links
@@ -71,7 +71,7 @@ class Arm:
 
     @property
     def offsets(self) -> tuple[float, ...]:
-        """Distance from the origin of the previous link to that of each link, along z (m)."""
+        """Distance from the origin of the previous link to the origin of each link, along z (m)."""
         return (self.base_height, *self.lengths[:-1])
 
     @property

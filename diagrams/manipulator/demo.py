@@ -14,13 +14,13 @@ from typing import Any
 import click
 import numpy as np
 
-from vtbdrake.child_process import ChildProcess
 from vtbdrake.cli.output import table
+from vtbdrake.common.child_process import ChildProcess
 from vtbdrake.control import RealTime, Runtime, SimulatedClock, SwitchRefusedError
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineProcess
 from vtbdrake.testbed import DpsAlone
@@ -39,8 +39,10 @@ from vtbdrake_diagrams.manipulator.studies.trials import (
 
 LAWS = ("cartesian_impedance", "admittance")
 
-# Masses, friction and other parameters of the machine differ from those of the DPS by up to this fraction.
-PERTURB, SEED = 0.05, 7
+# Masses, friction and other parameters of the machine differ from the DPS's by up to this fraction.
+PERTURB = 0.05
+# Seed by which they are drawn.
+SEED = 7
 
 # Consecutive missed deadlines after which the arm floats in place; the machine brakes after 100.
 MAX_MISSED = 50
@@ -51,7 +53,10 @@ PATIENCE = 0.1
 # With more latches than this, the figures of a trial mean nothing: the motions were interrupted too often.
 MANY_LATCHES = 30
 
-HUB_PRIORITY, LOOP_PRIORITY = 80, 75
+# Priority of the hub in SCHED_FIFO.
+HUB_PRIORITY = 80
+# Priority of the loop in SCHED_FIFO.
+LOOP_PRIORITY = 75
 MACHINE: dict[str, Any] = {"priority": 70, "perturb": PERTURB, "seed": SEED}
 
 # Times in the press at which the force is printed, in seconds from its beginning.
@@ -216,7 +221,7 @@ class Demo:
             print(f"        latches of the guards, each reset as soon as possible: {len(reasons)}; the first because")
             print(f"        {reasons[0]}")
         if len(reasons) > MANY_LATCHES:
-            print("        With so many latches, the figures describe this computer, not the control law: give")
+            print("        With this many latches, the figures describe this computer, not the control law: give")
             print("        it real-time rights (see above), or less other load.")
 
     def report(self, simulated: Track, real: Track) -> None:

@@ -118,7 +118,7 @@ def _make_env(model: ArmDynamics, *, period: float, compile: bool) -> System:
     ``contact_wrench`` F_T, [torque; force] that the environment exerts on the tip, in the world, follows the sensor's
     wrench, less the tool's weight, by a first-order low-pass. (The tool's inertia is left in: 0.4 N at 1 m/s^2.)
 
-    ``external_torque`` r, of the environment on the joints, is that of a momentum observer,
+    ``external_torque`` r, of the environment on the joints, comes from a momentum observer,
 
         r = k (p - s),   s' = tau + dL/dq + r,
 
@@ -274,7 +274,7 @@ def _system(
     """Return the system x_next = following(x, p, inputs), with all its state in one vector, which is its output.
 
     Every group of a Context that Python reads and writes costs more than the arm's dynamics. The addresses of the state
-    are those of its parts.
+    come from its parts.
     """
     parts = [x[name] for name in state]
     whole = casadi.SX.sym(_STATE, sum(part.numel() for part in parts))

@@ -26,7 +26,10 @@ from vtbdrake_diagrams.sdf import (
 ARM_SDF = Path(__file__).parent / "models" / "arm.sdf"
 NOTE = "Written by diagrams/manipulator/model.py; change the arm, not this file."
 
-_LIGHT, _DARK, _ORANGE, _STEEL = "0.86 0.87 0.88 1", "0.30 0.32 0.35 1", "0.95 0.50 0.10 1", "0.55 0.57 0.60 1"
+_LIGHT = "0.86 0.87 0.88 1"
+_DARK = "0.30 0.32 0.35 1"
+_ORANGE = "0.95 0.50 0.10 1"
+_STEEL = "0.55 0.57 0.60 1"
 _ALONG_Y = f"{text(pi / 2)} 0 0"
 
 

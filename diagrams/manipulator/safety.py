@@ -19,13 +19,14 @@ from vtbdrake_diagrams.manipulator.laws import LAWS
 # 6.4 N m in the shoulder, 0.8 N m in the wrist.
 CONTINUITY = {"joint_torque": "joint_torque_measured"}
 
-POSITION, VELOCITY = "joint_position", "joint_velocity"
+POSITION = "joint_position"
+VELOCITY = "joint_velocity"
 
 JUMP_TOLERANCE = {POSITION: 0.03, VELOCITY: 0.3, "joint_torque_measured": 50.0, "wrench": 100.0}
 """The change of each sensor signal that is always plausible, in the unit of the signal."""
 
 DISAGREEMENT = 0.2
-"""The largest difference between the measured velocity and that of the positions (rad/s)."""
+"""The largest difference between the measured velocity and the positions' velocity (rad/s)."""
 
 SMOOTHING = 0.01
 """Time constant of the positions' velocity (s)."""
@@ -43,7 +44,7 @@ class FloatInPlace(Fallback):
 
         tau = g(q) + K (h - q) - D v
 
-    The pose h is that of the arm when the fallback takes over. It follows the arm at a distance of `SLIP`, so the arm
+    The pose h is the arm's when the fallback takes over. It follows the arm at a distance of `SLIP`, so the arm
     yields to a push. The measured velocity is limited to what the positions confirm, up to `DISAGREEMENT`.
 
     Without a fresh position, it carries the weight at the last accepted pose, for `CARRY` seconds after that sample.

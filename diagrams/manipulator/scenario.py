@@ -9,6 +9,7 @@ from drake import lcmt_force_torque, lcmt_scope
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 
+from vtbdrake.common.settings import setting
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.sensors import (
     ErrorModel,
@@ -17,12 +18,13 @@ from vtbdrake.components.sensors import (
     JointTachometers,
     JointTorqueSensors,
 )
+from vtbdrake.control.bridge import acts_idle
+from vtbdrake.control.robot_mode import RobotMode
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import VectorMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.monitoring.residuals import ResidualConfig
-from vtbdrake.settings import setting
 from vtbdrake.testbed import (
     Interface,
     Scenario,
@@ -52,6 +54,10 @@ HAND_MAX_AGE = 0.1
 """The age at which the last pose of a hand that leads is given up (s)."""
 
 
+MODE_PERIOD = 0.005
+"""The time between two messages of the arm's mode (s)."""
+
+
 def _hand_map() -> VectorMap:
     return vector_map("ARM_HAND", lcmt_scope, {"hand": "value"})
 
@@ -73,11 +79,9 @@ class ManipulatorScenario(Scenario):
         True, "Whether to compile the arithmetic of the DPS if there is a C compiler; the results are the same."
     )
     knows_tool: bool = setting(
-        False, "Whether mass and centre of the tool in mental rollouts and predictions are those of dps.tool."
+        False, "Whether mass and centre of the tool in mental rollouts and predictions are dps.tool's."
     )
-    led_by_hand: bool = setting(
-        False, "Whether a hand may lead the tip, by the command u.hand, while u.motion is that of led."
-    )
+    led_by_hand: bool = setting(False, "Whether a hand may lead the tip, by the command u.hand, while u.motion is led.")
     wall: bool = setting(False, "Whether there is a wall; False is free space.")
     wall_distance: float = setting(
         0.825,
@@ -136,8 +140,8 @@ class ManipulatorScenario(Scenario):
         )
 
     def _commands(self) -> list[Signal]:
-        last = Motion.LED if self.led_by_hand else Motion.CIRCLE
-        motion = Signal("motion", size=1, lower=0.0, upper=float(last), default=int(Motion.HOME))
+        motions = [motion for motion in Motion if self.led_by_hand or motion != Motion.LED]
+        motion = Signal("motion", size=1, values=motions, default=int(Motion.HOME))
         if not self.led_by_hand:
             return [motion]
         reach = np.array([1.0, 1.0, 1.0, 1.0, 1.0, *(3 * [HAND_REACH])])
@@ -162,7 +166,8 @@ class ManipulatorScenario(Scenario):
         """Return how the DPS runs on the arm: it answers each state at once; after a fault, the arm floats in place.
 
         The arm speaks the messages of an iiwa, with their signs, but does not compensate gravity: its command is the
-        whole torque. It publishes the wrench at its flange; ARM_MOTION chooses the motion, ARM_HAND leads the tip.
+        whole torque. It publishes the wrench at its flange, and 200 times per second on ARM_MODE whether it takes
+        commands (see `RobotMode`): its own stop blocks them. ARM_MOTION chooses the motion, ARM_HAND leads the tip.
         """
         status = {
             "joint_position": "joint_position_measured",
@@ -173,19 +178,26 @@ class ManipulatorScenario(Scenario):
         wrench = {"wrench": ("tx", "ty", "tz", "fx", "fy", "fz")}
         return Deployment(
             protocol=Protocol(
-                sense=[iiwa_status(status), vector_map("WRENCH", lcmt_force_torque, wrench, stamp="timestamp")],
+                sense=[
+                    vector_map("ARM_MODE", lcmt_scope, {"arm_mode": "value"}),
+                    iiwa_status(status),
+                    vector_map("WRENCH", lcmt_force_torque, wrench, stamp="timestamp"),
+                ],
                 act=[iiwa_command(["joint_torque"])],
                 commands=[
                     vector_map("ARM_MOTION", lcmt_scope, {"motion": "value"}),
                     *([_hand_map()] if self.led_by_hand else []),
                 ],
                 reported={"joint_torque": "joint_torque_reported"},
+                robot_mode=RobotMode(carrier="arm_mode", max_cycles=max(10, round(5.0 * MODE_PERIOD / self.period))),
+                periods={"ARM_MODE": max(MODE_PERIOD, self.period)},
             ),
             period=self.period,
             guards={"fallback": arm_fallback(), "jump_tolerance": JUMP_TOLERANCE},
             continuity=CONTINUITY,
             hint=f"set u.motion to {Motion.FOLLOW} (follow), by which the reference is where the arm is; "
             "home comes after it",
+            released_by=acts_idle({"joint_torque": 0.0}),  # The arm has braked.
             pace="wrench",  # It is in the last message of the arm's cycle.
             residuals=ResidualConfig(
                 scenario=self._without_chance(),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vtbdrake_diagrams.manipulator.compiled import PushEquations
 
 BALL_STIFFNESS = 1e8
-"""The stiffness of the ball at the tip, in N/m [A], much larger than that of any wall."""
+"""The stiffness of the ball at the tip, in N/m [A], much larger than any wall's."""
 
 WALL_THICKNESS = 0.1
 

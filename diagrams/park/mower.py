@@ -5,9 +5,9 @@ repository borglab/gtsam. (Djugash, Hamner and Roth, "Navigating with ranging ra
 Journal of Field Robotics 26, 2009.) Half of a drive calibrates the odometry and its `DriftModel`; the other half
 judges.
 
-What the files call odometry must be looked at: the turns of the gyro are those of the headings of the RTK path, to the
+What the files call odometry must be looked at: the turns of the gyro equal the turns of the RTK path's headings, to the
 last digit, and the ways of the second drive are those between the RTK positions. So a drift of the gyro cannot be seen,
-only positions judge, and only those of the first drive.
+only positions judge, and only the first drive's.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from scipy.io import loadmat
 from scipy.optimize import least_squares, minimize
 from scipy.stats import chi2
 
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.planar import compose, rotation
@@ -33,7 +33,7 @@ FILES = ("Plaza1_.mat", "Plaza2_.mat")
 HORIZONS = (10.0, 30.0, 100.0)
 """How long dead reckoning goes on alone, in s."""
 
-# The samples of the odometry are taken together to motions of so many, about a second.
+# Number of samples of the odometry that are taken together to a motion, about a second.
 _TOGETHER = 5
 
 
@@ -70,7 +70,7 @@ class Mowing:
 
     @property
     def likeness(self) -> tuple[float, float]:
-        """How far the odometry is that of the RTK path: correlations of the turns and of the distances."""
+        """Return the correlations of the odometry with the RTK path: of the turns, and of the distances."""
         steps = np.hypot(*np.diff(self.positions, axis=0).T)
         turns = (np.diff(self.headings) + np.pi) % (2.0 * np.pi) - np.pi
         return float(np.corrcoef(turns, self.turns)[0, 1]), float(np.corrcoef(steps, self.ways)[0, 1])

@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.estimation import squared_distances
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -39,16 +39,24 @@ from vtbdrake_diagrams.park.scenario import PERIOD, ROWS, ParkScenario
 from vtbdrake_diagrams.park.survey import Survey, SurveyConfig, survey
 from vtbdrake_diagrams.park.world import tree_model
 
-# Where Victoria Park lies: the positions of the recording have no origin, and their axes are those of the map.
+# Where Victoria Park lies: the positions of the recording have no origin, and their axes are the map's.
 _FRAME = LocalFrame(151.192, -33.886)
-# Windows of the odometry's calibration, in s, and the least way in one, in m.
-_WINDOW, _LEAST_WAY = 25.0, 10.0
-# A position by satellites jumps if its distance from others within some seconds is not the way driven, to so many m.
-_NEAR_IN_TIME, _JUMP = 4.0, 1.0
-# A claim is wrong if it is off by this distance in m, and by this many of its standard deviations.
-_WRONG, _DEVIATIONS = 3.0, 3.0
-# Trees of two maps are the same, and a detection is of a tree, within these distances in m.
-_SAME_TREE, _MATCHES = 1.5, 0.6
+# Duration of a window of the odometry's calibration, in s.
+_WINDOW = 25.0
+# Least distance driven in a window, in m.
+_LEAST_WAY = 10.0
+# A position by satellites is compared with others within this time, in s.
+_NEAR_IN_TIME = 4.0
+# It jumps if its distance from them differs from the distance driven by more than this, in m.
+_JUMP = 1.0
+# A claim is wrong if it is off by more than this distance, in m.
+_WRONG = 3.0
+# A claim is wrong if it is off by more than this number of its own standard deviations, too.
+_DEVIATIONS = 3.0
+# Trees of two maps within this distance are the same, in m.
+_SAME_TREE = 1.5
+# A detection within this distance of a tree shows it, in m.
+_MATCHES = 0.6
 # The time in s after which a scan is answered: before the next one.
 _ANSWERED = 0.2
 
@@ -401,7 +409,7 @@ def main(folder: Path, speed: float, plot: Path | None) -> None:
     where = claims.at(steady[:, 0]).has_pose
     print("  the survey of the whole drive against the same steady positions:")
     print(f"         {judged_by_positions(whole, steady[where], half.antenna, noise=half.noise)}")
-    print(f"  its trees lie {np.hypot(*X[:2]):.2f} m and {np.degrees(X[2]):.2f} deg off those of the map")
+    print(f"  its trees lie {np.hypot(*X[:2]):.2f} m and {np.degrees(X[2]):.2f} deg off the map's")
     with TemporaryDirectory() as name:
         scenario = half.with_map(Path(name), mirrored=True)
         mirrored, _ = localized(second, scenario, Path(name) / "drive.lcm")

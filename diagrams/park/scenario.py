@@ -9,7 +9,8 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import SteeringDriftModel
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
@@ -18,7 +19,6 @@ from vtbdrake.components.localization.steering import SteeringConfig, SteeringRe
 from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.world_model import WorldModel, load_geojson
-from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.perception import Localizer, PresentPose, add_localizer
@@ -35,11 +35,11 @@ CLAIM = ("x", "y", "heading", "deviation", "status")
 _SCAN_EVERY = 9
 # The smallest number of landmarks with which a pose can be sure.
 _FEWEST = 8
-# Standard deviation in m that is added to those of detections, per axis: the axes of large or leaning trunks.
+# Standard deviation in m that is added to the detections', per axis: the axes of large or leaning trunks.
 _LEAST_DEVIATION = 0.03
 # Standard deviation of the displacement of a scan in m: its time is known to a period of the DPS, 7 ms at 3 m/s.
 _SCAN_DEVIATION = 0.02
-# The share of the variance of the map that neighbours share: that of where the map lies, not of the trees on it.
+# The share of the variance of the map that neighbours share: the variance of the map's place, not of the trees on it.
 _SHARED = 0.9
 
 
@@ -195,7 +195,7 @@ class Claim(AddressedSystem):
         output_ports:
         - claim
 
-    ``pose_estimate`` is that of a `PresentPose`; ``claim`` has the entries of `CLAIM`.
+    ``pose_estimate`` comes from a `PresentPose`; ``claim`` has the entries of `CLAIM`.
     """
 
     def __init__(self) -> None:

@@ -3,13 +3,13 @@
 Unknown are the pose X_WH of the car at each scan and the position of each tree. The squares are those of
 
     odometry:    R_iᵀ (p_i+1 - p_i) - t_i  and  θ_i+1 - θ_i - φ_i,     with the covariance of the drift model,
-    detections:  R_iᵀ (l - p_i) - z,                                   with that of the detector,
+    detections:  R_iᵀ (l - p_i) - z,                                   with the detector's,
     positions:   p_i + R_i a - g,                                      with the antenna a in H,
 
 each weighted with its distance (Cauchy's weights), as detections may be of something else, and positions jump. Errors
-of satellite positions last for some ten seconds: only one position in so many seconds counts as independent.
+of satellite positions last for some ten seconds: only one position in this number of seconds counts as independent.
 
-Which detection is of which tree is decided anew between the steps: the nearest tree within a gate, one to one in a
+Which tree each detection shows is decided anew between the steps: the nearest tree within a gate, one to one in a
 scan. What was detected too rarely is no tree. (Grisetti, Kümmerle, Stachniss and Burgard, "A tutorial on graph-based
 SLAM", IEEE Intelligent Transportation Systems Magazine 2, 2010.)
 """
@@ -27,11 +27,11 @@ from scipy.sparse import eye as sparse_eye
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse, rotation, rotations, transform, wrap
-from vtbdrake.settings import check_settings, setting
 
 # The gates of the association in m, one for each round: as long as the poses are uncertain, they are wide.
 _GATES = (2.5, 2.0, 1.5, 1.5, 1.2, 1.2)
@@ -41,9 +41,11 @@ _STEPS = 3
 _ALIGNED = 300.0
 # Cauchy's weights are one half at this many deviations.
 _HALF = 3.0
-# Standard deviations of a motion in m and rad, beside its drift, and of a tree's axis in m: the squares need them.
-_LEAST_MOTION, _AXIS = np.array([0.005, 0.005, 5e-4]), 0.05
-# Standard deviation in m that is added to those of the trees: a trunk is no point.
+# Standard deviations of a motion [m, m, rad] beside its drift: least squares need them.
+_LEAST_MOTION = np.array([0.005, 0.005, 5e-4])
+# Standard deviation of a tree's axis, in m.
+_AXIS = 0.05
+# Standard deviation in m that is added to the trees': a trunk is no point.
 _FLOOR = 0.03
 
 

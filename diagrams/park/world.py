@@ -9,19 +9,22 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import chord, compose, inverse, transform
 from vtbdrake.components.localization.range_bearing import RangeBearingConfig
 from vtbdrake.components.localization.steering import SteeringConfig, bicycle_motion
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
-from vtbdrake.components.world_model import Quantity as Attribute
-from vtbdrake.components.world_model import WorldModel, WorldObject
+from vtbdrake.components.world_model import AttributeValue, WorldModel, WorldObject
 from vtbdrake.state import AddressedSystem, Quantity
 
-# The steering angle in rad, and its swing with the period in s.
-_ANGLE, _SWING, _SWINGS_EVERY = 0.08, 0.05, 29.0
+# Mean steering angle, in rad.
+_ANGLE = 0.08
+# Amplitude with which it swings, in rad.
+_SWING = 0.05
+# Period of the swing, in s.
+_SWINGS_EVERY = 29.0
 # Which share of the trees in view a scan shows.
 _DETECTED = 0.7
 
@@ -53,7 +56,7 @@ def tree_model(trees: Landmarks, *, source: str) -> WorldModel:
         covariance = np.diag([inf, inf, inf, 0.0, 0.0, 0.0])
         covariance[3:5, 3:5] = C
         pose = PoseEstimate.of(RigidTransform([*place.tolist(), 0.0]), covariance, time=0.0)
-        attributes = {"trunk_diameter": Attribute(float(diameter), "m", float(deviation))}
+        attributes = {"trunk_diameter": AttributeValue(float(diameter), "m", float(deviation))}
         objects.append(WorldObject(f"tree-{k}", "tree", pose, attributes=attributes, source=source))
     return WorldModel(objects)
 

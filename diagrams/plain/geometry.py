@@ -10,7 +10,8 @@ from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.plain.rocks import RockField, rock_surface
 
 # Red, green, blue and opacity, from 0 to 1.
-_SAND, _STONE = np.array([0.6, 0.42, 0.28, 1.0]), np.array([0.42, 0.32, 0.26, 1.0])
+_SAND = np.array([0.6, 0.42, 0.28, 1.0])
+_STONE = np.array([0.42, 0.32, 0.26, 1.0])
 
 
 def add_plain(plant: MultibodyPlant, rock_field: RockField, ground: Ground) -> None:

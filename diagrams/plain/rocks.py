@@ -15,20 +15,23 @@ from math import pi
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.meshes import Surface, copies, unit_sphere
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.components.world_model import AttributeValue, WorldModel, WorldObject, position_estimate
 from vtbdrake_diagrams.forest.world.ground import Ground
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 from vtbdrake_diagrams.forest.world.stand import MapErrors, surveyed
 
 # Streams of random numbers; the forest has others.
-_ROCKS, _MAP = 6, 7
+_ROCKS = 6
+_MAP = 7
 
-# Length over width, and height over diameter of the whole rock, of which the upper half sticks out.
-_ELONGATION, _FLATNESS = (1.0, 1.2), (0.8, 1.2)
+# Range of length over width.
+_ELONGATION = (1.0, 1.2)
+# Range of height over diameter, for the whole rock: only its upper half sticks out.
+_FLATNESS = (0.8, 1.2)
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class RockField:
             sizes = {"length": diameters[k] * stretch[k], "width": diameters[k] / stretch[k], "height": heights[k]}
             X_WO = RigidTransform(RollPitchYaw(0.0, 0.0, yaws[k]), [*places[k], 0.0])
             pose = PoseEstimate.of(X_WO, np.zeros((6, 6)), time=0.0)
-            attributes = {name: Quantity(size, "m") for name, size in sizes.items()}
+            attributes = {name: AttributeValue(size, "m") for name, size in sizes.items()}
             objects.append(WorldObject(f"rock-{k}", "rock", pose, attributes=attributes, source=f"plain {self.seed}"))
         return WorldModel(objects)
 
@@ -110,7 +113,7 @@ class RockField:
                 f"map-{k}",
                 "rock",
                 position_estimate([*place, 0.0], deviation=deviation),
-                attributes={"width": Quantity(width, "m", errors.diameter * width)},
+                attributes={"width": AttributeValue(width, "m", errors.diameter * width)},
                 source=f"map {seed} of plain {self.seed}",
             )
             for k, (place, width) in enumerate(zip(places, widths, strict=True))

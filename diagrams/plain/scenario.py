@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.rocks import RockDetectorConfig, detect_rocks
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.components.world_model import WorldModel
-from vtbdrake.settings import setting
 from vtbdrake_diagrams.forest.perception import ScanLandmarks
 from vtbdrake_diagrams.forest.scenario import CarrierScenario
 from vtbdrake_diagrams.forest.world.routes import Route

@@ -1,1 +1,1 @@
-"""Arms and legs of which there are recordings: calibrated, and compared with what others have published."""
+"""Arms and legs with recordings: calibrated, and compared with what others have published."""

@@ -11,19 +11,27 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RevoluteJoint, RotationalInertia, SpatialInertia
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.calibration import Calibration, JointRecording, TorqueRegressor, calibrate, equations, regress
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import setting
 from vtbdrake.recording import Log
-from vtbdrake.settings import setting
 from vtbdrake_diagrams.recorded_arms import plants
 from vtbdrake_diagrams.torque_driven import TorqueDrivenScenario
 
-BODY, DRIVES = "sim.sys.pendulum.rod", "sim.act.drives"
+BODY = "sim.sys.pendulum.rod"
+DRIVES = "sim.act.drives"
 HORIZON = 0.3
 """Duration of a prediction, in s."""
 IDENTIFICATION = "control_method_pd/system_identification"
 HELD_OUT = {"energy shaping": "control_method_energy_shaping", "iLQR": "control_method_ilqr"}
-_SLOWEST, _SUBSTEPS, _STEEP, _SMOOTHED = 1.0, 4, 0.02, 0.06
+# A window is predicted if its largest speed exceeds this one, in rad/s.
+_SLOWEST = 1.0
+# Steps of the integration within a period of a published model: its friction is steep.
+_SUBSTEPS = 4
+# Velocity scale of its Coulomb friction, in rad/s.
+_STEEP = 0.02
+# Duration over which velocities are smoothed, in s.
+_SMOOTHED = 0.06
 _FIT_PERIOD = 0.02
 
 

@@ -21,7 +21,9 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
-X_AXIS, Y_AXIS, Z_AXIS = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X_AXIS = (1.0, 0.0, 0.0)
+Y_AXIS = (0.0, 1.0, 0.0)
+Z_AXIS = (0.0, 0.0, 1.0)
 Triple = tuple[float, float, float]
 _ZERO = (0.0, 0.0, 0.0)
 TIAGO_LINKS = ("torso", *(f"arm{k}" for k in range(1, 8)))
@@ -30,7 +32,7 @@ GO2_JOINTS = ("hip", "thigh", "calf")
 
 @dataclass(frozen=True)
 class ArmLink:
-    """A link and the joint that carries it; the link's frame is that of its joint.
+    """A link and the joint that carries it; the link's frame is its joint's.
 
     Attributes:
         name: Name of the link and of its joint.
@@ -61,7 +63,7 @@ def serial_plant(links: Sequence[ArmLink]) -> MultibodyPlant:
         xx, yy, zz, xy, xz, yz = link.inertia
         about_origin = RotationalInertia(xx, yy, zz, xy, xz, yz) + RotationalInertia(link.mass, link.center)
         moments, products = about_origin.get_moments() / link.mass, about_origin.get_products() / link.mass
-        # Published inertias need not be those of bodies with positive masses.
+        # Published inertias need not belong to bodies with positive masses.
         G = UnitInertia(*moments, *products)
         body = plant.AddRigidBody(link.name, SpatialInertia(link.mass, link.center, G, skip_validity_check=True))
         X_PF = RigidTransform(RollPitchYaw(link.angles), link.place)
@@ -81,7 +83,7 @@ def pendulum() -> MultibodyPlant:
 def panda() -> MultibodyPlant:
     """Return Franka's Panda with the masses, centres and inertias of Gaz and others (RA-L 2019).
 
-    Distances and angles are those of the modified convention of Denavit and Hartenberg.
+    Distances and angles follow the modified convention of Denavit and Hartenberg.
     """
     d, a = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
     alpha = (0.0, -pi / 2, pi / 2, pi / 2, -pi / 2, pi / 2, pi / 2)

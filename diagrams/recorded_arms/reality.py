@@ -13,8 +13,8 @@ import click
 import numpy as np
 from matplotlib.figure import Figure
 
-from vtbdrake.arrays import Array
-from vtbdrake.calibration import Equations, Regression, regress
+from vtbdrake.calibration import Regression, RegressionEquations, regress
+from vtbdrake.common.arrays import Array
 from vtbdrake_diagrams.recorded_arms import pendulum, subjects
 from vtbdrake_diagrams.recorded_arms.subjects import Prediction, Subject
 
@@ -42,7 +42,7 @@ def compared(subject: Subject) -> dict[str, Array]:
     """Return the held-out residuals by joint of our two fits and of the published models, and of no model at all."""
     free, consistent = fits(subject)
 
-    def nothing(each: Equations) -> Array:
+    def nothing(each: RegressionEquations) -> Array:
         return np.broadcast_to(each.tau.mean(axis=0), each.tau.shape)
 
     models = {"torques themselves": nothing, "ours": free.torques, "ours, of real bodies": consistent.torques}

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
-from vtbdrake.arrays import Array
-from vtbdrake.calibration import Drive, Equations, JointRecording, TorqueRegressor, equations, friction
-from vtbdrake.calibration.model import INERTIA_SIZE
+from vtbdrake.calibration import DriveModel, JointRecording, RegressionEquations, TorqueRegressor, equations, friction
+from vtbdrake.common.arrays import Array
+from vtbdrake.testbed.inertia import INERTIA_SIZE
 from vtbdrake_diagrams.recorded_arms import plants
 
-Prediction = Callable[[Equations], Array]
+Prediction = Callable[[RegressionEquations], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +43,10 @@ class Subject:
 
     name: str
     model: TorqueRegressor
-    fitted: tuple[Equations, ...]
-    held_out: tuple[Equations, ...]
+    fitted: tuple[RegressionEquations, ...]
+    held_out: tuple[RegressionEquations, ...]
     published: Mapping[str, Prediction]
-    runs: tuple[tuple[Equations, ...], ...]
+    runs: tuple[tuple[RegressionEquations, ...], ...]
     joints: Sequence[int] | None = None
     block: float = 0.25
     prior: float | None = 0.3
@@ -54,13 +54,15 @@ class Subject:
 
 
 def by_parameters(model: TorqueRegressor, values: Mapping[str, float], *, nominal: bool = False) -> Prediction:
-    """Return the torques by parameters; those without a value are zero, or with ``nominal`` those of the plant."""
+    """Return the torques by parameters; those without a value are zero, or with ``nominal`` the plant's."""
     everything = {} if nominal else dict.fromkeys(model.names, 0.0)
     p = model.vector(everything | dict(values))
     return lambda each: np.asarray(each.Y @ p)
 
 
-def with_fitted_friction(model: TorqueRegressor, inertial: Prediction, fitted: Sequence[Equations]) -> Prediction:
+def with_fitted_friction(
+    model: TorqueRegressor, inertial: Prediction, fitted: Sequence[RegressionEquations]
+) -> Prediction:
     """Return torques by inertias that are published, with friction that fits what they leave of each joint."""
     first = INERTIA_SIZE * len(model.bodies)
     Y = np.concatenate([each.Y[:, :, first:] for each in fitted])
@@ -70,7 +72,7 @@ def with_fitted_friction(model: TorqueRegressor, inertial: Prediction, fitted: S
     return lambda each: inertial(each) + each.Y[:, :, first:] @ p
 
 
-def _split(each: Equations, parts: int) -> tuple[tuple[Equations], ...]:
+def _split(each: RegressionEquations, parts: int) -> tuple[tuple[RegressionEquations], ...]:
     edges = np.linspace(each.times[0], each.times[-1] + 1e-9, parts + 1)
     return tuple((each.between(a, b),) for a, b in pairwise(edges))
 
@@ -84,7 +86,7 @@ def panda(folder: Path) -> Subject:
     times = np.loadtxt(log / "exciting_traj_time.txt")
     q, tau = (np.loadtxt(log / f"exciting_traj_{name}.txt").reshape(-1, 7) for name in ("positions", "torques"))
     # Behind the gears, the sensors do not feel the rotors.
-    drives = {f"link{k + 1}": Drive(row, friction(rotor=False)) for k, row in enumerate(np.eye(7))}
+    drives = {f"link{k + 1}": DriveModel(row, friction(rotor=False)) for k, row in enumerate(np.eye(7))}
     model = TorqueRegressor(plants.panda(), drives=drives)
     # There is one time more than positions.
     each = equations(model, JointRecording("panda", times[: len(q)], q, tau), cutoff=25.0, band=8.0)
@@ -93,7 +95,7 @@ def panda(folder: Path) -> Subject:
     steep = (5.1181, 9.0657, 10.136, 5.5903, 8.3469, 17.133, 10.336)
     inertial = by_parameters(model, {}, nominal=True)
 
-    def gaz(part: Equations) -> Array:
+    def gaz(part: RegressionEquations) -> Array:
         v = np.stack([part.Y[:, k, model.names.index(f"link{k + 1}.viscous")] for k in range(7)], axis=1)
         A, s, k = np.array(law), np.array(shift), np.array(steep)
         return inertial(part) + A / (1.0 + np.exp(-k * (v + s))) - A / (1.0 + np.exp(-k * s))
@@ -130,8 +132,10 @@ def tx40(folder: Path) -> Subject:
     gears[5, 4] = _TX40_GEARS[5]
     q = np.linalg.solve(gears, motor.T).T + np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
     names = [f"link{k + 1}" for k in range(6)]
-    drives = {name: Drive(row, friction(coulomb_velocity=0.03)) for name, row in zip(names, np.eye(6), strict=True)}
-    drives["wrist"] = Drive(np.array([0, 0, 0, 0, 1.0, 1.0]), friction(coulomb_velocity=0.03, offset=False))
+    drives = {
+        name: DriveModel(row, friction(coulomb_velocity=0.03)) for name, row in zip(names, np.eye(6), strict=True)
+    }
+    drives["wrist"] = DriveModel(np.array([0, 0, 0, 0, 1.0, 1.0]), friction(coulomb_velocity=0.03, offset=False))
     model = TorqueRegressor(plants.tx40(), drives=drives)
     recording = JointRecording("tx40", _TX40_PERIOD * np.arange(len(q)), q, torque @ gears)
     each = equations(model, recording, cutoff=100.0, band=12.0)
@@ -204,11 +208,11 @@ _KR300_COULOMB = 2e-4  # rad/s; friction changes as steeply as that, as its desi
 def kr300(folder: Path) -> dict[str, Subject]:
     """KUKA's KR300 R2500 (J. Weigand and others, 2021): three movements of 10 s at 250 Hz, each held out once.
 
-    The torques are those of the motors. A hydraulic spring on axis 2 carries a part of the weight.
+    The torques are the motors'. A hydraulic spring on axis 2 carries a part of the weight.
     """
     law = friction(coulomb_velocity=_KR300_COULOMB)
-    drives = {f"axis{k + 1}": Drive(row, law) for k, row in enumerate(np.eye(6))}
-    drives["spring"] = Drive(np.eye(6)[1], {"torque": lambda angle, rate, acceleration: kr300_spring(angle)})
+    drives = {f"axis{k + 1}": DriveModel(row, law) for k, row in enumerate(np.eye(6))}
+    drives["spring"] = DriveModel(np.eye(6)[1], {"torque": lambda angle, rate, acceleration: kr300_spring(angle)})
     model = TorqueRegressor(plants.kr300(), drives=drives)
     movements = []
     for path in sorted(folder.glob("recorded_trajectories/*/data.mat")):
@@ -248,7 +252,7 @@ def kr300_published(model: TorqueRegressor, folder: Path) -> Prediction:
     rotors = {f"axis{k + 1}.rotor": float(value) for k, value in enumerate(motors)}
     inertial = by_parameters(model, {"spring.torque": 1.0, **rotors}, nominal=True)
 
-    def torques(part: Equations) -> Array:
+    def torques(part: RegressionEquations) -> Array:
         v = np.stack([part.Y[:, k, model.names.index(f"axis{k + 1}.viscous")] for k in range(6)], axis=1)
         return inertial(part) + p.f_asym + p.f_vis * v + p.f_coul * np.tanh(100.0 * v) + p.f_a * np.tanh(p.f_b * v)
 
@@ -257,14 +261,17 @@ def kr300_published(model: TorqueRegressor, folder: Path) -> Prediction:
 
 # -- Unitree's Go2
 
-_GO2_KP, _GO2_KD = 20.0, 1.5
+# Stiffness of the controller of each joint, in N m/rad.
+_GO2_KP = 20.0
+# Damping of the controller of each joint, in N m s/rad.
+_GO2_KD = 1.5
 _GO2_LEGS = ("FL", "FR", "RL", "RR")
 
 
 def go2(folder: Path) -> dict[str, Subject]:
     """Unitree's Go2 (IIT's DLS lab): it hangs, and its legs follow a chirp for 23 s at 200 Hz.
 
-    The torques were not recorded: they are those of the drives' controllers, kp (q_d - q) - kd v.
+    The torques were not recorded: they follow from the drives' controllers, kp (q_d - q) - kd v.
     """
     with zipfile.ZipFile(folder / "traj_0.pt") as archive:
         times, q, desired = (

@@ -89,7 +89,7 @@ class Servicer:
 
     @property
     def offsets(self) -> tuple[float, ...]:
-        """Distance from the origin of the previous link (the foot, for the first) to that of each link, along z (m)."""
+        """Distance from the origin of the previous link (the foot, for the first) to its own, along z (m)."""
         return (self.foot, *self.lengths[:-1])
 
     @property

@@ -10,7 +10,7 @@ import casadi
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel, clamp
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Servicer
@@ -129,7 +129,7 @@ class ArmController(AddressedSystem):
         self._measured.mutable_array(state)[:] = measured
 
     def _gentle(self, context: Context, state: DiscreteValues, before: Array, rates: Array) -> Array:
-        """Return the rates on the way from those of the last period to ``rates`` whose momentum changes slowly.
+        """Return the rates on the way from the last period's to ``rates`` whose momentum changes slowly.
 
         The momentum and its rate are written to ``state``.
         """
@@ -232,7 +232,7 @@ class AttitudeController(AddressedSystem):
         output_ports:
         - wheel_torque
 
-    ``base`` is that of a `BaseEstimator`, ``reaction`` that of the `ArmController`. ``wheel_torque``, on the base about
+    ``base`` comes from a `BaseEstimator`, ``reaction`` from the `ArmController`. ``wheel_torque``, on the base about
     its axes (N m), is
 
         tau = dh_B/dt - J_B 2 b (w + u(theta)),   |u(theta)| = `stopping_speed` of |theta|,

@@ -16,7 +16,7 @@ from pydrake.systems.primitives import (
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.perception.target_tracker import TargetTracker
-from vtbdrake.components.sensors.calibration import make_calibration
+from vtbdrake.components.sensors.raw_values import make_calibration
 from vtbdrake_diagrams.satellite.bodies import JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.control import ACCELERATION, UNLIMITED, ArmController, AttitudeController
 from vtbdrake_diagrams.satellite.estimation import BaseEstimator

@@ -38,7 +38,7 @@ def joint_rates() -> Kernel:
 def reaction(*, holding: bool) -> Kernel:
     """Return [h_B (3,); J_B (9,)], by which the arm's motion turns the base, as a kernel of (q, qdot), (7,) each.
 
-    They are those of `MomentumModel.reaction`. The wheels are at rest, and open fingers count as closed ones.
+    See `MomentumModel.reaction`. The wheels are at rest, and open fingers count as closed ones.
 
     Args:
         holding: Whether the gripper holds the target, with G and H in one place.

@@ -37,7 +37,9 @@ from vtbdrake_diagrams.sdf import (
 )
 
 MODELS = Path(__file__).parent / "models"
-SERVICER_SDF, WHEELS_SDF, TARGET_SDF = (MODELS / f"{name}.sdf" for name in ("servicer", "wheels", "target"))
+SERVICER_SDF = MODELS / "servicer.sdf"
+WHEELS_SDF = MODELS / "wheels.sdf"
+TARGET_SDF = MODELS / "target.sdf"
 NOTE = "Written by diagrams/satellite/model.py; change diagrams/satellite/bodies.py, not this file."
 
 CONTACT_STIFFNESS = 2e5
@@ -45,8 +47,12 @@ CONTACT_STIFFNESS = 2e5
 FRICTION = 0.8
 """Static and dynamic friction of the fingers' pads and of the bar [assumed: rubber on metal]."""
 
-_GOLD, _WHITE, _DARK, _BLUE = "0.80 0.62 0.24 1", "0.86 0.87 0.88 1", "0.25 0.27 0.30 1", "0.10 0.16 0.40 1"
-_STEEL, _ORANGE = "0.60 0.62 0.65 1", "0.95 0.50 0.10 1"
+_GOLD = "0.80 0.62 0.24 1"
+_WHITE = "0.86 0.87 0.88 1"
+_DARK = "0.25 0.27 0.30 1"
+_BLUE = "0.10 0.16 0.40 1"
+_STEEL = "0.60 0.62 0.65 1"
+_ORANGE = "0.95 0.50 0.10 1"
 
 
 def servicer_sdf(servicer: Servicer | None = None) -> str:

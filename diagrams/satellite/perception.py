@@ -18,7 +18,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.arrival import Arrival
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.markers import MarkerBoard, MarkerDetectorConfig, detect_markers, pose_from_markers
@@ -30,7 +31,6 @@ from vtbdrake.components.perception.target_tracker import (
     TargetTracker,
     pose_of_state,
 )
-from vtbdrake.scan import Scan
 from vtbdrake.testbed.slow_part import SlowPart
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, BaseEstimator, pose_at

@@ -32,7 +32,7 @@ def add_servicer(
 
     Args:
         plant: The plant, not yet finalized.
-        servicer: Supplies home position and gains; the masses and dimensions are those of the SDF file.
+        servicer: Supplies home position and gains; the masses and dimensions come from the SDF file.
         wheels: Whether it has reaction wheels: the model instance ``wheels``, whose actuators take torques.
         servos: Whether arm and fingers have position servos (Drake's implicit PD controllers); otherwise their
             actuators take torques.

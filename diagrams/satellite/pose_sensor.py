@@ -85,7 +85,7 @@ class PoseReader(AddressedSystem):
         output_ports:
         - estimate
 
-    ``history`` is that of a `BaseEstimator`; ``estimate`` is a PoseEstimate of X_IT. A pose that arrives was measured
+    ``history`` comes from a `BaseEstimator`; ``estimate`` is a PoseEstimate of X_IT. A pose that arrives was measured
     one period of the DPS before, plus the parameter ``latency`` (s), whenever the sensor samples. It waits for a
     period, in which the history reaches that time, and then shows an estimate; else none is shown. A pose that equals
     the last one in all digits is taken for one that did not arrive: sensors have noise.

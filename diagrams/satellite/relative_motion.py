@@ -8,7 +8,7 @@ from functools import lru_cache
 import casadi
 from pydrake.systems.framework import BasicVector, Context
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.components.casadi_system.rotations import rotation_vector
 from vtbdrake.state import AddressedSystem
@@ -102,7 +102,7 @@ class RelativeMotion(AddressedSystem):
         output_ports:
         - relative
 
-    ``base`` is that of a `BaseEstimator`, ``target`` and ``status`` are those of a `TargetTracker`. The pose of the
+    ``base`` comes from a `BaseEstimator`, ``target`` and ``status`` from a `TargetTracker`. The pose of the
     base is extrapolated to the time of the others, one period later. ``relative`` is a `Relative` as a vector.
     """
 

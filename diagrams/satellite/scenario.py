@@ -12,24 +12,25 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain
 
+from vtbdrake.common.scan import Scan
+from vtbdrake.common.settings import setting
 from vtbdrake.components.environment.light import LightConfig
 from vtbdrake.components.perception.target_tracker import pose_of_state
 from vtbdrake.components.sensors import ErrorModel, Imu, JointEncoders
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.control.fallback import Hold
+from vtbdrake.control.robot_mode import RobotMode
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.drake_messages import image_map, scan_map
 from vtbdrake.lcm.maps import LcmMap, vector_map
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.scan import Scan
-from vtbdrake.settings import setting
+from vtbdrake.lcm.sensor_messages import image_map, scan_map
 from vtbdrake.state.systems import pose_later, pose_to_array
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, WHEEL_JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.dps import PERIOD, POSE_PERIOD, TargetSensors, make_dps
 from vtbdrake_diagrams.satellite.perception import PerceptionConfig, target_board
 from vtbdrake_diagrams.satellite.plant import plant_config
-from vtbdrake_diagrams.satellite.supervisor import GO, STOP
+from vtbdrake_diagrams.satellite.supervisor import GO, STAY, STOP
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
@@ -155,7 +156,7 @@ class SatelliteScenario(Scenario):
                 *self._abstract_signals(),
             ],
             act=act,
-            commands=[Signal("capture", size=1, lower=STOP, upper=GO, default=GO)],
+            commands=[Signal("capture", size=1, values=(STOP, STAY, GO), default=GO)],
         )
 
     def _abstract_signals(self) -> list[Signal]:
@@ -183,7 +184,9 @@ class SatelliteScenario(Scenario):
     def deployment(self) -> Deployment:
         """Return how the DPS runs on its satellite: joints hold after a fault, and CAPTURE carries the command.
 
-        Signals of numbers travel as ``lcmt_scope``; images and scans leave before them in the satellite's cycle.
+        Signals of numbers travel as ``lcmt_scope``; images and scans leave before them in the satellite's cycle. Before
+        those, it tells which commands act, on channels that end in ``_ACTING``, and on SATELLITE_MODE whether it takes
+        commands (see `RobotMode`): its own stop blocks them.
         """
         sense = [_lcm_map(signal, signal.name) for signal in reversed(self.interface().sense)]
         periods = {"TARGET_POSE": POSE_PERIOD}
@@ -192,9 +195,19 @@ class SatelliteScenario(Scenario):
         if "scanner" in self.aboard:
             periods["SCAN"] = 1.0 / self.scanner.frequency
         act = [_lcm_map(signal, f"{signal.name}_command") for signal in self.interface().act]
+        reported = {signal.name: f"{signal.name}_acting" for signal in self.interface().act}
+        reports = ["satellite_mode", *reported.values()]
+        sense = [*(vector_map(name.upper(), lcmt_scope, {name: "value"}) for name in reports), *sense]
         commands = [_lcm_map(signal, signal.name) for signal in self.interface().commands]
         return Deployment(
-            protocol=Protocol(sense=sense, act=act, commands=commands, periods=periods),
+            protocol=Protocol(
+                sense=sense,
+                act=act,
+                commands=commands,
+                reported=reported,
+                robot_mode=RobotMode(carrier="satellite_mode"),
+                periods=periods,
+            ),
             period=PERIOD,
             guards={"fallback": {"joint_position": Hold()}},
             continuity={

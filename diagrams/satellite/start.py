@@ -13,7 +13,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake_diagrams.satellite.bodies import Target
@@ -83,7 +83,7 @@ class Release(AddressedSystem):
 
     A plant has no default velocities. During the first step, of dt, the body is pushed by the momentum that it is to
     have, divided by dt; it then has the parameter ``velocity``, [angular (rad/s); linear (m/s)] in the world. The
-    body's frame is at its centre of mass, and its mass is that of the model.
+    body's frame is at its centre of mass, and its mass is the model's.
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, start: Start) -> None:

@@ -12,7 +12,7 @@ import casadi
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.declarations import NamedView
@@ -65,8 +65,12 @@ class Reason(IntEnum):
         return member
 
 
-GO, STAY, STOP = 1.0, 0.0, -1.0
-"""Values of the command ``capture``: go ahead, wait, abort."""
+GO = 1.0
+"""Value of the command ``capture``: go ahead."""
+STAY = 0.0
+"""Value of the command ``capture``: wait."""
+STOP = -1.0
+"""Value of the command ``capture``: abort."""
 
 # Time constant of the low-pass filter of the arm's positions, in s.
 _SMOOTHING = 0.5
@@ -165,7 +169,7 @@ class Supervisor(AddressedSystem):
         output_ports:
         - guidance
 
-    ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` is that of `RelativeMotion`. ``acceleration``
+    ``capture`` is the command: `GO`, `STAY` or `STOP`. ``relative`` comes from `RelativeMotion`. ``acceleration``
     limits how fast ``closing_speed`` is reached and left.
 
     ========= ============================================ =====================================================
@@ -189,7 +193,7 @@ class Supervisor(AddressedSystem):
     The open fingers' lips leave 25 mm of room on each side of the bar. The grip tolerance takes half of it; the other
     half is for what the target does while the fingers close.
 
-    The variables ``mode`` and ``reason`` are numbers: those of `Mode` and `Reason`.
+    The variables ``mode`` and ``reason`` are numbers of `Mode` and `Reason`.
     """
 
     def __init__(self, *, period: float, acceleration: float) -> None:
@@ -292,7 +296,7 @@ class Supervisor(AddressedSystem):
         return steady
 
     def _steer(self, guidance: NamedView, memory: NamedView, situation: _Situation, rate: float, p: NamedView) -> None:
-        """Approach the fixture, or go in along its axis; ``rate`` is that of the last period."""
+        """Approach the fixture, or go in along its axis; ``rate`` is the last period's."""
         T = self._period
         close = situation.error < p.position_tolerance and situation.angle < p.orientation_tolerance
         lasts = self._lasts(memory, close)

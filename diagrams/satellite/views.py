@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import counted
+from vtbdrake.common.argument_checks import counted
 from vtbdrake.state.systems import pose_to_array
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.satellite.supervisor import Mode

@@ -4,7 +4,7 @@ from libc.math cimport exp
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport numbers, writable
+from vtbdrake.common.array_memory cimport numbers, writable
 
 cnp.import_array()
 

@@ -13,8 +13,8 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus
 
+from vtbdrake.common.settings import setting
 from vtbdrake.components.sensors import ErrorModel
-from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
@@ -45,7 +45,7 @@ def _cenic() -> SimulatorConfig:
 
 @dataclass
 class CraterScenario(SpaceClimberScenario):
-    """The robot on the floor of a `Crater`, looking along x; ``u.walk`` starts it in the direction ``u.heading``.
+    """A six-legged robot in a `Crater` that it has to leave; ``u.walk`` starts it in the direction ``u.heading``.
 
     A simulation ends when the robot has passed the rim, or has tipped over by 60 deg: only its feet collide, so that
     what follows would mean nothing.
@@ -141,7 +141,7 @@ class CraterScenario(SpaceClimberScenario):
         return RigidTransform([0.0, 0.0, float(crater.mesh_height(Morphology().stance[:, :2]).max())])
 
     def _declare_belief(self, builder: VirtualTestbedBuilder) -> None:
-        """Declare what the robot believes; the elevation is that of its map plus its height over the ground."""
+        """Declare what the robot believes; the elevation is its map's plus its height over the ground."""
         ground = self.crater.height
         place = ["dps.impl.navigator.position", "dps.env.position[2]"]
         self._believe_base(builder, place, lambda p, height: [*p, height + float(ground(*p))])

@@ -36,7 +36,7 @@ class PerceivedEnvironment(AddressedSystem):
     not zero sets roll and pitch.
 
     Position: feet that are on the ground at two successive samples stand still, so the body moves against their mean
-    displacement. The height is that of the torso's centre over the ground under the feet, on average.
+    displacement. The height is the torso's centre's over the ground under the feet, on average.
     """
 
     def __init__(self, *, period: float, morphology: Morphology) -> None:

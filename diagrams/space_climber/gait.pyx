@@ -15,7 +15,7 @@ from libc.math cimport floor
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport numbers, writable
+from vtbdrake.common.array_memory cimport numbers, writable
 
 cnp.import_array()
 

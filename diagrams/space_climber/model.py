@@ -31,13 +31,11 @@ CLIMBER_SDF = MODELS / "space_climber.sdf"
 PAYLOAD_SDF = MODELS / "payload.sdf"
 NOTE = "Written by diagrams/space_climber/model.py; change the morphology, not this file."
 
-_SILVER, _DARK, _ORANGE, _BLACK, _GOLD = (
-    "0.75 0.77 0.80 1",
-    "0.25 0.27 0.30 1",
-    "0.95 0.50 0.10 1",
-    "0.08 0.08 0.08 1",
-    "0.80 0.65 0.20 1",
-)
+_SILVER = "0.75 0.77 0.80 1"
+_DARK = "0.25 0.27 0.30 1"
+_ORANGE = "0.95 0.50 0.10 1"
+_BLACK = "0.08 0.08 0.08 1"
+_GOLD = "0.80 0.65 0.20 1"
 _RIGHT_ANGLE = "1.5707963267948966"
 _ALONG_X = f"0 {_RIGHT_ANGLE} 0"
 _ALONG_Y = f"{_RIGHT_ANGLE} 0 0"
@@ -88,7 +86,7 @@ def _torso(model: ET.Element, m: Morphology) -> None:
 
 
 def _leg(model: ET.Element, m: Morphology, leg: str, *, p_BH: np.ndarray) -> None:
-    """Return three links in a row; the frame of each link is that of its joint."""
+    """Return three links in a row; the frame of each link is its joint's."""
     # Coxa: the thorax joint's housing (upright) and the basal joint's housing (across).
     half = m.coxa_mass / 2
     thorax = SpatialInertia.SolidCylinderWithMass(half, m.housing_radius, m.housing_length, [0, 0, 1])

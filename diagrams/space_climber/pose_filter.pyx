@@ -4,7 +4,7 @@ from libc.math cimport asin, atan2, copysign, cos, exp, fabs, fmod, hypot, pi, s
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport numbers, writable
+from vtbdrake.common.array_memory cimport numbers, writable
 from vtbdrake_diagrams.space_climber.kinematics cimport LEG_COUNT, LegKinematics
 
 cnp.import_array()

@@ -16,8 +16,8 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import MatrixGain
 
+from vtbdrake.common.settings import setting
 from vtbdrake.components.sensors import ContactSensor, Imu, JointEncoders
-from vtbdrake.settings import setting
 from vtbdrake.state.systems import pose_later
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps

@@ -41,7 +41,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 from scipy.special import ndtr
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.meshes import obj_mesh
 
 RIM_RADIUS = 40.0
@@ -65,8 +65,12 @@ FIELD_DENSITY = (0.5, 1.5)
 BOULDER_HEIGHT = (0.06, 0.5)
 BOULDER_EXPONENT = 2.5
 
-# Distances of the mesh's vertices in m: in the sector, along gullies, and elsewhere.
-_FINE, _ALONG_GULLY, _COARSE = 2.5, 1.5, 12.0
+# Distance of the mesh's vertices in the sector, in m.
+_FINE = 2.5
+# Distance of the vertices along gullies, in m.
+_ALONG_GULLY = 1.5
+# Distance of the vertices elsewhere, in m.
+_COARSE = 12.0
 _THICKNESS = 1.0
 
 _GREY = np.array([0.55, 0.53, 0.50, 1.0])

@@ -4,7 +4,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport numbers, writable
+from vtbdrake.common.array_memory cimport numbers, writable
 from vtbdrake_diagrams.space_climber.gait cimport Gait, fraction
 from vtbdrake_diagrams.space_climber.kinematics cimport LEG_COUNT, LegKinematics
 from vtbdrake_diagrams.space_climber.pose_filter cimport wrap

@@ -19,7 +19,10 @@ HOME = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])
 OPEN = 0.04
 """The distance of the fingers in m at first."""
 PERIOD = 0.005
-_SPEED, _ACCELERATION = 0.2, 1.0  # rad/s, rad/s^2, of the reference
+# Largest speed of the reference, in rad/s.
+_SPEED = 0.2
+# Largest acceleration of the reference, in rad/s^2.
+_ACCELERATION = 1.0
 _STIFFNESS = np.array([300.0, 300.0, 200.0, 200.0, 50.0, 40.0, 10.0])  # N m/rad
 _DAMPING = np.array([30.0, 30.0, 20.0, 20.0, 3.0, 2.0, 0.3])  # N m s/rad
 
@@ -95,7 +98,7 @@ def _commands() -> dict[str, StationCommand]:
 
 @dataclass
 class ArmStation(Station):
-    """The station of ``station.yaml``, under a `JointControl`; by default with torques."""
+    """An iiwa with a gripper, from a file of Drake's hardware_sim, under a `JointControl`; by default with torques."""
 
     file: ClassVar[str] = f"{FILE}#Torque"
 

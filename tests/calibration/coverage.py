@@ -1,4 +1,4 @@
-"""How often intervals of 95 % contain the truth: ``python -m tests.calibration.coverage`` prints it, in two minutes."""
+"""Coverage of the intervals of 95 %: ``python -m tests.calibration.coverage`` prints it, in two minutes."""
 
 from __future__ import annotations
 

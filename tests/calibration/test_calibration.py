@@ -104,6 +104,7 @@ def test_what_the_recording_cannot_tell_is_named() -> None:
     assert mass * center == pytest.approx(-0.36, rel=0.02)
 
 
+@pytest.mark.slow
 def test_inertia_as_a_whole_reports_the_body() -> None:
     result = calibrated(recorded(TRUTH, 2), PARAMETERS[2:], inertias=[Inertia(f"{ARM}.link")])
     numbers = {
@@ -117,13 +118,15 @@ def test_inertia_as_a_whole_reports_the_body() -> None:
     )
 
 
+@pytest.mark.slow
 def test_value_at_the_end_of_its_range_is_not_accepted() -> None:
     result = calibrated(recorded(TRUTH, 3), [*PARAMETERS[:2], Parameter(COULOMB, 0.0, 0.15), PARAMETERS[3]])
     assert result.parameters[COULOMB].value == 0.15 and result.parameters[COULOMB].verdict == Verdict.AT_BOUND
 
 
+@pytest.mark.slow
 def test_model_that_lacks_something_is_discrepant() -> None:
-    log = recorded(TRUTH, 4, seconds=8.0)
+    log = recorded(TRUTH, 4, seconds=4.0)
     torque = log.act["torque"]
     # A spring that nobody modelled, beside the motor: what acts is not what was commanded.
     q = log.sense["position"].values
@@ -142,7 +145,7 @@ def test_derivatives_of_the_innovations_are_those_of_differences() -> None:
     slopes = segments.innovations(noise, segments.linearized(z)).slopes
 
     def white(at: np.ndarray) -> np.ndarray:
-        # The filter's gain is not differentiated: it is that of z.
+        # The filter's gain is not differentiated: it is the gain for z.
         defects = segments.linearized(at).defects
         return segments.innovations(noise, segments.linearized(z)._replace(defects=defects)).white
 

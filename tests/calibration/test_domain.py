@@ -17,13 +17,13 @@ import vtbdrake as vtb
 from tests.monitoring.residuals.line import Line, Together, loop
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, Rhythm, machine
 from tests.reasoning.scenarios import MassScenario
-from vtbdrake.calibration import ValidityDomain, ValidityDomainError
+from vtbdrake import ValidityDomain, ValidityDomainError
+from vtbdrake.common.validity_domain import DomainWatch
 from vtbdrake.monitoring import DomainMonitor
 from vtbdrake.recording import Recorder
 from vtbdrake.recording.replay import replay
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.testbed import DpsAlone
-from vtbdrake.validity_domain import DomainWatch
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 
 pytestmark = pytest.mark.one_python
@@ -63,7 +63,7 @@ def test_windows_of_new_recordings_lie_outside_as_rarely_as_the_quantile_says() 
         for _ in range(12):
             domain = swinging(generator, quantile=quantile)
             shares += [outside(domain, swing(generator)) for _ in range(4)]
-        # Recordings differ, so that the shares scatter; their mean is that of 48 recordings.
+        # Recordings differ, so that the shares scatter; their mean is the mean of 48 recordings.
         assert np.mean(shares) == pytest.approx(1.0 - quantile, abs=0.4 * (1.0 - quantile) + 0.01)
 
 
@@ -187,6 +187,7 @@ def test_what_makes_no_domain_is_refused(call: Any, message: str) -> None:
 FEATURES = ["dps.seen", "dps.torque"]
 
 
+@pytest.mark.slow
 def test_rollout_and_loop_say_that_they_leave_the_domain(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     scenario = DrivenPendulum()
     runner = RolloutRunner(RolloutTask(scenario=scenario, horizon=60.0, sample_period=PERIOD, record=FEATURES))

@@ -7,10 +7,10 @@ import pytest
 
 from tests.calibration.pendulum import ARM, DRIVES, PERIOD, PendulumScenario
 from vtbdrake.calibration import CalibrationError, Excitation, Noise, calibrate, excitation
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, Series
-from vtbdrake.spline import Spline
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 
@@ -91,6 +91,7 @@ def test_calibration_with_the_designed_motion_leaves_less_than_with_a_naive_one(
     assert (np.array(deviations[0]) < 3.0 * predicted).all() and (np.array(deviations[0]) > predicted / 3.0).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.one_python
 @pytest.mark.parametrize(
     ("change", "message"),

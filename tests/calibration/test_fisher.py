@@ -71,7 +71,7 @@ def test_information_is_that_of_finite_differences() -> None:
     slopes = segments.innovations(noise, linearized).slopes.reshape(-1, 4)
     columns = []
     for k, step in enumerate((1e-5, 1e-6, 1e-5, 1e-5)):
-        # The gain of the filter is that of z.
+        # The filter has the gain for z.
         ends = [
             segments.innovations(noise, linearized._replace(defects=segments.linearized(at).defects)).white
             for at in (z + step * np.eye(4)[k], z - step * np.eye(4)[k])
@@ -174,6 +174,7 @@ def test_what_a_recording_will_tell_is_known_beforehand() -> None:
     assert np.all(told.alone <= told.together)
 
 
+@pytest.mark.slow
 def test_interval_at_a_bound_is_the_profile_of_the_likelihood() -> None:
     # No viscous friction: the best value would be negative in half of all recordings.
     truth = {**TRUTH, VISCOUS: 0.0}

@@ -57,13 +57,14 @@ def of_double_pendulum(log: Log) -> object:
     return calibrate(DoublePendulumScenario(), log, parameters, position="joint_position", torque="torque")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda q, u: (q[:, ::-1], u[:, ::-1]), "with joints 0 and 1 exchanged"),
         (lambda q, u: (q[:, ::-1], u), "with positions 0 and 1 exchanged"),
         (lambda q, u: (np.rad2deg(q), u), "with positions that are degrees"),
-        (lambda q, u: (q * [1, -1], u * [1, -1]), ""),
+        pytest.param(lambda q, u: (q * [1, -1], u * [1, -1]), "", marks=pytest.mark.slow),
         (lambda q, u: (q, u * [-1, 1]), "with the other sign of torque 0"),
         (lambda q, u: (q, 1000.0 * u), "with torques that are 1000 times too large"),
     ],
@@ -95,6 +96,7 @@ def test_times_in_another_unit_are_refused(factor: float, unit: str) -> None:
         calibrated(Log(log.source, *sides))
 
 
+@pytest.mark.slow
 def test_double_pendulum_as_it_is_recorded_is_accepted() -> None:
     result = of_double_pendulum(double_pendulum_log())
     assert result.accepted and not result.remarks, result
@@ -121,12 +123,14 @@ def test_gaps_cut_a_recording_and_it_stays_right() -> None:
     assert [len(piece.times) for piece in recording.pieces(longest=1.5)] == [500, 399, len(q) - 901]
 
 
+@pytest.mark.slow
 def test_positions_after_the_last_torque_are_left_out() -> None:
     log = pendulum_log()
     result = calibrated(Log("cut.csv", log.sense, {"torque": log.act["torque"].between(0.0, 4.0)}))
     assert result.accepted and any("of 1500 samples of position have no torque" in each for each in result.remarks)
 
 
+@pytest.mark.slow
 def test_torques_of_another_clock_are_mentioned() -> None:
     log = pendulum_log()
     u = log.act["torque"]
@@ -144,6 +148,7 @@ def test_torques_of_another_clock_are_mentioned() -> None:
     assert not any("vary the delay" in each for each in measured.remarks)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("defect", "text"),
     [
@@ -162,6 +167,7 @@ def test_columns_with_a_defect_are_never_accepted(
     assert any(text in each for each in (*result.remarks, *result.reasons)), (result.remarks, result.reasons)
 
 
+@pytest.mark.slow
 def test_sensor_that_freezes_is_not_accepted() -> None:
     def frozen(q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.where(np.arange(len(q))[:, np.newaxis] % 900 < 600, q, q[0]), u
@@ -177,6 +183,7 @@ def test_recording_without_any_motion_is_refused() -> None:
         calibrated(still)
 
 
+@pytest.mark.slow
 def test_recording_of_another_machine_is_not_accepted() -> None:
     # Positions of a mass on a spring, whose motion has nothing to do with the torques.
     times = PERIOD * np.arange(1500)
@@ -187,6 +194,7 @@ def test_recording_of_another_machine_is_not_accepted() -> None:
     assert any("another machine" in reason for reason in result.reasons), result
 
 
+@pytest.mark.slow
 def test_parameter_that_changes_nothing_is_refused_by_its_name() -> None:
     # The link turns about y alone, so that its moment about x is felt by nothing.
     idle = Parameter(f"{LINKS}.link.inertia[0]", 1e-3, 0.03)
@@ -205,6 +213,7 @@ def test_optimum_beyond_a_bound_is_doubted_and_others_are_not_accepted() -> None
     assert not any(each.verdict == Verdict.ACCEPTED for each in result.parameters.values())
 
 
+@pytest.mark.slow
 def test_start_on_a_bound_leaves_it() -> None:
     # The scenario begins at 0.1.
     result = calibrated(pendulum_log(), [*PARAMETERS[:2], Parameter(COULOMB, 0.1, 1.0), PARAMETERS[3]])

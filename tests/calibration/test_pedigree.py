@@ -33,6 +33,7 @@ def result_of_inertia() -> Calibration:
     return calibrated(recorded(TRUTH, 22, seconds=6.0), PARAMETERS[2:], inertias=[Inertia(f"{ARM}.link")])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", [result, result_of_inertia])
 def test_file_gives_the_calibrated_scenario_again(make, tmp_path: Path) -> None:
     calibration = make()

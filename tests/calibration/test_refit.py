@@ -85,6 +85,7 @@ def rig(mass: float = HEAVY, **options: Any) -> Iterator[Rig]:
         yield pendulum
 
 
+@pytest.mark.slow
 def test_accepted_model_ends_the_alarm_and_replays(tmp_path: Path) -> None:
     with rig() as pendulum:
         with Recorder(pendulum.loop, tmp_path / "log") as recorder:
@@ -106,7 +107,7 @@ def test_accepted_model_ends_the_alarm_and_replays(tmp_path: Path) -> None:
 
 def test_user_decides_what_is_taken() -> None:
     offers: list[Calibration] = []
-    with rig(accept=lambda calibration: bool(offers.append(calibration))) as pendulum:
+    with rig(seconds=8.0, segment=2.0, accept=lambda calibration: bool(offers.append(calibration))) as pendulum:
         pendulum.run_until_calibrated()
         pendulum.together.run(100)
         (refit,) = pendulum.refit.refits
@@ -122,6 +123,7 @@ def test_nothing_is_calibrated_without_an_alarm() -> None:
         assert not (pendulum.monitor.alarms or pendulum.refit.refits or pendulum.refit.pending)
 
 
+@pytest.mark.slow
 def test_calibration_that_fails_is_told_and_changes_nothing(caplog: pytest.LogCaptureFixture) -> None:
     with rig(torque="no_signal") as pendulum:
         pendulum.run_until_calibrated()

@@ -9,7 +9,7 @@ from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 
 from vtbdrake.calibration import (
     CalibrationError,
-    Drive,
+    DriveModel,
     JointRecording,
     TorqueRegressor,
     base_parameters,
@@ -17,7 +17,8 @@ from vtbdrake.calibration import (
     friction,
     regress,
 )
-from vtbdrake.calibration.model import inertia_of, log_cholesky
+from vtbdrake.calibration.joint_model import log_cholesky
+from vtbdrake.testbed.inertia import inertia_of
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.recorded_arms import plants
 
@@ -121,6 +122,7 @@ def test_panda_has_as_many_base_parameters_as_published() -> None:
     assert len(base_parameters(TorqueRegressor(plants.panda(), drives={})).names) == 43
 
 
+@pytest.mark.slow
 def test_intervals_cover_hidden_parameters(double: TorqueRegressor) -> None:
     base = base_parameters(double)
     truth, covered = base.B @ double.vector(TRUTH), []
@@ -173,7 +175,7 @@ def test_own_numbers_count_where_a_recording_says_little(double: TorqueRegressor
 def test_motor_coupled_to_two_joints_has_one_friction(double: TorqueRegressor) -> None:
     plant = DoublePendulumScenario().build().plant
     assert plant is not None
-    both = Drive(np.array([1.0, 1.0]), friction(offset=False))
+    both = DriveModel(np.array([1.0, 1.0]), friction(offset=False))
     model = TorqueRegressor(plant, drives={"both": both})
     v = np.array([[0.5, -0.2]])
     Y = model.matrix(np.zeros((1, 2)), v, np.zeros((1, 2)))[0]
@@ -224,4 +226,4 @@ def test_values_of_no_parameter_are_refused(double: TorqueRegressor) -> None:
     with pytest.raises(CalibrationError, match=r"shoulder\.viscos is no parameter"):
         double.vector({"shoulder.viscos": 1.0})
     with pytest.raises(CalibrationError, match="direction"):
-        TorqueRegressor(plants.pendulum(), drives={"motor": Drive(np.ones(2), friction())})
+        TorqueRegressor(plants.pendulum(), drives={"motor": DriveModel(np.ones(2), friction())})

@@ -37,7 +37,7 @@ class InterruptAt(logging.Handler):
 @pytest.mark.one_python
 def test_model_repeats_the_log_of_a_machine_to_rounding() -> None:
     truth = {DELAY: 3.0, FRICTION: 0.7, PAYLOAD: 1.3}
-    log = machine_log(SCENARIO, 0.5, machine=MachineConfig(values=truth), values=PLANNED)
+    log = machine_log(SCENARIO, 0.25, machine=MachineConfig(values=truth), values=PLANNED)
     model = JointModel(SCENARIO.build(), [Parameter(address, 0.0, 5.0) for address in truth])
     recording = JointRecording.of(log, model, position=POSITION, torque=TORQUE)
     z = np.array(list(truth.values()))

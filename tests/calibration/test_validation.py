@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 
 from tests.chromium import needs_chromium, screenshot
 from vtbdrake.calibration import Comparison, ToleranceConfig, compare
-from vtbdrake.calibration.validation import Verdict, delay, sprague_geers, whiteness
+from vtbdrake.calibration.validation import ComparisonVerdict, delay, sprague_geers, whiteness
 from vtbdrake.recording import Log, LogError, Series
 
 pytestmark = pytest.mark.one_python
@@ -70,7 +70,7 @@ def test_numbers_of_a_known_difference() -> None:
     assert second.rmse == pytest.approx(0.5 / sqrt(TIMES.size))
     r, s = reference[:, 0], reference[:, 0] + 0.1
     assert first.phase == pytest.approx(acos(r @ s / sqrt(r @ r * (s @ s))) / pi)
-    assert result.verdict == Verdict.NOT_JUDGED and first.samples == 2001 and np.isnan(first.coverage)
+    assert result.verdict == ComparisonVerdict.NOT_JUDGED and first.samples == 2001 and np.isnan(first.coverage)
 
 
 def test_simulation_is_taken_at_the_times_of_the_recording() -> None:
@@ -87,9 +87,9 @@ def test_band_of_several_simulations_covers_what_it_says() -> None:
         of(generator.normal(size=TIMES.size)), simulations, tolerances={"q": ToleranceConfig(coverage=0.9)}
     )
     # A binomial share of 2001 samples, with three standard deviations; the band's own quantiles err, too.
-    assert result.signals["q"].coverage == pytest.approx(0.95, abs=0.02) and result.verdict == Verdict.WITHIN
+    assert result.signals["q"].coverage == pytest.approx(0.95, abs=0.02) and result.verdict == ComparisonVerdict.WITHIN
     narrow = compare(of(3.0 + TIMES), simulations, tolerances={"q": ToleranceConfig(coverage=0.9)})
-    assert narrow.verdict == Verdict.BEYOND and "coverage 0" in narrow.signals["q"].beyond[0]
+    assert narrow.verdict == ComparisonVerdict.BEYOND and "coverage 0" in narrow.signals["q"].beyond[0]
 
 
 def test_verdict_names_what_is_exceeded() -> None:
@@ -98,9 +98,11 @@ def test_verdict_names_what_is_exceeded() -> None:
     def judged(simulated: np.ndarray) -> Comparison:
         return compare(Log("run.csv", of(np.sin(TIMES)), {}), of(simulated), tolerances={"q": tolerance})
 
-    assert judged(np.sin(TIMES)).verdict == Verdict.WITHIN
+    assert judged(np.sin(TIMES)).verdict == ComparisonVerdict.WITHIN
     late = judged(np.sin(TIMES - 0.05))
-    assert late.verdict == Verdict.BEYOND and [reason.split()[0] for reason in late.signals["q"].beyond] == ["delay"]
+    assert late.verdict == ComparisonVerdict.BEYOND and [reason.split()[0] for reason in late.signals["q"].beyond] == [
+        "delay"
+    ]
     assert re.match(r"delay 0\.0(5|49)\d* > 0.01", late.signals["q"].beyond[0])
     still = judged(np.full(TIMES.size, 0.1))  # What cannot be computed is no success.
     assert [reason.split()[0] for reason in still.signals["q"].beyond] == ["rmse", "largest", "delay", "magnitude"]
@@ -109,6 +111,15 @@ def test_verdict_names_what_is_exceeded() -> None:
     assert [text.get_text() for text in course.get_legend().get_texts()] == ["recorded", "simulated"]
 
 
+def test_page_names_its_recording_and_the_verdict(tmp_path: Path) -> None:
+    recorded = Log("a<b.csv", of(np.sin(TIMES)), {})
+    result = compare(recorded, of(np.sin(TIMES - 0.1)), tolerances={"q": ToleranceConfig(rmse=1e-3)})
+    result.save_html(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert "a&lt;b.csv: beyond tolerances" in text and "data:image/png;base64," in text
+
+
+@pytest.mark.slow
 @needs_chromium
 def test_page_holds_verdict_numbers_and_plot(tmp_path: Path, browser: Browser) -> None:
     recorded = Log("a<b.csv", of(np.stack([np.sin(TIMES), TIMES], axis=1)), {})
@@ -149,6 +160,7 @@ def test_what_cannot_be_compared_is_refused(reference, simulation, tolerances, m
         compare(reference, simulation, tolerances=tolerances)
 
 
+@pytest.mark.slow
 def test_impossible_tolerance_is_refused() -> None:
     with pytest.raises(ValueError, match="ToleranceConfig.rmse must be a number of at least 0, not -1.0"):
         ToleranceConfig(rmse=-1.0)

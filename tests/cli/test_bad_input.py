@@ -36,11 +36,14 @@ def negative(_: float) -> float:
         ),
         (["variable", PENDULUM], "No such command 'variable'"),
         (["view", PENDULUM, "--certificate", __file__], "--certificate and --key go with --tls"),
+        (["view", PENDULUM, "--host", "0.0.0.0"], "expected NAME:PORT of a proxy that offers the page"),
+        (["view", PENDULUM, "--host", "0.0.0.0:80"], "this is no address to listen on"),
         (["view", PENDULUM, "--key", __file__], "--certificate and --key go with --tls"),
         ([*ROLLOUT, "--set", "dps.gian=1"], "did you mean dps.gain"),
         ([*ROLLOUT, "--set", "dps.gain=[1,2]"], "has shape (4,)"),
         ([*ROLLOUT, "--set", "dps.gain=[1,2,3,NaN]"], "must be finite"),
         ([*ROLLOUT, "--set", "dps.gain=stiff"], "a number or a JSON list of numbers, not 'stiff'"),
+        ([*ROLLOUT, "--set", "dps.gain=1,2"], "in brackets, and in quotes for the shell: 'dps.gain=[1,2]'"),
         ([*ROLLOUT, "--set", "dps.ticks=true"], "a number or a JSON list of numbers, not 'true'"),
         ([*ROLLOUT, "--set", "dps.gain"], "ADDRESS=VALUE, not 'dps.gain'"),
         ([*ROLLOUT, "--set", "dps.ticks=1", "--set", "dps.ticks=2"], "dps.ticks is set twice"),
@@ -151,15 +154,18 @@ def test_damaged_snapshot(tmp_path: Path) -> None:
     assert "damaged" in error_of(*ROLLOUT, "--start", path)
 
 
+SERIAL = ("--executor", "serial")
+
+
 def test_sweep_without_a_success_has_exit_code_1() -> None:
     vary = ["--vary", "sim.sys.Acrobot.elbow.position=0:1:2", "--set", "sim.sys.Acrobot.lower_link.mass=0"]
-    error = error_of("sweep", ACROBOT, *vary, "--quality", "dps.torque", "--horizon", "1", code=1)
+    error = error_of("sweep", ACROBOT, *vary, "--quality", "dps.torque", "--horizon", "1", *SERIAL, code=1)
     assert "all 2 rollouts failed; the first: RuntimeError: An internal mass matrix" in error
 
 
 def test_failures_are_listed_below_the_table_once() -> None:
     vary = ["--vary", "sim.sys.Acrobot.lower_link.mass=0:1:2", "--quality", "dps.torque", "--horizon", "0.1"]
-    result = run("sweep", ACROBOT, *vary)
+    result = run("sweep", ACROBOT, *vary, *SERIAL)
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
     assert [line.split()[-1] for line in lines[2:4]] == ["failed", "horizon"]

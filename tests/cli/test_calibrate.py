@@ -30,6 +30,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_library(table: Path, tmp_path: Path) -> None:
     saved = tmp_path / "pendulum.yaml"
     program = run("calibrate", SCENARIO, table, *SIGNALS, *COLUMNS, *VARY, "--save", saved, "--json")

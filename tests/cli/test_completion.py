@@ -16,16 +16,14 @@ pytestmark = pytest.mark.one_python
 ROBOTS = "from vtbdrake import Scenario\n\nclass RobotScenario(Scenario):\n    pass\n\nclass Other:\n    pass\n"
 
 
-def completed(line: str, folder: Path) -> list[str]:
-    """Return what bash offers at the end of a line."""
+def completed(*lines: str, folder: Path) -> list[list[str]]:
+    """Return what one bash offers at the end of each line."""
     program = folder / "bin" / "vtbdrake"
     program.parent.mkdir(exist_ok=True)
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m vtbdrake.cli "$@"\n')
     program.chmod(0o755)
-    script = (
-        f"compopt() {{ :; }}; source <(vtbdrake completion bash); COMP_LINE={line!r}; COMP_POINT=${{#COMP_LINE}}; "
-        "_vtbdrake_completion vtbdrake; printf '%s\\n' \"${COMPREPLY[@]}\""
-    )
+    ask = 'COMP_LINE={!r}; COMP_POINT=${{#COMP_LINE}}; _vtbdrake_completion vtbdrake; echo "${{COMPREPLY[@]}}"'
+    script = "\n".join(["compopt() { :; }; source <(vtbdrake completion bash)", *map(ask.format, lines)])
     path = f"{program.parent}:{os.environ['PATH']}"
     result = subprocess.run(
         ["bash", "-c", script],
@@ -36,47 +34,53 @@ def completed(line: str, folder: Path) -> list[str]:
         check=True,
     )
     assert result.stderr == ""
-    return result.stdout.split()
+    return [line.split() for line in result.stdout.splitlines()]
 
 
 def test_commands_options_and_choices(tmp_path: Path) -> None:
-    assert completed("vtbdrake ro", tmp_path) == ["rollout"]
-    assert completed("vtbdrake study ed", tmp_path) == ["edit"]
-    assert completed("vtbdrake rollout x:Y --hor", tmp_path) == ["--horizon"]
-    assert completed("vtbdrake diagram x:Y --mode tw", tmp_path) == ["twin"]
+    lines = ("vtbdrake ro", "vtbdrake study ed", "vtbdrake rollout x:Y --hor", "vtbdrake diagram x:Y --mode tw")
+    assert completed(*lines, folder=tmp_path) == [["rollout"], ["edit"], ["--horizon"], ["twin"]]
 
 
 def test_scenarios_of_the_folder_and_of_the_testbeds(tmp_path: Path) -> None:
     (tmp_path / "robots.py").write_text(ROBOTS)
-    # Bash takes a colon for the end of a word.
-    assert completed("vtbdrake rollout robots:", tmp_path) == ["RobotScenario"]
-    assert completed("vtbdrake rollout rob", tmp_path) == ["robots:RobotScenario"]
-    assert completed("vtbdrake view vtbdrake_diagrams.cart_pole:", tmp_path) == ["CartPoleScenario"]
     (tmp_path / "heavy.yaml").write_text("")
-    assert completed("vtbdrake rollout robots:RobotScenario@h", tmp_path) == ["heavy.yaml"]
+    scenarios = completed(
+        "vtbdrake rollout robots:",
+        "vtbdrake rollout rob",
+        "vtbdrake view vtbdrake_diagrams.cart_pole:",
+        "vtbdrake rollout robots:RobotScenario@h",
+        "vtbdrake view cart_",
+        folder=tmp_path,
+    )
+    # Bash takes a colon for the end of a word.
+    assert scenarios == [
+        ["RobotScenario"],
+        ["robots:RobotScenario"],
+        ["CartPoleScenario"],
+        ["heavy.yaml"],
+        ["cart_pole"],
+    ]
 
 
 def answers(line: str, folder: Path) -> list[str]:
     """Return what the program answers to bash."""
-    asked = subprocess.run(
-        [sys.executable, "-c", "from vtbdrake.cli import main; main(prog_name='vtbdrake')"],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "_VTBDRAKE_COMPLETE": "bash_complete", "COMP_LINE": line},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return asked.stdout.split()
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("_VTBDRAKE_COMPLETE", "bash_complete")
+        environment.setenv("COMP_LINE", line)
+        result = run(cwd=folder)
+    assert result.exit_code == 0
+    return result.stdout.split()
 
 
 def test_parameters_of_a_study_and_files(tmp_path: Path) -> None:
     begin = (PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--quality", ANGLE, "--rollouts", 1)
     assert run("study", "run", tmp_path / "a.db", *begin, "--executor", "serial", "--solver", "random").exit_code == 0
-    assert answers("vtbdrake study try a.db sim", tmp_path) == [f"plain,{ANGLE}"]
-    assert answers("vtbdrake study freeze a.db ", tmp_path) == [f"plain,{ANGLE}"]
+    assert answers("vtbdrake study intervene a.db try sim", tmp_path) == [f"plain,{ANGLE}"]
+    assert answers("vtbdrake study intervene a.db freeze ", tmp_path) == [f"plain,{ANGLE}"]
     (tmp_path / "gait.yaml").write_text("")
     assert answers("vtbdrake study run a.db ga", tmp_path) == ["plain,gait.yaml"]
-    assert answers("vtbdrake study freeze gait.yaml ", tmp_path) == []
+    assert answers("vtbdrake study intervene gait.yaml freeze ", tmp_path) == []
     for line in ("rollout x:Y --save ", "view x:Y --start ", "study run ", "export a.lcm "):
         assert answers(f"vtbdrake {line}", tmp_path) == ["file,"]
 

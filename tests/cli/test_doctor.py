@@ -47,6 +47,7 @@ def test_every_check_has_a_result_and_what_is_missing_a_remedy() -> None:
     assert code == 0
 
 
+@pytest.mark.slow
 def test_missing_parts_are_warnings_that_fail_if_required(tmp_path: Path) -> None:
     lacking = {"CC": str(tmp_path / "cc"), "LIBGL_DRIVERS_PATH": "/nonexistent"}
     code, results = diagnosis(**lacking)
@@ -56,6 +57,7 @@ def test_missing_parts_are_warnings_that_fail_if_required(tmp_path: Path) -> Non
     assert diagnosis("--require", "compiler", **lacking)[0] == 1
 
 
+@pytest.mark.slow
 def test_no_network_is_a_failure() -> None:
     alone = ("unshare", "--user", "--map-root-user", "--net")
     if shutil.which("unshare") is None or subprocess.run([*alone, "true"], capture_output=True).returncode:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from tornado.websocket import websocket_connect
 from tests.cli.program import ROOT
 from tests.diagrams.forest.riding import RidingScenario, motion
 from tests.visualization.meshcat_page import decoded
+from tests.web.serving.entrance import entered
 from vtbdrake.components.localization.landmarks import map_landmarks
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.testbed import Interface
 from vtbdrake_diagrams.forest.pictures.display import main, program
@@ -37,6 +40,10 @@ class PatientScenario(RidingScenario):
         declared = super().interface()
         return replace(declared, sense=[replace(signal, max_age=TIMEOUT) for signal in declared.sense])
 
+    def deployment(self) -> Deployment:
+        deployment = super().deployment()
+        return replace(deployment, guards={**deployment.guards, "max_missed": inf})
+
 
 def start(module: str, *arguments: object) -> subprocess.Popen[str]:
     fields = ("--field", f"seed={SEED}", "--field", f"stand_seed={SEED}")
@@ -48,7 +55,7 @@ async def drawn_with_carrier(url: str) -> dict[str, np.ndarray]:
     """Return the first picture with a carrier that a display shows: matrices (4, 4) by path below ``display``."""
     matrices: dict[str, np.ndarray] = {}
     has_carrier = False
-    page = await websocket_connect(url.replace("http", "ws"))
+    page = await websocket_connect(entered(url).replace("http", "ws", 1))
     while not (has_carrier and "" in matrices):
         message = decoded(await page.read_message())
         path = message.get("path", "").removeprefix("/drake/display").removeprefix("/")
@@ -61,6 +68,7 @@ async def drawn_with_carrier(url: str) -> dict[str, np.ndarray]:
     return matrices
 
 
+@pytest.mark.slow
 def test_display_shows_what_another_process_knows() -> None:
     with Hub(port=0) as hub, ExitStack() as stack:
         common = (SCENARIO, "--url", hub.url)

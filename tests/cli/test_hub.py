@@ -74,13 +74,14 @@ def protected(url: str) -> set[str]:
     return found[0]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("arguments", "channels", "warns"),
     [
-        ((), {"VTB_SET", "VTB_RESET"}, True),
-        (("tests.control.servo_machine:ServoMachineScenario",), {"IIWA_COMMAND", "VTB_SET", "VTB_RESET"}, False),
-        (("--protect", "A"), {"A", "VTB_SET", "VTB_RESET"}, False),
-        (("--protect", "A", "--unprotected"), {"A"}, False),
+        ((), set(), True),
+        (("tests.control.servo_machine:ServoMachineScenario",), {"IIWA_COMMAND"}, False),
+        (("--protect", "A", "tests.control.servo_machine:ServoMachineScenario"), {"A", "IIWA_COMMAND"}, False),
+        (("--protect", "A", "--unprotected", "tests.control.servo_machine:ServoMachineScenario"), {"A"}, False),
         (("--unprotected",), set(), False),
     ],
 )

@@ -21,7 +21,7 @@ from tests.recording.servo import Servo
 from tests.testbeds import PendulumScenario
 from vtbdrake import Parameter, Problem, Quality
 from vtbdrake.cli import main
-from vtbdrake.cli.output import plain
+from vtbdrake.common.json_data import plain
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.rollout.named_function import magnitude
 
@@ -116,8 +116,8 @@ def test_sweep_and_boundary_have_the_values_of_the_library() -> None:
     common = ("--quality", RATE, "--threshold", 4, "--horizon", 2)
     swept, expected = result("sweep", PENDULUM, "--vary", f"{ANGLE}=0:3:4", *common), problem.sweep(4, progress=False)
     assert [entry["h"] for entry in swept["points"]] == expected.h.tolist()
-    assert swept["best"] == dict(zip(("point", "h"), expected.best(), strict=True))
-    steps = {"resolution": 0.1, "coarse": 0.5, "repeats": 2}
+    assert swept["best"] == {"point": expected.best.parameters, "h": expected.best.value}
+    steps = {"resolution": 0.25, "coarse": 0.5, "repeats": 2}
     options = [f"--{name}={value}" for name, value in steps.items()]
     bounded = result("boundary", PENDULUM, "--vary", f"{ANGLE}=0:3", *common, *options)
     interval = problem.boundary(**steps, progress=False)
@@ -129,7 +129,7 @@ def test_study_has_its_points(tmp_path: Path) -> None:
     begin = (PENDULUM, "--horizon", 0.3, "--vary", f"{ANGLE}=-1.5:1.5", "--quality", ANGLE, "--sample-period", 0.1)
     ran = result("study", "run", file, *begin, "--rollouts", 4, "--executor", "serial", "--solver", "sobol")
     assert ran["reason"] in ("budget", "solver") and len(ran["points"][ANGLE]) == 4
-    tried = result("study", "try", file, f"{ANGLE}=0.5", "--by", "me")
+    tried = result("study", "intervene", file, "try", f"{ANGLE}=0.5", "--by", "me")
     assert (tried["number"], tried["name"], tried["payload"]) == (1, "me", {"point": {ANGLE: 0.5}})
     assert result("study", "history", file) == [tried]
     assert result("study", "attribute", file, "operator=me") == {"operator": "me"}

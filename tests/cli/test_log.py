@@ -35,6 +35,7 @@ def test_replay_compares_and_writes_what_was_recorded(path: Path, tmp_path: Path
     program = run("replay", path, *SCENARIO, "--record", "dps.velocity", "--out", out)
     assert program.exit_code == 0, program.stderr
     assert "20 cycles replayed, 0 digests of the state: identical" in program.stdout
+    assert out.stat().st_mode & 0o777 == 0o600  # What a machine has done is its owner's.
     table = pandas.read_csv(out)
     assert len(table) == 20 and table["t"].is_monotonic_increasing
     assert np.ptp(table["dps.velocity[0]"]) > 0.0
@@ -145,5 +146,5 @@ def test_problem_that_cannot_be_viewed_is_told() -> None:
     assert "cannot import nothing" in error_of("view", PENDULUM, "--problem", "nothing:problem")
     assert "is no Problem" in error_of("view", PENDULUM, "--problem", "tests.testbeds:PENDULUM")
     assert "SCENARIO --problem swing:NAME" in error_of("view", "studies/swing.py")
-    other = error_of("view", PENDULUM, "--problem", "tests.web.test_drive:problem")
+    other = error_of("view", PENDULUM, "--problem", "tests.web.live.test_drive:problem")
     assert "the problem is one of LimitedPendulumScenario" in other

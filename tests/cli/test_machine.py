@@ -44,6 +44,7 @@ def test_machine_has_the_parameters_that_are_asked_for(hub: Hub) -> None:
     assert "0.04 s simulated" in program.stdout
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_machine_runs_until_it_is_interrupted(hub: Hub, ending: signal.Signals) -> None:
     with start("--url", hub.url) as program:

@@ -72,7 +72,7 @@ def test_scenario_of_another_module_is_named_by_the_user(tmp_path: Path) -> None
     assert "importing a module runs its code: name the scenario" in refused
     assert "antigravity" not in sys.modules
     assert run("open", file, "--scenario", PENDULUM, "-o", tmp_path / "a.html").exit_code == 0
-    assert "not that of" in error_of("open", file, "--scenario", ACROBOT, "-o", tmp_path / "a.html")
+    assert "does not belong to" in error_of("open", file, "--scenario", ACROBOT, "-o", tmp_path / "a.html")
 
 
 def test_fields_of_the_scenario_are_those_of_the_snapshot() -> None:
@@ -81,7 +81,7 @@ def test_fields_of_the_scenario_are_those_of_the_snapshot() -> None:
     assert scenario_of(changed.record()) == changed
     with pytest.raises(ScenarioError, match="no field 'colour'"):
         scenario_of({**CartPoleScenario().record(), "colour": 1.0})
-    with pytest.raises(ScenarioError, match="not that of"):
+    with pytest.raises(ScenarioError, match="does not fit"):
         scenario_of({k: v for k, v in CartPoleScenario().record().items() if k != "simulator.accuracy"})
 
 

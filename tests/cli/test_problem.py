@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.cli.program import ACROBOT, ANGLE, DAMPING, PENDULUM, RATE, run
 from tests.testbeds import PendulumScenario
@@ -33,7 +34,7 @@ def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> Non
         [f"{p:.6g}", f"{r.h:.6g}", f"{r.t_star:.6g}", r.end]
         for p, r in zip(expected.points[:, 0], expected.rollouts, strict=True)
     ]
-    (point, h) = expected.best()
+    point, h = expected.best.parameters, expected.best.value
     assert lines[-2:] == [
         f"best: h = {h:.6g} at {ANGLE} = {point[ANGLE]:.6g} rad (the upper end of its range)",
         f"boundary: {expected.boundary()}",
@@ -43,6 +44,7 @@ def test_sweep_prints_and_saves_what_the_library_computes(tmp_path: Path) -> Non
     assert files[2].read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_sweep_with_a_python_quality_in_processes() -> None:
     vary = ("--vary", "sim.sys.Acrobot.elbow.position=0.1:0.3:2", "--horizon", 0.2)
     quality = ("--quality", "math:hypot", "--of", "dps.torque", "--of", "sim.sys.Acrobot.elbow.velocity")
@@ -64,6 +66,7 @@ def test_sweep_over_two_parameters_has_a_row_per_pair_and_condition() -> None:
     assert f"condition 1 ({DAMPING} = 0.5)" in lines
 
 
+@pytest.mark.slow
 def test_boundary_for_all_and_for_each_condition() -> None:
     problem = stated(conditions=[{DAMPING: 0.1}, {DAMPING: 0.5}])
     expected = problem.boundary(resolution=0.1, coarse=0.5, repeats=2, progress=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import resource
 import signal
@@ -17,6 +18,7 @@ from pathlib import Path
 import lcm
 import numpy as np
 import pytest
+from drake import lcmt_iiwa_command
 
 from tests.cli.program import ROOT, error_of, run
 from tests.control.scripted import PERIOD
@@ -26,6 +28,8 @@ from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
+from vtbdrake.recording.log_format import CYCLE
+from vtbdrake.recording.log_reader import LogEvents, read_log
 from vtbdrake.state import Snapshot
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
@@ -42,19 +46,20 @@ def hub() -> Iterator[Hub]:
         yield running
 
 
-def start(*arguments: object, priority: int = 0) -> subprocess.Popen[str]:
-    """``vtbdrake run`` in a process of its own, which tells in its last line what it had imported."""
+def start(*arguments: object, priority: int = 0, group: bool = False) -> subprocess.Popen[str]:
+    """``vtbdrake run`` in a process (or group) of its own, which tells in its last line what it had imported."""
     program = (
         "import sys; from vtbdrake.cli import main\n"
         "try: main(prog_name='vtbdrake')\n"
         "finally: print(*sorted(sys.modules))"
     )
     command = [sys.executable, "-u", "-c", program, "run", *map(str, arguments), "--priority", str(priority)]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=group)
 
 
 def snapshot_in_motion(path: Path, *, lock_step: bool = False) -> Snapshot:
-    """Of the whole testbed, where its DPS has been at work for a while."""
+    """A state of the whole testbed, where its DPS has been at work for a while."""
     testbed = ServoMachineScenario(lock_step=lock_step).build()
     simulator = testbed.simulator()
     testbed.write(simulator.get_mutable_context(), {"u.target": [0.1, -0.05], "dps.gain": 3.0})
@@ -83,6 +88,7 @@ def commands_of_the_whole_testbed(hub: Hub, snapshot: Snapshot) -> list[float]:
     return ear.torques[: 2 * CYCLES]
 
 
+@pytest.mark.slow
 def test_dps_alone_commands_like_the_testbed(tmp_path: Path) -> None:
     snapshot, lock_step = snapshot_in_motion(tmp_path / "s", lock_step=True), ("--field", "lock_step=true")
     with Hub(port=0) as hub:
@@ -104,6 +110,7 @@ def test_dps_alone_commands_like_the_testbed(tmp_path: Path) -> None:
     assert "deadlines missed" in output
 
 
+@pytest.mark.slow
 def test_the_arm_is_run_without_its_plant() -> None:
     program = (
         "import sys; from vtbdrake_diagrams.manipulator import ManipulatorScenario as S; import vtbdrake.cli.run;"
@@ -122,7 +129,8 @@ def test_the_arm_is_run_without_its_plant() -> None:
     assert Deployment.of(ManipulatorScenario()).continuity.keys() == {"joint_torque"}
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_in_the_end_the_fallback_goes_out_once(hub: Hub, ending: signal.Signals) -> None:
     with MachineProcess(ServoMachineScenario(rate=0.0), hub.url):
         ear = Ear(hub.url)
@@ -134,6 +142,40 @@ def test_in_the_end_the_fallback_goes_out_once(hub: Hub, ending: signal.Signals)
     assert program.returncode == 0, errors
     # No velocity; before that the DPS is on its way.
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_log_holds_the_last_commands_when_the_whole_group_is_ended(
+    hub: Hub, tmp_path: Path, ending: signal.Signals
+) -> None:
+    """As systemd and ``timeout`` do it, the second of them twice."""
+    path = tmp_path / "log.lcm"
+    fields = ("--field", "leave_time=0.5", "--set", "u.target=[0.1,-0.05]", "--set", "dps.gain=2.0")
+    with MachineProcess(ServoMachineScenario(), hub.url):
+        ear = Ear(hub.url)
+        with start(SERVO, "--url", hub.url, "--record", path, *fields, group=True) as program:
+            ear.listen(lambda: len(ear.torques) >= 40)
+            os.killpg(program.pid, ending)
+            os.killpg(program.pid, ending)
+            _, errors = program.communicate(timeout=PATIENCE)
+    assert program.returncode == 0, errors
+    assert f"recorded to {path}, without a loss" in errors
+    events = LogEvents(path)
+    sent = [lcmt_iiwa_command.decode(events.data(begin, end)) for _, _, begin, end in events.on(COMMAND)]
+    after = [
+        message.joint_torque for message, (n, *_) in zip(sent, events.on(COMMAND), strict=True) if n > last(events)
+    ]
+    ear.listen(lambda: sent[-1].utime in ear.utimes)
+    assert [message.utime for message in sent if message.utime in ear.utimes] == ear.utimes
+    speeds = np.abs(after).max(axis=1)
+    assert len(after) > 10 and (np.diff(speeds) <= 0.0).all() and speeds[-1] == 0.0 < speeds[0]
+    assert read_log(path).closed
+
+
+def last(events: LogEvents) -> int:
+    """Return the number of the event of the last cycle."""
+    return int(events.places(CYCLE)[-1, 0])
 
 
 @contextmanager
@@ -154,6 +196,7 @@ def intruder(url: str) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.slow
 def test_second_publisher_delays_switch_and_alarms(hub: Hub) -> None:
     options = ("--url", hub.url, "--no-live", *FAR)
     with MachineProcess(ServoMachineScenario(), hub.url), ExitStack() as stack:
@@ -177,6 +220,7 @@ def may_have_priority() -> bool:
     return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not may_have_priority(), reason="needs the right to SCHED_FIFO")
 def test_endless_step_sends_the_fallback(hub: Hub) -> None:
     with MachineProcess(ServoMachineScenario(rate=0.0), hub.url):
@@ -191,6 +235,7 @@ def test_endless_step_sends_the_fallback(hub: Hub) -> None:
     assert np.flatnonzero((heard == 0.0).all(axis=1)).tolist() == [len(heard) - 1]
 
 
+@pytest.mark.slow
 def test_run_ends_in_time_and_writes_files(hub: Hub, tmp_path: Path) -> None:
     files = ("--statistics", tmp_path / "s.json", "--record", tmp_path / "log.lcm")
     with MachineProcess(ServoMachineScenario(), hub.url):
@@ -206,6 +251,7 @@ def test_run_ends_in_time_and_writes_files(hub: Hub, tmp_path: Path) -> None:
     assert (tmp_path / "log.lcm").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_log_that_lacks_cycles_is_an_error(hub: Hub, tmp_path: Path) -> None:
     with MachineProcess(ServoMachineScenario(), hub.url):
         options = ("--url", hub.url, "--seconds", 1.0, "--no-live", "--record", tmp_path / "log.lcm")
@@ -217,6 +263,7 @@ def test_log_that_lacks_cycles_is_an_error(hub: Hub, tmp_path: Path) -> None:
     assert re.search(r"^Error: \d+ of \d+ cycles of the loop are not in the log .*log\.lcm$", errors, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:
     with MachineProcess(ServoMachineScenario(), hub.url), start(SERVO, "--url", hub.url, *FAR) as program:
         try:
@@ -237,6 +284,7 @@ def test_a_dps_that_runs_is_read_set_and_watched(hub: Hub) -> None:
     assert refused.stderr.startswith("Error: there is no variable") and "did you mean dps.gain" in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_stopped_dps_goes_on_with_the_machine_back(hub: Hub) -> None:
     options = ("--url", hub.url, "--field", "max_age=0.2", "--pace", "", *FAR)
     patience = ("--url", hub.url, "--timeout", PATIENCE)
@@ -269,6 +317,7 @@ def test_silent_machine_is_given_up(hub: Hub) -> None:
     assert "position" in last and "speed" in last
 
 
+@pytest.mark.slow
 def test_a_frozen_owner_of_the_commands_is_succeeded_only_on_request() -> None:
     with Hub(port=0, protect=[COMMAND], lease=0.05) as hub:
         owner, options = lcm.LCM(hub.url), ("--url", hub.url, "--no-live", "--pace", "", *FAR)
@@ -296,6 +345,7 @@ def another_snapshot(folder: Path) -> Path:
     return folder / "other"
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("scenario", "options", "code", "message"),
     [
@@ -318,7 +368,8 @@ def test_bad_input_is_one_line(
     assert message in error_of("run", scenario, "--url", hub.url, *given, code=code)
 
 
-def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub) -> None:
+@pytest.mark.parametrize("ending", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub, ending: signal.Signals) -> None:
     options = ("--url", hub.url, "--field", "max_age=0.05", "--pace", "", "--no-live", *FAR)
     with MachineProcess(ServoMachineScenario(), hub.url) as machine, start(SERVO, *options) as program:
         assert program.stderr is not None
@@ -327,7 +378,7 @@ def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub) -> None:
         # It goes on, with what is safe.
         assert any("the fallbacks command from now on" in line for line in program.stderr)
         assert program.poll() is None
-        program.send_signal(signal.SIGTERM)
+        program.send_signal(ending)
         output, errors = program.communicate(timeout=PATIENCE)
     assert program.returncode == 1
     assert "Error: the fallbacks took over: " in errors

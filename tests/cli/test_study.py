@@ -31,10 +31,10 @@ def test_a_study_is_run_shown_given_points_and_resumed(tmp_path: Path) -> None:
     assert f"best: magnitude = {expected.best.value:g} at" in begun.stdout
 
     for arguments in (
-        ["try", file, f"{ANGLE}=0.5", f"{RATE}=1"],
-        ["try", file, f"{ANGLE}=0.25", f"{RATE}=0"],
+        ["intervene", file, "try", f"{ANGLE}=0.5", f"{RATE}=1"],
+        ["intervene", file, "try", f"{ANGLE}=0.25", f"{RATE}=0"],
         ["edit", file, 1, f"{RATE}=2", f"{ANGLE}=-0.5"],
-        ["try", file, f"{ANGLE}=1", f"{RATE}=1"],
+        ["intervene", file, "try", f"{ANGLE}=1", f"{RATE}=1"],
         ["remove", file, 3],
         ["attribute", file, "operator=somebody=else"],
         ["attribute", file, "marks=[1, 2]", "--trial", 0],
@@ -94,8 +94,8 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path) -> None:
     for arguments, message in (
         (["run", file, *BEGIN], "give rollouts=, seconds= or target="),
         (["show", tmp_path / "none.db"], "does not exist"),
-        (["try", file, f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
-        (["try", file, f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
+        (["intervene", file, "try", f"{ANGLE}=9", f"{RATE}=0"], "outside its range"),
+        (["intervene", file, "try", f"{ANGLE}=1", f"{ANGLE}=2"], "is set twice"),
         (["remove", file, 7], "no intervention 7 waits"),
         (["attribute", file, "a=1", "--trial", 99], "no trial 99"),
         (["run", file, *BEGIN, "--rollouts", 4, "--seed", 3], "was begun with seed 0, not 3"),
@@ -125,6 +125,7 @@ def test_a_wrong_option_says_what_it_takes(arguments: list[str], message: str, t
     assert message in error_of("study", "run", *common, *arguments)
 
 
+@pytest.mark.slow
 def test_a_study_is_steered_by_commands_and_replayed_without_one(tmp_path: Path) -> None:
     file, new = tmp_path / "a.db", tmp_path / "b.db"
     begin = ["study", "run", file, *BEGIN, "--choose", f"{DAMPING}=0.1,0.2,0.4", "--executor", "serial"]
@@ -145,7 +146,7 @@ def test_a_study_is_steered_by_commands_and_replayed_without_one(tmp_path: Path)
         ["resume"],
         ["try", f"{ANGLE}=0.5", f"{RATE}=1", f"{DAMPING}=0.2"],
     ):
-        done = run("study", arguments[0], file, *arguments[1:])
+        done = run("study", "intervene", file, *arguments)
         assert (done.exit_code, done.stderr) == (0, ""), arguments
     assert "try" in done.stdout and "waits for the next batch, as soon as the study runs" in done.stdout
 
@@ -182,6 +183,10 @@ def test_a_study_is_steered_by_commands_and_replayed_without_one(tmp_path: Path)
         (["forbid", f"{ANGLE}=:"], "no point is left"),
         (["aspiration", "-1"], "an aspiration belongs to several qualities"),
         (["solver", "nonsense"], "there is no solver 'nonsense'"),
+        (["pause", "--bye", "Ada"], "pause takes no argument, not '--bye Ada'"),
+        (["try"], "try takes ADDRESS=VALUE [...], and none is given"),
+        (["allow", "first"], "allow takes NUMBER, not 'first'"),
+        (["pause", "--option", "batch=2"], "--option is for another solver, not for pause"),
     ],
 )
 def test_an_intervention_that_makes_no_sense_is_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -192,4 +197,4 @@ def test_an_intervention_that_makes_no_sense_is_one_line(arguments: list[str], m
         quality=Quality(magnitude, ANGLE),
         horizon=0.3,
     ).study(file, solver="sobol").close()
-    assert message in error_of("study", arguments[0], file, *arguments[1:])
+    assert message in error_of("study", "intervene", file, *arguments)

@@ -31,11 +31,11 @@ from pydrake.systems.primitives import (
 )
 from pydrake.trajectories import PiecewisePolynomial
 
+from vtbdrake.common.spline import ORDERS, Spline
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.sensors import ErrorModel, JointEncoders, JointTachometers
 from vtbdrake.components.spline_command import SplineCommand
-from vtbdrake.spline import ORDERS, Spline
 
 PERIODS = (0.1, 0.02, 0.03, 0.05, 0.04)
 OFFSETS = (0.0, 0.0, 0.01, 0.06, 0.07)
@@ -179,7 +179,7 @@ class RandomDiagram:
         return PassThrough(self.size())
 
     def add_arm(self) -> None:
-        """Add two links with sensors, of which some are in error, and sometimes with drives."""
+        """Add two links with sensors, some of them in error, and sometimes with drives."""
         step = float(self.random.choice([0.005, 0.01, 0.02]))
         plant = MultibodyPlant(step)
         plant.SetUseSampledOutputPorts(bool(self.random.random() < 0.5))

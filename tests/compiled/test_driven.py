@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlantConfig
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.recording import DrivenScenario, Log, read_table
 from vtbdrake.rollout import RolloutTask, SerialExecutor
 from vtbdrake.testbed import Scenario
@@ -49,7 +49,7 @@ def in_drake(scenario: Scenario, address: str, values: list[float], outputs: lis
     return {output: np.array([result.record[output] for result in results]) for output in outputs}
 
 
-@pytest.mark.parametrize("name", DRIVEN)
+@pytest.mark.parametrize("name", ["pendulum", "arm", pytest.param("arm in the middle", marks=pytest.mark.slow)])
 def test_follows_the_log_as_in_drake(name: str) -> None:
     scenario, varied = DRIVEN[name]
     ((address, values),) = varied.items()

@@ -14,7 +14,7 @@ from vtbdrake.compiled.equations import Expression
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Budget, OnboardReasoner, Reasoner, SearchConfig
 from vtbdrake.rollout import Quality, RolloutTask, SerialExecutor, Start
-from vtbdrake.rollout.compiled import CompiledExecutor
+from vtbdrake.rollout.compiled_executor import CompiledExecutor
 
 SAMPLED = 0.3
 OUTPUTS = (STATE, *(f"{PLANNER}.{name}" for name in ("decision", "sampled_at", "valid", "taken")))
@@ -24,7 +24,7 @@ class LawEquations(Equations):
     def output(self, port: str, at: At) -> Expression:
         return at.state(0)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         x, v = at.input("state")[0], at.input("state")[1]
         return {0: 9.0 * (at.input("valid") * at.input("setpoint") - x) - 1.5 * v}
 

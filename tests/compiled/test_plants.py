@@ -8,12 +8,21 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
-from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, MatrixGain, Sine, ZeroOrderHold
+from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia, WeldJoint
+from pydrake.symbolic import Variable, exp, sin
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import (
+    ConstantValueSource,
+    ConstantVectorSource,
+    MatrixGain,
+    Sine,
+    SymbolicVectorSystem,
+    ZeroOrderHold,
+)
 
-from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
-from vtbdrake.compiled.check import TOLERANCE, compare
+from vtbdrake.compiled import EQUATIONS, At, CompiledRollouts, Equations, UnsupportedTestbedError
+from vtbdrake.compiled.agreement import TOLERANCE, compare
 from vtbdrake.state.systems import collect
 
 BOX = SpatialInertia.SolidBoxWithMass(1.5, 0.2, 0.3, 0.4)
@@ -82,6 +91,23 @@ def test_an_actuator_without_input_rests_and_generalized_forces_act() -> None:
     np.testing.assert_allclose(end[2:], 0.3 * np.array([1.0, -2.0]) / 1.5, rtol=1e-12)
 
 
+def test_actuation_ports_add_up() -> None:
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    two_carts(plant)
+    builder.AddNamedSystem("plant", plant)
+    whole = builder.AddNamedSystem("whole", ConstantVectorSource([1.0, -2.0]))
+    part = builder.AddNamedSystem("part", ConstantVectorSource([3.0]))
+    builder.Connect(whole.get_output_port(), plant.get_actuation_input_port())
+    left = plant.GetModelInstanceByName("left")
+    builder.Connect(part.get_output_port(), plant.get_actuation_input_port(left))
+    rollouts = rollouts_of(builder.Build(), ("plant.state", "whole.y0"))
+    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    end = rollouts().outputs
+    np.testing.assert_allclose(end["plant.state"][0, -1, 2:], 0.3 * np.array([4.0, -2.0]) / 1.5, rtol=1e-12)
+    np.testing.assert_array_equal(end["whole.y0"][0, -1], [1.0, -2.0])
+
+
 def test_a_floating_base_tumbles() -> None:
     builder = DiagramBuilder()
     plant = MultibodyPlant(0.01)
@@ -100,7 +126,7 @@ def test_a_floating_base_tumbles() -> None:
 
 
 def test_poses_of_bodies_are_recorded() -> None:
-    """They are those of a floating base that turns through all angles, and of a link with a tilted joint."""
+    """A floating base turns through all angles, and so does a link with a tilted joint."""
     builder = DiagramBuilder()
     plant = MultibodyPlant(0.01)
     base, arm = (plant.AddRigidBody(name, BOX) for name in ("base", "arm"))
@@ -134,6 +160,112 @@ def test_a_rollout_that_reaches_a_stop_is_not_valid() -> None:
     source = builder.AddNamedSystem("force", ConstantVectorSource([5.0, 0.0]))
     builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
     batch = rollouts_of(builder.Build())({"force.value": [[0.1, 0.0], [5.0, 0.0]]})
+    assert batch.valid.tolist() == [True, False]
+
+
+class Weigh(LeafSystem):
+    """The force that a joint exerts on its child along z (N)."""
+
+    def __init__(self, place: int) -> None:
+        super().__init__()
+        self.place = place
+        forces = Value[list[SpatialForce]]()
+        self.DeclareAbstractInputPort("reaction_forces", forces)
+        self.DeclareVectorOutputPort("force", 1, self._weigh)
+
+    def _weigh(self, context: Context, output) -> None:
+        forces = self.get_input_port().Eval(context)
+        output[0] = forces[self.place].translational()[2]
+
+
+class WeighEquations(Equations):
+    def output(self, port: str, at: At):
+        return at.input("reaction_forces")(self.system.place)[5]
+
+
+def weighed(plant: MultibodyPlant, joint: str) -> tuple[DiagramBuilder, MultibodyPlant]:
+    """Return the builder of a plant without sampled ports, and of a `Weigh` of a joint."""
+    plant.Finalize()
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("plant", plant)
+    places = [plant.get_joint(index).name() for index in plant.GetJointIndices()]
+    weigh = builder.AddNamedSystem("weigh", Weigh(places.index(joint)))
+    builder.Connect(plant.get_reaction_forces_output_port(), weigh.get_input_port())
+    return builder, plant
+
+
+@pytest.fixture
+def weigh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Weigh, WeighEquations)
+
+
+@pytest.mark.parametrize("hanging", ["slide", "weld"])
+@pytest.mark.usefixtures("weigh")
+def test_reaction_of_a_joint_whose_parent_hangs_on_its_child(hanging: str) -> None:
+    """The slider is blocked by nothing, and falls; the joint of the other kind carries the box below it."""
+    plant = MultibodyPlant(0.01)
+    plant.SetUseSampledOutputPorts(False)
+    carrier, box = plant.AddRigidBody("carrier", BOX), plant.AddRigidBody("box", BOX)
+    plant.AddJoint(PrismaticJoint("along", plant.world_frame(), carrier.body_frame(), [1, 0, 0]))
+    frames = box.body_frame(), carrier.body_frame()
+    # Held by nothing along y, so that it carries all the weight.
+    plant.AddJoint(
+        WeldJoint("hung", *frames, RigidTransform([0.0, 0.0, 0.3]))
+        if hanging == "weld"
+        else PrismaticJoint("hung", *frames, [0, 1, 0])
+    )
+    builder, plant = weighed(plant, "hung")
+    rollouts = rollouts_of(builder.Build(), ("weigh.force",))
+    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    # The child is the carrier, which the box pulls down.
+    np.testing.assert_allclose(rollouts().outputs["weigh.force"][0], -1.5 * 9.81, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("weigh")
+def test_a_stop_that_is_felt_in_the_last_step_makes_the_forces_invalid() -> None:
+    plant = MultibodyPlant(0.01)
+    plant.SetUseSampledOutputPorts(False)
+    body = plant.AddRigidBody("box", BOX)
+    plant.AddJoint(PrismaticJoint("down", plant.world_frame(), body.body_frame(), [0, 0, 1], -1.0, 1.0))
+    builder, plant = weighed(plant, "down")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    joint, own = plant.GetJointByName("down"), plant.GetMyMutableContextFromRoot(context)
+
+    def falls(height: float) -> bool:
+        """Return whether a box that begins above its stop has a valid rollout of two steps."""
+        joint.set_translation(own, -1.0 + height)
+        rollouts = CompiledRollouts(
+            diagram,
+            collect(diagram),
+            context,
+            horizon=0.02,
+            sample_period=0.01,
+            outputs=["weigh.force"],
+            compile=False,
+        )
+        simulator = Simulator(diagram, context.Clone())
+        simulator.AdvanceTo(0.02)
+        port = diagram.GetSubsystemByName("weigh").get_output_port()
+        feels = port.Eval(diagram.GetSubsystemByName("weigh").GetMyContextFromRoot(simulator.get_context()))[0]
+        batch = rollouts()
+        assert (abs(feels - batch.outputs["weigh.force"][0, -1, 0]) < 1e-9) == batch.valid[0]
+        return bool(batch.valid[0])
+
+    # Two steps fall by 3 g T^2, and a stop is felt 2 T ahead: in the third step, 3 g T^2 + 2 * 3 g T^2 below the begin.
+    assert falls(9.1 * 9.81e-4)
+    assert not falls(8.9 * 9.81e-4)
+
+
+def test_a_state_that_is_infinite_for_a_while_makes_the_rollout_invalid() -> None:
+    time, x, scale = Variable("time"), Variable("x"), Variable("scale")
+    peak = SymbolicVectorSystem(
+        time=time, state=[x], parameter=[scale], dynamics=[exp(scale * sin(40.0 * time))], output=[x], time_period=0.02
+    )
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("peak", peak)
+    batch = rollouts_of(builder.Build(), ("peak.y0",))({"peak.parameter_0": [[1.0], [800.0]]})
+    assert np.isfinite(batch.outputs["peak.y0"][:, -1]).all()
     assert batch.valid.tolist() == [True, False]
 
 

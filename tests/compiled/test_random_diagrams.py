@@ -46,16 +46,19 @@ def difference(seed: int, *, t0: float = 0.0, compile: bool = False) -> float:
     return max(largest, np.max(apart) / max(1.0, np.max(np.abs(expected[state]))))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(20))
 def test_is_the_diagram(seed: int) -> None:
     assert difference(seed) <= 1e-11
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(3))
 def test_machine_code_is_the_diagram(seed: int) -> None:
     assert difference(100 + seed, compile=True) <= 1e-11
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("t0", [0.02, 0.3, 0.055, 1.2])
 def test_begins_at_any_time(t0: float) -> None:
     assert difference(7, t0=t0) <= 1e-11
@@ -63,6 +66,6 @@ def test_begins_at_any_time(t0: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_two_hundred_are_the_diagram() -> None:
-    differences = {seed: difference(seed, t0=float(seed % 3) * 0.05) for seed in range(1000, 1200)}
+def test_forty_others_are_the_diagram() -> None:
+    differences = {seed: difference(seed, t0=float(seed % 3) * 0.05) for seed in range(1000, 1040)}
     assert max(differences.values()) <= 1e-11

@@ -1,4 +1,4 @@
-"""What cannot be compiled is refused by name, and what is compiled wrongly is noticed."""
+"""Testbeds that cannot be compiled are refused by name, and wrong compilations are noticed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from pydrake.symbolic import Expression, Variable, uninterpreted_function
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     Context,
     Diagram,
@@ -38,6 +39,7 @@ from vtbdrake.compiled import (
 )
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import collect
+from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
 
@@ -98,6 +100,15 @@ def compiled(diagram: Diagram, outputs: tuple[str, ...] = (), **options) -> Comp
 def test_names_the_system(diagram: Callable[[], Diagram], reason: str) -> None:
     with pytest.raises(UnsupportedTestbedError, match=reason):
         compiled(diagram())
+
+
+def test_of_a_continuous_world_the_plant_alone_is_named() -> None:
+    with pytest.raises(UnsupportedTestbedError) as told:
+        DoublePendulumScenario().build().compiled(horizon=0.1, compile=False)
+    assert str(told.value) == (
+        "the testbed cannot be compiled: plant: MultibodyPlant has continuous state, and a compiled rollout has steps: "
+        "give it a time step (MultibodyPlantConfig(time_step=0.001)), or take another executor"
+    )
 
 
 def test_names_contact() -> None:
@@ -162,6 +173,40 @@ def test_wrong_equations_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled(alone(Squares()), check=False)
 
 
+class Logistic(AddressedSystem):
+    """The logistic map: what rounding makes doubles in each step, and becomes as large as the state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._x = self.declare_discrete_state(x=Quantity(0.3))
+        self.DeclareStateOutputPort("x", self._x.index)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.02, 0.0, self._update)
+
+    def _update(self, context: Context, state) -> None:
+        x = self._x.array(context)[0]
+        self._x.mutable_array(state)[0] = 3.999 * x * (1.0 - x)
+
+
+class LogisticEquations(Equations):
+    """The same, rounded in another way."""
+
+    def output(self, port: str, at: At):
+        return at.state(0)
+
+    def update(self, at: At):
+        return {0: 3.999 * at.state(0) - 3.999 * at.state(0) ** 2}
+
+
+def test_a_chaotic_diagram_is_not_taken_for_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EQUATIONS, Logistic, LogisticEquations)
+    diagram = alone(Logistic())
+    rollouts = compiled(diagram, outputs=("part0.x",))
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(1.0)
+    apart = rollouts().outputs["part0.x"][0, -1] - simulator.get_context().get_discrete_state_vector().CopyToVector()
+    assert abs(apart[0]) > 1e-6
+
+
 class MoreSquares(Squares):
     """Computes something else than its base class, as the equations of that cannot tell."""
 
@@ -187,7 +232,7 @@ def test_what_may_end_a_simulation_is_named() -> None:
 
 @TemplateSystem.define("Counter_")
 def Counter_(T: type) -> type:
-    """Count in a way of its own, which Drake converts to symbolic expressions; ``periods`` are those of its updates."""
+    """Count in a way of its own, which Drake converts to symbolic expressions; ``periods`` are its updates'."""
 
     class Impl(LeafSystem_[T]):
         def _construct(self, periods=(), per_step=False, most=np.inf, converter=None) -> None:
@@ -216,7 +261,7 @@ def Counter_(T: type) -> type:
 
 @pytest.mark.parametrize("events", [{"periods": (0.1, 0.3)}, {"per_step": True}, {}])
 def test_state_that_is_updated_otherwise_is_named(events: dict) -> None:
-    with pytest.raises(UnsupportedTestbedError, match="part0: Counter has other state than that of one periodic"):
+    with pytest.raises(UnsupportedTestbedError, match="part0: Counter has state beside one periodic"):
         compiled(alone(Counter_[float](**events)), check=False)
 
 

@@ -1,4 +1,4 @@
-"""What arrives at a DPS, and when: from sensors that sample by another clock, drop out and are late."""
+"""Samples arrive at a DPS with their dates: from sensors that sample by another clock, drop out and are late."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.sensors import ImageRgba8U
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.arrival import Arrival
-from vtbdrake.scan import Scan
 from vtbdrake.testbed import SlowPart
 
 PERIOD = 0.02

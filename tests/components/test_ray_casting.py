@@ -32,7 +32,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.ray_casting import TOLERANCE, Hits, RayCaster
 
 AT_REST = SpatialVelocity.Zero()
@@ -131,7 +131,7 @@ def test_incidence_is_that_of_the_gradient(name: str) -> None:
     hits = still(caster, directions, X_WL, RigidTransform())
     points = X_WL.translation() + hits.distances[:, np.newaxis] * directions
     gradient = [(distance(points + h) - distance(points - h)) / 2e-6 for h in 1e-6 * np.eye(3)]
-    # A facet's normal is that of the surface up to half the angle between two facets.
+    # A facet has the normal of the surface up to half the angle between two facets.
     assert np.abs(hits.cosines - np.abs(np.sum(np.array(gradient).T * directions, axis=1))).max() < 0.03
 
 

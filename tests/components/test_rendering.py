@@ -10,6 +10,7 @@ from vtbdrake.components.rendering import RenderingError, check_rendering
 
 
 # As if the packages were not there: where libEGL finds Mesa, and Mesa its drivers.
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("variable", ["__EGL_VENDOR_LIBRARY_FILENAMES", "LIBGL_DRIVERS_PATH"])
 def test_missing_package_is_an_error_that_names_it(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("VTBDRAKE_RENDERING", raising=False)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vtbdrake.common.settings import check_settings
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.rocks import RockDetectorConfig
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig
@@ -14,7 +15,6 @@ from vtbdrake.components.localization.tracking import Tracker
 from vtbdrake.components.localization.trunks import TrunkDetectorConfig
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
-from vtbdrake.settings import check_settings
 
 pytestmark = pytest.mark.one_python
 

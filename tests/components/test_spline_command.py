@@ -9,8 +9,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from scipy.interpolate import BSpline, interp1d, make_interp_spline
 
+from vtbdrake.common.spline import ORDERS, Spline
 from vtbdrake.components.spline_command import SplineCommand
-from vtbdrake.spline import ORDERS, Spline
 
 PERIOD, DURATION, KNOTS, SIZE = 0.02, 0.5, 6, 2
 W = np.random.default_rng(5).normal(size=(KNOTS, SIZE))

@@ -49,7 +49,7 @@ TWO = np.array([[0, 1, 2], [0, 2, 3]])
 
 def test_tiles_lie_at_their_places_on_level_ground() -> None:
     ground = np.column_stack([SQUARE, np.zeros(4)])
-    above = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 1.0])  # The image's x is that of the world.
+    above = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 1.0])  # The image's x is the world's.
     image = photograph(tiled_mesh((ground, TWO), image=QUARTERS, tile=(2.0, 2.0)), above)
     for (x, y), color in {
         (0.4, 0.4): (255, 255, 255),

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status
 
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.testbed import Interface, Signal
 
 SENSE = {"position": "joint_position_measured", "torque": "joint_torque_external"}

@@ -88,12 +88,17 @@ class Servo(AddressedSystem):
         self.DeclareStateOutputPort("velocity", self._command.index)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
 
+    @staticmethod
+    def law(gain: float, error: np.ndarray) -> np.ndarray:
+        """Return the velocity that is commanded in a distance from the target."""
+        return gain * error
+
     def _update(self, context: Context, discrete: Any) -> None:
         trouble = self._faults.view(context).trouble
         if trouble == 1.0:
             raise RuntimeError("out of ideas")
         position = self._position.Eval(context)
-        velocity = self._gain.view(context).gain * (self._target.Eval(context) - position)
+        velocity = self.law(self._gain.view(context).gain, self._target.Eval(context) - position)
         self._command.mutable(discrete).velocity = velocity if trouble == 0.0 else [np.nan, 0.0]
         self._counter.mutable(discrete).ticks += 1.0
         self._sensed.mutable(discrete).seen = position

@@ -9,7 +9,7 @@ from drake import lcmt_scope
 
 from tests.control.scripted import PERIOD, ServoScenario
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.testbed import Interface

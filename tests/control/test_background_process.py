@@ -9,36 +9,11 @@ import time
 import numpy as np
 import pytest
 
+from tests.control.background_functions import echo, fail, fall_asleep, sum_up, tell_scheduling
 from tests.interruptions import hanging_fails
 from vtbdrake.control.background_process import BackgroundProcess, FrameConnection
 
 TIMEOUT = 60.0
-
-
-def echo(connection):
-    while True:
-        connection.send_frame(connection.receive_frame())
-
-
-def sum_up(connection):
-    total = 0
-    try:
-        while True:
-            total += len(connection.receive_frame())
-    except EOFError:
-        connection.send_frame(str(total).encode())
-
-
-def fall_asleep(connection):
-    signal.pause()
-
-
-def tell_scheduling(connection):
-    connection.send_frame(f"{os.sched_getscheduler(0)} {len(os.sched_getaffinity(0))}".encode())
-
-
-def fail(connection, code):
-    os._exit(code)
 
 
 def taken(worker, count):

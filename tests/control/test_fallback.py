@@ -1,4 +1,4 @@
-"""Tests of the commands of fallbacks, and of which of them fit which signal."""
+"""Tests of the commands of fallbacks, and of the signals that each of them fits."""
 
 from __future__ import annotations
 

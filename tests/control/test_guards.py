@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vtbdrake.control.fallback import NO_COMMAND, Brake, Fallback, FallbackController, Hold, Sample, Silence, Zero
-from vtbdrake.control.guards import Guards, Verdict
+from vtbdrake.control.guards import GuardDecision, Guards, LoopCondition
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.testbed import Interface, Signal
 
@@ -45,14 +45,16 @@ class Loop:
                 if signal.is_vector:
                     self.guards.start(signal.name, np.zeros(signal.size))
 
-    def cycle(self, commands: Mapping[str, Any], **options: Any) -> Verdict:
+    def cycle(
+        self, commands: Mapping[str, Any], active: list[str] | None = None, at: float = nan, **condition: Any
+    ) -> GuardDecision:
         self.now += T
         if not self.silent:
             for signal in self.received.values():
                 signal.arrived, signal.count = self.now, signal.count + 1
-        return self.guards.judge(self.now, self.received, commands, **options)
+        return self.guards.judge(self.now, self.received, commands, active, condition=LoopCondition(**condition), at=at)
 
-    def lose(self, commands: Mapping[str, Any]) -> Verdict:
+    def lose(self, commands: Mapping[str, Any]) -> GuardDecision:
         """Run a cycle whose torques do not leave."""
         verdict = self.cycle(commands)
         self.guards.note_unsent(["torque"] if "torque" in verdict.actuation else [])
@@ -69,7 +71,7 @@ def measured_loop(max_age: float = 0.02, **options: Any) -> Loop:
     return loop
 
 
-def kinds(verdict: Verdict) -> list[tuple[str | None, str]]:
+def kinds(verdict: GuardDecision) -> list[tuple[str | None, str]]:
     return [(fault.signal, fault.kind) for fault in verdict.faults]
 
 
@@ -614,6 +616,25 @@ def test_command_after_pause_departs_from_measurement_unless_in_lock_step(
     start = [-5.0, 1.0] if max_age < inf else [2.0, 2.0]
     sent = loop.cycle({"torque": commands}).actuation["torque"]
     assert abs(sent - start).max() <= RATE * T + 1e-9
+
+
+def test_start_after_an_interrupted_pause_departs_from_measurement() -> None:
+    """The pause ended before a command could leave: the report tells what acted when others commanded."""
+    loop = measured_loop(fallback={"torque": Hold()}, leave_time=0.0)
+    report = ReceivedSignal(value=np.zeros(2), arrived=0.0, count=1)
+    loop.guards.reported = {"torque": report}
+    for _ in range(20):
+        loop.cycle({"torque": [0.0, 0.0]})
+        report.arrived, report.count = loop.now, report.count + 1
+    loop.now += 0.5
+    loop.lose({"torque": [0.0, 0.0]})
+    loop.cycle({}, active=[])
+    loop.received["acting"].value, report.value = np.array([5.0, 5.0]), np.array([-5.0, -5.0])
+    loop.guards.start("torque", [5.0, 5.0])
+    for _ in range(2):
+        report.arrived, report.count = loop.now, report.count + 1
+        verdict = loop.lose({"torque": [5.0, 5.0]})
+    assert abs(verdict.actuation["torque"] - 5.0).max() <= RATE * T + 1e-9
 
 
 @pytest.mark.parametrize("fresh", [True, False])

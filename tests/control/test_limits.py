@@ -480,7 +480,7 @@ def test_steps_are_the_longest_allowed_at_any_times(seed: int, acceleration: flo
 
 
 def longest_step_of_share(d: float, a: float, r: float) -> float:
-    """Return by bisection the longest step w of a whole period, of which a share r is taken, with a rest within d."""
+    """Return by bisection the longest step w of a period, with a share r of it taken, and a rest within d."""
     low, high = 0.0, d / r
     for _ in range(80):
         middle = 0.5 * (low + high)

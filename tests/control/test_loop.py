@@ -27,8 +27,8 @@ from tests.machine.robot import COMMAND, PERIOD, RobotScenario, Swing, torque
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import ClockJump, Corrupt, Delay, Duplicate, Freeze, InjectedFault, MachineProcess, Reorder
 from vtbdrake.state import Quantity
@@ -41,7 +41,7 @@ PATIENCE = 60.0  # s for whatever has to happen
 
 
 class TroubledSwing(Swing):
-    """A `Swing` that raises, or commands NaN, when it is told to; its ports are those of `Swing`."""
+    """A `Swing` that raises, or commands NaN, when it is told to; it has the ports of `Swing`."""
 
     def __init__(self, period: float) -> None:
         super().__init__(period)
@@ -208,6 +208,7 @@ def commands_in_lock_step(hub: Hub, *faults: InjectedFault, cycles: int = 100) -
 # -- nothing is wrong
 
 
+@pytest.mark.slow
 def test_testbed_and_dps_alone_send_the_same_bytes(hub: Hub) -> None:
     commanded, _ = commands_in_lock_step(hub)
     with Loop(hub, lock_step=True, alone=False) as loop:
@@ -240,6 +241,7 @@ def test_nothing_is_sent_while_actuator_is_on_sim(hub: Hub) -> None:
 # -- the machine's messages
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_duplicates_change_nothing(hub: Hub) -> None:
     healthy, _ = commands_in_lock_step(hub)
@@ -248,6 +250,7 @@ def test_duplicates_change_nothing(hub: Hub) -> None:
     assert bridge.sensed["position"].rejected["duplicate"] >= 190
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("fault", "rejection"),
     [
@@ -265,7 +268,8 @@ def test_frozen_machine_is_stopped_until_reset(hub: Hub, fault: InjectedFault, r
         loop.machine.begin(fault)
         if rejection is not None:
             loop.until(lambda: loop.bridge.sensed["position"].rejected.get(rejection, 0) > 0)
-        loop.until(lambda: "is stale" in loop.latched)
+        # A busy loop may read what is refused so late that the signal is stale before.
+        loop.until(lambda: "is stale" in loop.latched or "is refused again and again" in loop.latched)
         loop.runtime.run(cycles=5)
         loop.assert_within_limits()
         assert loop.ear.torques[-1] == 0.0
@@ -274,6 +278,7 @@ def test_frozen_machine_is_stopped_until_reset(hub: Hub, fault: InjectedFault, r
         loop.assert_within_limits()
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_delayed_messages_are_used_up_to_max_delay(hub: Hub) -> None:
     """Where signals may grow so old, the loop goes on."""
@@ -286,6 +291,7 @@ def test_delayed_messages_are_used_up_to_max_delay(hub: Hub) -> None:
         loop.assert_within_limits()
 
 
+@pytest.mark.slow
 def test_late_messages_are_rejected(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
@@ -296,6 +302,7 @@ def test_late_messages_are_rejected(hub: Hub) -> None:
         loop.assert_within_limits()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [3600.0, pytest.param(-3600.0, marks=pytest.mark.one_python)])
 def test_new_time_of_the_sender_is_accepted(hub: Hub, seconds: float) -> None:
     with Loop(hub) as loop:
@@ -310,19 +317,23 @@ def test_new_time_of_the_sender_is_accepted(hub: Hub, seconds: float) -> None:
         assert loop.bridge.clock_jumps["IIWA_STATUS"] == 1
 
 
+@pytest.mark.slow
 def test_damaged_messages_are_rejected(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
-        loop.machine.begin(Corrupt(kind="truncate", fraction=0.5))
+        loop.machine.begin(Corrupt(kind="truncate", fraction=0.1))
         position = loop.bridge.sensed["position"]
         loop.until(lambda: sum(position.rejected.values()) > 50)
         assert not loop.latched
+        loop.machine.begin(Corrupt(kind="truncate", fraction=0.5))
+        loop.until(lambda: "position is refused again and again" in loop.latched)
         loop.assert_within_limits()
 
 
 # -- processes that end
 
 
+@pytest.mark.slow
 def test_killed_machine_stops_the_dps_and_may_return(hub: Hub) -> None:
     with Loop(hub, max_age=SHORT) as loop:
         loop.begin()
@@ -371,6 +382,7 @@ loop.runtime.run()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGSTOP, signal.SIGKILL])
 def test_machine_brakes_when_the_controller_is_gone(hub: Hub, end: int) -> None:
     with MachineProcess(LoopScenario(), hub.url) as machine:
@@ -390,6 +402,7 @@ def test_machine_brakes_when_the_controller_is_gone(hub: Hub, end: int) -> None:
                 controller.kill()
 
 
+@pytest.mark.slow
 def test_interrupted_controller_sends_the_fallback(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
@@ -402,6 +415,7 @@ def test_interrupted_controller_sends_the_fallback(hub: Hub) -> None:
 # -- others
 
 
+@pytest.mark.slow
 def test_second_publisher_is_rejected_and_reported(hub: Hub) -> None:
     with Loop(hub) as loop:
         loop.begin()
@@ -420,6 +434,7 @@ def test_second_publisher_is_rejected_and_reported(hub: Hub) -> None:
         assert not loop.latched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("trouble", "reason"), [(1.0, "out of ideas"), (2.0, "not finite")])
 def test_failing_dps_is_replaced_at_once(hub: Hub, trouble: float, reason: str) -> None:
     with Loop(hub, lock_step=True) as loop:

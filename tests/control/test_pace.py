@@ -183,6 +183,7 @@ def rates(bridge: ScriptedBridge) -> np.ndarray:
     return np.asarray(np.abs(np.diff(commands, axis=0)).max(axis=1) / np.diff(times))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("interval", [0.05, 0.2, 0.5, 1.0, 2.0])
 def test_rate_of_commands_holds_by_the_clock_at_any_pace(interval: float, alone: bool) -> None:
@@ -233,6 +234,7 @@ def test_cycles_run_by_hand_move_no_faster_than_the_clock() -> None:
     assert commands[-1, 0] == pytest.approx(RATE * PERIOD * (1.0 + 0.1 * 99))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("interval", [0.2, 0.5, 2.0])
 @pytest.mark.parametrize("alone", [True, False])
 def test_switch_is_refused_at_another_pace(interval: float, alone: bool) -> None:
@@ -332,6 +334,7 @@ def test_commands_once_per_period_are_limited_as_without_times() -> None:
     assert np.array_equal(*sent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", [True, False])
 def test_rate_holds_against_a_real_machine_that_is_five_times_quicker(alone: bool) -> None:
     scenario = ServoMachineScenario(rate=RATE)

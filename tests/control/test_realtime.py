@@ -193,8 +193,9 @@ def test_endless_python_step_is_ended_and_fallback_sent() -> None:
     assert found["after"] == found["before"]
 
 
+@pytest.mark.slow_cases
 @privileged
-@pytest.mark.parametrize("main", [True, False])
+@pytest.mark.parametrize("main", [False, True])
 def test_endless_native_step_ends_the_process(main: bool) -> None:
     run = "    with RealTime(longest_step=0.2, awake=False) as r: runtime.run(cycles=1000)\n"
     code = "import threading\ndef work():\n" + run + ("work()" if main else "threading.Thread(target=work).start()")

@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough
 
 from tests.control.scripted import PERIOD, ScriptedBridge, Servo, ServoScenario
-from vtbdrake.child_process import ending_signals
+from vtbdrake.common.child_process import ending_signals
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.fallback import FallbackController, Silence, Zero
 from vtbdrake.control.guards import Guards
@@ -60,6 +60,7 @@ def test_on_sim_only_the_world_gets_commands():
     assert runtime.time == 2000 * PERIOD and runtime.target.read(runtime.context, "dps.ticks") == 2000.0
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("start", [0.0, 0.5, 2501 * PERIOD, 7.7])
 def test_every_cycle_contains_one_update(start):
     dps = DpsAlone(ServoScenario())
@@ -148,6 +149,7 @@ def test_world_starts_from_belief_after_switch_to_sim():
 # -- leaving real
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("pace", [None, "position"])
 @pytest.mark.parametrize("way", ["sim", "shadow", {"act": "sim"}, {"sense": {"speed": "sim"}, "act": "sim"}])
 def test_machine_without_time_out_is_left_at_rest(way, pace):
@@ -546,7 +548,7 @@ def test_measurement_of_the_opposite_sign_is_told():
 @pytest.mark.parametrize("alone", [False, True])
 def test_first_command_that_does_not_continue_is_not_sent(alone, rate):
     runtime, bridge, _ = make(alone=alone, rate=rate, continuity={"velocity": ("speed", 0.3)})
-    # The DPS alone has no command before the switch; that of a testbed comes to rest with its simulated axes.
+    # The DPS alone has no command before the switch; a testbed's comes to rest with its simulated axes.
     runtime.run(cycles=1 if alone else 2000)
     runtime.switch("real")
     runtime.run(cycles=3)
@@ -658,7 +660,7 @@ def test_missed_deadlines_are_left_out():
     assert runtime.statistics.misses == 3 and len(times) == 10
     assert np.diff(times).min() >= 0.5 * PERIOD
     assert times[-1] == pytest.approx(12 * PERIOD)
-    # The DPS's time is that of the cycles that were.
+    # The DPS's time counts the cycles that were.
     assert runtime.target.read(runtime.context, "dps.ticks") == 11.0
 
 
@@ -997,7 +999,7 @@ def test_interruption_sends_the_fallback():
     assert sent(bridge)[-1] == pytest.approx([0.0, 0.0])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interruption_dropped_by_pybind11_ends_the_loop(number):
     runtime, bridge, _ = switched(rate=0.0)
 
@@ -1100,15 +1102,22 @@ def test_cycle_records_changes_and_new_values():
     assert np.array_equal(cycles[0].fed["position"], [0.05, 0.0])
 
 
-def test_rejected_commands_are_logged_once_for_each_reason(caplog):
+def test_every_rejected_command_raises_an_alarm(caplog):
     runtime, bridge, _ = make()
     bridge.commands["target"] = ReceivedSignal()
     runtime = Runtime(runtime.target, bridge, period=PERIOD, clock=runtime.clock)
-    for reason in ("limits", "limits", "fingerprint"):
+    for reason in ("limits", "limits", "fingerprint", *(3 * ["limits"])):
         bridge.commands["target"].reject(reason)
-        runtime.cycle()
-    told = [record.getMessage() for record in caplog.records if "command target was rejected" in record.getMessage()]
-    assert ["limits" in told[0], "fingerprint" in told[1], len(told)] == [True, True, 2]
+        runtime.run(cycles=300)  # 0.3 s
+    runtime.run(cycles=1000)
+    told = [record.getMessage() for record in caplog.records if "the command target were rejected" in record.message]
+    assert [message.partition("rejected: ")[2] for message in told] == [
+        "1 limits",
+        "2 limits, 1 fingerprint",
+        "2 limits",
+    ]
+    assert all(message.startswith("ALARM: ") for message in told)
+    assert [f"ALARM: {fault.reason}" for fault in runtime.guards.log if fault.kind == "command"] == told
 
 
 def test_received_commands_reach_the_dps_or_are_counted():

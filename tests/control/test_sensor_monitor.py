@@ -54,6 +54,64 @@ def test_stale_signal_tells_which_messages_were_rejected() -> None:
     assert monitor.fault_at(1.0, sample).reason == reason
 
 
+def refuse(sample: ReceivedSignal, *, times: int) -> None:
+    for _ in range(times):
+        sample.reject("limits", np.array([0.0, 7.0]))
+
+
+def test_signal_that_is_refused_more_than_ten_times_in_a_row_is_implausible() -> None:
+    monitor, sample = SensorMonitor(Signal("encoders", size=2, lower=-1.0, upper=1.5)), received(np.zeros(2))
+    refuse(sample, times=10)
+    assert kind(monitor, 1.0, sample) is None
+    refuse(sample, times=1)
+    fault = monitor.fault_at(1.0, sample)
+    assert (fault.kind, fault.signal) == ("implausible", "encoders")
+    assert fault.reason == (
+        "sensor signal encoders is refused again and again, 11 times so far: encoders[1] is 7, above its limit 1.5"
+    )
+    for _ in range(3):
+        assert kind(monitor, 1.0, sample) == "implausible"
+        sample.accept(np.zeros(2), 1.0, 1.0)
+    assert kind(monitor, 1.0, sample) is None
+
+
+@pytest.mark.parametrize(("accepted", "is_fault"), [(1, True), (2, True), (3, False), (10, False)])
+def test_signal_of_which_every_third_value_is_refused_is_implausible(accepted: int, is_fault: bool) -> None:
+    monitor, sample = SensorMonitor(Signal("encoders", size=2)), received(np.zeros(2))
+    faults = set()
+    for _ in range(100):
+        refuse(sample, times=1)
+        faults.add(kind(monitor, 1.0, sample))
+        for _ in range(accepted):
+            sample.accept(np.zeros(2), 1.0, 1.0)
+    assert ("implausible" in faults) == is_fault
+
+
+def test_messages_out_of_time_are_not_refused_values() -> None:
+    monitor, sample = SensorMonitor(Signal("encoders", size=2)), received(np.zeros(2))
+    for reason in ("duplicate", "out of order", "ahead of time"):
+        for _ in range(20):
+            sample.reject(reason)
+    assert kind(monitor, 1.0, sample) is None and sample.refused == 0
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ([-2.0, 0.0], "encoders[0] is -2, below its limit -1"),
+        ([0.0, nan], "encoders[1] is nan"),
+        (None, "truncated"),
+    ],
+)
+def test_refused_value_is_named_with_its_limit(value: list[float] | None, problem: str) -> None:
+    monitor, sample = SensorMonitor(signal(lower=-1.0, upper=1.5)), received(np.zeros(2))
+    for _ in range(11):
+        sample.reject("limits" if value else "truncated", None if value is None else np.array(value))
+    assert str(monitor.fault_at(0.0, sample)).endswith(f"11 times so far: {problem}")
+    if value is not None:  # Where a signal is too old because of it, too.
+        assert str(monitor.fault_at(1.0, sample)).endswith(f"messages rejected so far: 11 limits ({problem})")
+
+
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 @pytest.mark.parametrize("size", [2, 100])
 @pytest.mark.parametrize("place", [0, -1])

@@ -15,14 +15,14 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from tests.control.scripted import PERIOD, ScriptedBridge
 from tests.control.slow import SlowScenario, busy, chaotic, deadly, gated, moving, picky, processes
-from vtbdrake.child_process import ProcessStartError
+from vtbdrake.common.child_process import ProcessStartError
+from vtbdrake.common.frames import pack, unpack
 from vtbdrake.control.clock import SimulatedClock, WallClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.deployment import Deployment
-from vtbdrake.frames import pack, unpack
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed import DpsAlone, SlowPart
@@ -114,6 +114,7 @@ def replayed(scenario, cycles, *, results):
         yield snapshot(target, context)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("latency", [0.01, 0.05])
 def test_loop_and_simulation_agree_bit_for_bit(latency):
     with loop(latency=latency) as real:
@@ -153,6 +154,7 @@ def test_memory_of_a_late_result_is_used_next(gate):
         assert np.array_equal(real.read("estimate"), estimate)
 
 
+@pytest.mark.slow
 def test_missed_results_are_logged_once_per_second(gate, caplog):
     with loop(function=partial(gated, gate=str(gate)), more=PATIENT) as real:
         real.run(round(1.5 / PERIOD))
@@ -196,6 +198,7 @@ def test_worker_that_dies_is_replaced():
         assert real.runtime.time == pytest.approx(len(real.cycles) * PERIOD)
 
 
+@pytest.mark.slow
 def test_sample_that_kills_the_worker_is_missing(caplog):
     settings = {"function": deadly, "period": 0.3, "latency": 0.25, "more": {"patience": 12.0}}
     with loop(sensors=lambda t: {"position": [t - 0.1, 0.0]}, **settings) as real:
@@ -229,6 +232,7 @@ def test_loop_begins_when_its_slow_parts_are_ready():
         assert runtime.slow_parts.wait(0.0)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("prepare", "reason"),
     [(lambda: os._exit(3), r"died \(exit code 3\)"), (signal.pause, r"it is not ready within 0\.5 s")],
@@ -285,6 +289,7 @@ def test_copy_of_a_running_context_computes_itself(gate):
     assert target.read(copy, f"{PATH}.missed") == 1.0
 
 
+@pytest.mark.slow
 def test_function_of_50_ms_runs_beside_a_loop_of_1_ms():
     settings = {"function": busy, "period": 0.1, "latency": 0.4, "more": {}}
     with loop(clock=WallClock(), **settings) as real:

@@ -10,6 +10,7 @@ from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("law", LAWS)
 def test_arm_is_stable_at_the_bounds_of_its_gains(law: str) -> None:
     """At 5 times its value, a damping already shakes the joints by radians per second, 13 N m from period to period."""

@@ -1,8 +1,16 @@
 """Every scenario of the library passes the checks that users' scenarios are put through."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import pytest
 
-from vtbdrake.testing import parametrize_with_checks
+from vtbdrake.testbed import Scenario
+from vtbdrake.testing import Subject, parametrize_with_checks
+from vtbdrake.testing.checks import loop_checks as loop
+from vtbdrake.testing.checks import scenario_checks as scenario
+from vtbdrake.testing.checks import signal_checks as signals
+from vtbdrake.testing.subject import CheckFailedError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
 from vtbdrake_diagrams.forest.scenario import ForestScenario
@@ -48,6 +56,9 @@ EXPECTED = {
 }
 
 
+# A small forest, or plain: to build a whole hectare takes seconds.
+LITTLE = {"length": 50.0, "width": 50.0, "start": 12.0}
+FIELDS = {ForestScenario: LITTLE, RouteScenario: LITTLE, PlainScenario: LITTLE}
 # Variants of others, for which one Python is enough.
 VARIANTS = (
     ArmMotionScenario,
@@ -58,18 +69,57 @@ VARIANTS = (
     CraterScenario,
     TorqueLimitedPendulumScenario,
 )
-
-
-@parametrize_with_checks(
-    [kind() for kind in SCENARIOS if kind not in VARIANTS],
-    values=lambda scenario: SCENARIOS[type(scenario)],
-    expected_failed_checks=lambda scenario: EXPECTED.get(type(scenario), {}),
+# What is built and simulated in no time; of the others, all checks together take some ten seconds each.
+SMALL = (CartPoleScenario,)
+# What one build of a scenario tells.
+STATIC = (
+    scenario.check_builds,
+    scenario.check_no_algebraic_loop,
+    scenario.check_yaml_round_trip,
+    scenario.check_pickle_round_trip,
+    signals.check_signals_have_units,
+    signals.check_signals_have_limits,
+    signals.check_parameters_have_bounds,
+    signals.check_variables_do_not_overlap,
+    loop.check_deployment_is_safe,
 )
-def test_scenario(scenario, check):
+
+
+def values(scenario: Scenario) -> dict[str, Any]:
+    return SCENARIOS[type(scenario)]
+
+
+def expected_failed_checks(scenario: Scenario) -> dict[str, str]:
+    return EXPECTED.get(type(scenario), {})
+
+
+def with_checks(kinds: Iterable[type[Scenario]]) -> pytest.MarkDecorator:
+    scenarios = [kind(**FIELDS.get(kind, {})) for kind in kinds]
+    return parametrize_with_checks(scenarios, values=values, expected_failed_checks=expected_failed_checks)
+
+
+@with_checks(SMALL)
+def test_small_scenario(scenario, check):
     check(scenario)
 
 
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("kind", [kind for kind in SCENARIOS if kind not in (*SMALL, *VARIANTS)])
+def test_one_build_of_a_larger_scenario_passes(kind):
+    subject = Subject(kind(**FIELDS.get(kind, {})), values=SCENARIOS[kind])
+    outcomes = {check.__name__: subject.outcome(check) for check in STATIC}
+    assert {name: error for name, error in outcomes.items() if isinstance(error, CheckFailedError)} == {}
+    assert outcomes["check_builds"] is None
+
+
+@pytest.mark.slow
+@with_checks(kind for kind in SCENARIOS if kind not in (*SMALL, *VARIANTS))
+def test_larger_scenario(scenario, check):
+    check(scenario)
+
+
+@pytest.mark.slow
 @pytest.mark.one_python
-@parametrize_with_checks([kind() for kind in VARIANTS], values=lambda scenario: SCENARIOS[type(scenario)])
+@with_checks(VARIANTS)
 def test_variant(scenario, check):
     check(scenario)

@@ -10,8 +10,8 @@ import lcm
 
 from tests.control.arm import status
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import STATUS_CHANNEL
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 
 PATIENCE = 60.0  # seconds to wait for another process
 

@@ -24,10 +24,11 @@ from pydrake.systems.primitives import PassThrough
 
 from vtbdrake.control.fallback import Brake, Fallback, Hold, gravity_compensation
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import AddressedSystem, Quantity
-from vtbdrake.testbed import HardwareSimScenario, Interface, Signal, VirtualTestbedBuilder
+from vtbdrake.station.hardware_sim import HardwareSimScenario
+from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.station import FILE
 
 PERIOD = 0.005

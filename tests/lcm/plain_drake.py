@@ -29,7 +29,7 @@ class PlainDrake:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def advance(self, commands: int) -> dict[str, Any]:
-        """Wait until so many commands have arrived in all, advance by a period, and publish the status."""
+        """Wait until this number of commands has arrived in all, advance by a period, and publish the status."""
         assert self._process.stdin is not None and self._process.stdout is not None
         print(commands, file=self._process.stdin, flush=True)
         answer: dict[str, Any] = json.loads(self._process.stdout.readline())

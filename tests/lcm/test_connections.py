@@ -21,9 +21,9 @@ import pytest
 from tests.control.arm import bridge, status
 from tests.lcm.bus import PATIENCE, Peer, free_port, in_step, wait
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.testbed import Interface, Signal
 

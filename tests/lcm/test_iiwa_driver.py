@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine import Machine, MachineConfig
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
 
 JUMP = TORQUE_RATE * PERIOD
 """The allowed jump of the torque on a joint from one step of the plant to the next, in N m (2.5)."""
@@ -42,6 +44,12 @@ class Session:
         return float(np.abs(np.diff(self.arm.actuation, axis=0)).max())
 
 
+@cache
+def target(mode: str, *, alone: bool) -> DpsAlone | VirtualTestbed:
+    scenario = IiwaScenario(mode=mode)
+    return DpsAlone(scenario) if alone else scenario.build()
+
+
 @contextmanager
 def session(
     mode: str,
@@ -52,10 +60,9 @@ def session(
     deployment: Deployment | None = None,
 ) -> Iterator[Session]:
     scenario = IiwaScenario(mode=mode)
-    target = vtb.DpsAlone(scenario) if alone else scenario.build()
     with (
         vtb.Hub(port=0, protect=["IIWA_COMMAND"]) as hub,
-        scenario.deploy(hub.url, target=target, record=record, deployment=deployment) as runtime,
+        scenario.deploy(hub.url, target=target(mode, alone=alone), record=record, deployment=deployment) as runtime,
         DrakeIiwa(hub.url, mode, offset=offset) as arm,
     ):
         yield Session(runtime, arm)
@@ -70,7 +77,8 @@ def test_model_has_the_kinematics_of_an_iiwa() -> None:
     np.testing.assert_allclose(flange, [0.2970356451892219, 0.1727696964662288, 1.154681973689345], atol=1e-9)
 
 
-@pytest.mark.parametrize(("mode", "offset"), [(TORQUE, 0.004), (POSITION, 0.0005)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "offset"), [(TORQUE, 0.004), pytest.param(POSITION, 0.0005, marks=pytest.mark.slow)])
 def test_arm_is_taken_over_and_handed_back_without_a_kick(mode: str, offset: float, tmp_path: Path) -> None:
     with session(mode, offset=offset, record=tmp_path / "log") as s:
         for position in ("sim", "shadow", "real", "twin", "real", "shadow", "sim", "shadow", "real"):
@@ -121,6 +129,7 @@ def raw(limit: Any) -> Deployment:
     return replace(deployment, protocol=protocol, continuity={"joint_torque": limit})
 
 
+@pytest.mark.slow
 def test_torques_as_in_the_messages_are_refused() -> None:
     with session(TORQUE, deployment=raw("joint_torque_added")) as s:
         s.run(2)
@@ -130,6 +139,7 @@ def test_torques_as_in_the_messages_are_refused() -> None:
             s.runtime.switch("real")
 
 
+@pytest.mark.slow
 def test_a_wide_limit_lets_them_kick_the_arm() -> None:
     with session(TORQUE, deployment=raw(("joint_torque_added", 100.0))) as s:
         s.run(2)
@@ -147,6 +157,7 @@ def test_dps_alone_takes_over_without_a_kick() -> None:
     assert 0.0 < s.largest_jump() < JUMP
 
 
+@pytest.mark.slow
 def test_dps_alone_sends_nothing_if_its_first_command_is_discontinuous() -> None:
     with session(TORQUE, alone=True, deployment=raw("joint_torque_added")) as s:
         s.run(2)
@@ -160,6 +171,7 @@ def test_dps_alone_sends_nothing_if_its_first_command_is_discontinuous() -> None
     assert s.largest_jump() < 1e-9
 
 
+@pytest.mark.slow
 def test_dps_alone_takes_over_by_a_reset_when_it_continues() -> None:
     with session(TORQUE, alone=True, offset=0.05) as s:
         s.run(2)
@@ -191,6 +203,7 @@ class Ear:
         self._lcm.publish("IIWA_COMMAND", data)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("mode", [TORQUE, POSITION])
 def test_simulated_machine_sends_what_drakes_driver_sends(mode: str) -> None:
     # In Drake's diagram, a message that arrives between two steps of the plant acts from the second one on.

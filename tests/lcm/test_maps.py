@@ -12,8 +12,8 @@ import pytest
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_image, lcmt_robot_state, lcmt_scope
 
 from tests.control.arm import ACT, SENSE, command, status
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.maps import LcmMap, decode, vector_map
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal

@@ -13,16 +13,17 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, LeafSystem, State, System
+from pydrake.systems.framework import Context, DiscreteValues, System
 from pydrake.systems.primitives import Demultiplexer
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from vtbdrake.components.sensors.camera import Camera, connect_camera
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command
-from vtbdrake.lcm.drake_messages import image_map
+from vtbdrake.lcm.iiwa_messages import iiwa_command
 from vtbdrake.lcm.maps import vector_map
 from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.lcm.sensor_messages import image_map
+from vtbdrake.state import AddressedSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD, CAMERA_PERIOD = 0.01, 0.02
@@ -30,7 +31,7 @@ WIDTH, HEIGHT = 64, 48
 POSITION = "sim.sys.slide.position"
 
 
-class Centring(LeafSystem):
+class Centring(AddressedSystem):
     """Pushes what is bright to the middle of the image.
 
     .. pydrake_system::
@@ -48,13 +49,13 @@ class Centring(LeafSystem):
         self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U(WIDTH, HEIGHT)))
         self._speed = self.DeclareVectorInputPort("speed", 1)
         self.DeclareStateOutputPort("force", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> None:
+    def _update(self, context: Context, state: DiscreteValues) -> None:
         image: Any = self._image.Eval(context)
         columns = image.data[..., :3].astype(float).sum(axis=(0, 2))
         off = columns @ np.linspace(-1.0, 1.0, WIDTH) / max(columns.sum(), 1.0)
-        state.get_mutable_discrete_state(0).set_value(12.0 * off - 5.0 * self._speed.Eval(context))
+        state.set_value(12.0 * off - 5.0 * self._speed.Eval(context))
 
 
 @dataclass
@@ -69,7 +70,7 @@ class LookingScenario(Scenario):
         return Interface(
             sense=[
                 Signal("image", model_value=ImageRgba8U(WIDTH, HEIGHT)),
-                Signal("speed", size=1, unit="m/s", max_age=1.0),
+                Signal("speed", size=1, unit="m/s", lower=-9.0, upper=9.0, max_age=1.0),
             ],
             act=[Signal("force", size=1, unit="N", lower=-50.0, upper=50.0, idle=0.0)],
         )

@@ -18,7 +18,7 @@ from pydrake.systems.primitives import Demultiplexer
 
 from tests.testbeds import ACROBOT
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.state import AddressedSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
@@ -126,7 +126,7 @@ class Listener:
         return self.wait(lambda heard: len(heard) > count)[count]
 
     def until_cycle(self, cycle: int) -> list[bytes]:
-        """Return what is heard until the machine has done so many cycles; its status, which follows, says so."""
+        """Return what is heard until the machine has done this number of cycles; its status, which follows, says so."""
         self._lcm.publish("VTB_MACHINE", b'{"request": "status"}')
         self.wait(lambda heard: bool(self.statuses) and self.statuses[-1]["cycle"] == cycle)
         return list(self.heard)

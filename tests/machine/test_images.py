@@ -18,6 +18,7 @@ from vtbdrake.recording.replay import replay
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutTask, SerialExecutor, Start, ThreadExecutor
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.testing import check_scenario
 
 CYCLES = 200
 
@@ -51,6 +52,14 @@ def test_snapshot_with_an_image_continues_alike(tmp_path: Path) -> None:
     assert (shown(testbed, simulator.get_context()) != before).any()
 
 
+@pytest.mark.slow
+def test_dps_with_images_passes_all_checks() -> None:
+    """Its updates are discrete: it sees an image as it sees a number, after the instant at which it was taken."""
+    passed = {result.name for result in check_scenario(LookingScenario(), horizon=0.2) if result.status == "passed"}
+    assert {"check_dps_cannot_tell_the_switch", "check_dps_alone_commands_the_same"} <= passed
+
+
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(1)])
 def test_rollouts_from_an_image_are_the_true_future(make: Callable[[], Executor]) -> None:
     task = RolloutTask(LookingScenario(), 0.1, record=[FORCE])
@@ -78,6 +87,7 @@ def simulated() -> tuple[list[float], float]:
     return forces, float(testbed.read(context, POSITION))
 
 
+@pytest.mark.slow
 def test_camera_of_a_machine_guides_as_in_a_simulation(tmp_path: Path) -> None:
     forces, position = simulated()
     assert abs(position) < 0.02  # From 0.3 m.

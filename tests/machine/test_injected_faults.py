@@ -24,6 +24,7 @@ from vtbdrake.machine import (
     InjectedFault,
     InjectedFaultError,
     NoBrake,
+    OwnStop,
     Reorder,
     fault_from_dict,
 )
@@ -203,6 +204,7 @@ EXAMPLES = [
     Reorder(),
     ClockJump(seconds=-5.0),
     NoBrake(),
+    OwnStop(),
 ]
 
 

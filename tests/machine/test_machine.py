@@ -14,10 +14,11 @@ from pydrake.systems.framework import Context, LeafSystem, State
 
 from tests.machine.robot import COMMAND, ELBOW, PERIOD, STATUS, RobotScenario, state, torque
 from tests.testbeds import AcrobotScenario
+from vtbdrake.common.scan import Scan
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
-from vtbdrake.lcm.drake_messages import scan_map
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol, ProtocolError, protocol_of
+from vtbdrake.lcm.sensor_messages import scan_map
 from vtbdrake.machine import (
     PERTURBED,
     Delay,
@@ -26,9 +27,9 @@ from vtbdrake.machine import (
     Machine,
     MachineConfig,
     NoBrake,
+    OwnStop,
     perturbed_values,
 )
-from vtbdrake.scan import Scan
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder, WorldAlone
 
 SHOULDER_RATE, ELBOW_RATE = "sim.sys.Acrobot.shoulder.velocity", "sim.sys.Acrobot.elbow.velocity"
@@ -342,6 +343,28 @@ def test_machine_without_brake_repeats_commands() -> None:
     robot.end_faults()
     run(robot, 1)
     assert robot.braking
+
+
+@pytest.mark.parametrize("brake", ["lock", "idle", "hold"])
+def test_stopped_machine_takes_no_commands_and_brakes_until_it_gets_one(brake: str) -> None:
+    robot, reference = machine(brake=brake), machine(brake=brake)
+    for each in (robot, reference):
+        run(each, 5, command=2.0)
+    robot.begin(OwnStop())
+    run(robot, 50, command=2.0)
+    assert robot.stopped and robot.braking
+    assert robot.status().faults == [{"fault": "own_stop", "side": "sense", "channels": []}]
+    if brake == "lock":
+        np.testing.assert_array_equal(state(run(robot, 1)[-1])[3], 0.0)  # The elbow, which has the motor, is locked.
+    else:
+        run(reference, 51, command=0.0)
+        run(robot, 1)
+        np.testing.assert_array_equal(robot.read("plant.state"), reference.read("plant.state"))
+    robot.end_faults()
+    run(robot, 1)
+    assert not robot.stopped and robot.braking
+    run(robot, 1, command=2.0)
+    assert not robot.braking
 
 
 def test_continuous_plant_cannot_be_locked() -> None:

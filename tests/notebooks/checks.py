@@ -35,14 +35,14 @@ def check_stored(name: str) -> None:
         assert not re.search(r"/(home|root|tmp|work|usr)/", text), f"{cell.id} shows a path of a machine"
 
 
-def check_runs(name: str, *, shorter: Mapping[str, str] | None = None) -> None:
+def check_runs(name: str, *, shorter: Mapping[str, str]) -> None:
     """Run the notebook: its own assertions hold, nothing warns, and each figure is shown once, as it is stored.
 
     ``shorter`` replaces pieces of its code, so that the same cells take less time.
     """
     before = {cell.id: cell for cell in code_cells(stored(name))}
     notebook = stored(name)
-    for old, new in (shorter or {}).items():
+    for old, new in shorter.items():
         (cell,) = (cell for cell in code_cells(notebook) if old in cell.source)
         cell.source = cell.source.replace(old, new)
     for cell in code_cells(run(notebook)):

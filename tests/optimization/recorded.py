@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import nan
+from pathlib import Path
 from typing import Any
 
 from vtbdrake.optimization import Study, Trial
 from vtbdrake.optimization.parameter import Dimension
-from vtbdrake.optimization.study_file import StudyFile
+from vtbdrake.optimization.study.study_file import StudyFile
 
 
 def point(
@@ -31,11 +32,13 @@ def recorded(
     units: Sequence[str] | None = None,
     conditions: int = 1,
     risk: str = "Worst()",
+    path: Path | None = None,
 ) -> Study:
-    """A study in memory with these points, each in a batch of its own, and no rollouts.
+    """A study with these points, each in a batch of its own, and no rollouts.
 
     Args:
         qualities: name -> ``maximize`` or ``minimize``.
+        path: Path of its file; None keeps it in memory.
     """
     problem = {
         "parameters": [asdict(parameter) for parameter in parameters],
@@ -46,8 +49,8 @@ def recorded(
     }
     units = [""] * len(parameters) if units is None else list(units)
     meta = {"problem": problem, "solver": "TPE", "seed": 0, "options": {}, "units": units}
-    meta["limits"] = [None] * len(units)
-    file = StudyFile(None, meta=meta)
+    meta |= {"limits": [None] * len(units), "versions": {}, "revision": None}
+    file = StudyFile(path, meta=meta)
     for batch, made in enumerate(points):
         trial = Trial(
             parameters=dict(zip((parameter.address for parameter in parameters), made["at"], strict=True)),

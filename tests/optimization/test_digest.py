@@ -1,4 +1,4 @@
-"""What a study must notice of a function, edits of what it uses, and what it must not: how it is written."""
+"""A study notices edits of a function and of what it uses, but not of the way that it is written."""
 
 import functools
 import importlib
@@ -268,6 +268,7 @@ def test_what_is_no_edit_is_not_noticed(before, after):
     assert digest(made(before)) == digest(made(after))
 
 
+@pytest.mark.slow
 def test_other_processes_and_hash_seeds_have_the_same_digests():
     code = (
         "from tests.optimization.test_digest import EDITS, NO_EDITS, digest, made\n"
@@ -282,7 +283,7 @@ def test_other_processes_and_hash_seeds_have_the_same_digests():
             text=True,
             check=True,
         ).stdout
-        for seed in ("0", "1", "77")
+        for seed in ("0", "77")
     }
     assert len(outputs) == 1
     # Every function was read to its end.
@@ -353,10 +354,11 @@ def test_modules_that_import_each_other(tmp_path, monkeypatch):
     assert digest(f) != before
 
 
-def test_drake_is_the_same_after_more_of_it_was_imported():
+@pytest.mark.parametrize("module", ["pydrake.math", pytest.param("pydrake.all", marks=pytest.mark.slow)])
+def test_drake_is_the_same_after_more_of_it_was_imported(module):
     code = (
         "from vtbdrake.optimization.digest import digest; from pydrake.common.value import Value\n"
-        "before = digest(Value); import pydrake.all; assert digest(Value) == before"
+        f"before = digest(Value); import {module}; assert digest(Value) == before"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 

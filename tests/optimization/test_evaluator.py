@@ -40,7 +40,7 @@ class Weighted(Risk):
 
 
 def problem(conditions: int, risk, *, quality=QUALITIES["maximized up to 1"], constraints=()):
-    """A problem with so many conditions, whose rollouts are not run here: their outcomes are stated."""
+    """A problem with a number of conditions, whose rollouts are not run here: their outcomes are stated."""
     return Problem(
         scenario=PendulumScenario(),
         parameters=[Parameter(THETA, 0.0, 1.0)],
@@ -139,10 +139,11 @@ BATCH_SOLVERS = [
 SLOW = {"auto", "bayesian", "GP"}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("solver", "kind"),
     [
-        (solver, kind)
+        pytest.param(solver, kind, marks=[pytest.mark.slow] if solver in SLOW else [])
         for solver in [*BATCH_SOLVERS, "LN_COBYLA", "SNOPT"]
         for kind in QUALITIES
         # Those that fit a Gaussian process take seconds.
@@ -198,6 +199,7 @@ def test_a_rest_smaller_than_a_point_is_left_and_named(solver, rollouts, run, re
     assert study.message.endswith(spent)
 
 
+@pytest.mark.slow
 def test_auto_comes_to_its_local_search_under_racing():
     def f(values):
         return 1.0 / (1.0 + (values[THETA] - 0.321) ** 2 + values[DAMPING]), ()
@@ -278,7 +280,7 @@ def test_equal_points_are_evaluated_once():
     assert len(runs) == 2
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
 def test_random_operations_leave_a_study_whole(tmp_path, seed):
     chance, rollouts, by_hand = random.Random(seed), 0, []
     kind = chance.choice(list(QUALITIES))

@@ -210,7 +210,7 @@ def test_another_python_cannot_compare_the_code(tmp_path, monkeypatch):
     path = tmp_path / "a.db"
     pendulum_problem().study(path).close()
     monkeypatch.setattr(sys, "version_info", (3, 99))
-    with pytest.raises(StudyError, match=r"Python 3\.\d+, whose code cannot be compared with that of 3\.99.*=True"):
+    with pytest.raises(StudyError, match=r"Python 3\.\d+, whose code cannot be compared with the code of 3\.99.*=True"):
         pendulum_problem().study(path)
     pendulum_problem().study(path, allow_changed_code=True).close()
     pendulum_problem().study(path).close()
@@ -241,6 +241,7 @@ def test_edited_values_of_a_function_are_told(tmp_path):
         quality(nearest).study(tmp_path / "a.db")
 
 
+@pytest.mark.slow
 def test_another_process_knows_the_same_functions():
     code = (
         "from tests.optimization.test_identity import *\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import jsonschema
@@ -82,7 +83,7 @@ def test_a_file_and_python_state_the_same_study(tmp_path: Path) -> None:
     assert (done.exit_code, done.stderr) == (0, "")
     with Study.open(tmp_path / "a.db") as study:
         assert study.trials == expected.trials
-    # A resumed study refuses another problem, so that Python states that of the file.
+    # A resumed study refuses another problem, so that Python states the one in the file.
     with problem.study(tmp_path / "a.db") as resumed:
         assert len(resumed) == len(expected)
 
@@ -97,6 +98,7 @@ def test_options_of_the_command_replace_those_of_the_file(tmp_path: Path) -> Non
         assert f"states the problem: leave out {option[0]}" in message
 
 
+@pytest.mark.slow
 def test_the_gait_of_the_space_climber_is_that_of_python() -> None:
     stated = ProblemFile.load(GAIT)
     gait = Problem(
@@ -192,3 +194,33 @@ def test_an_error_names_the_line(tmp_path: Path, old: str, new: str, line: int, 
 def test_a_file_that_is_no_problem_is_refused(tmp_path: Path, text: str, message: str) -> None:
     assert message in error_of("study", "run", tmp_path / "a.db", written(tmp_path, text))
     assert "no problem file none.yaml" in error_of("study", "run", tmp_path / "a.db", "none.yaml")
+
+
+def test_a_file_that_is_only_looked_at_imports_what_was_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()")
+    text = "scenario: tests.testbeds:PendulumScenario\nqualities:\n- f: stranger:nothing\n  of: time\n"
+    path = written(tmp_path, text)
+    for look in (lambda *options: error_of("view", path, *options), lambda *_: refusal(path)):
+        message = look()
+        assert "it names stranger:nothing, and importing its module runs its code: if you trust it, add" in message
+        assert "line 3" in message and "--trust stranger" in message
+    assert "it names stranger:nothing" in error_of("view", path, "--trust", "strange")
+    assert not (tmp_path / "ran").exists()
+    assert "stranger has no function 'nothing'" in error_of("view", path, "--trust", "stranger")
+    assert (tmp_path / "ran").exists()
+    del sys.modules["stranger"]
+    (tmp_path / "ran").unlink()
+    # To run a study is to run the code of its file.
+    assert "stranger has no function 'nothing'" in error_of("study", "run", tmp_path / "a.db", path)
+    assert (tmp_path / "ran").exists()
+    # The scenario is asked about, too.
+    assert "it names other.strangers:Scenario" in error_of(
+        "view", written(tmp_path, "scenario: other.strangers:Scenario")
+    )
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(ProblemFileError) as caught:
+        ProblemFile.load(path, trusted=[])
+    return str(caught.value)

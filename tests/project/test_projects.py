@@ -2,15 +2,24 @@
 
 import json
 import os
+import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pydrake
 import pytest
+from pydrake.multibody.plant import MultibodyPlant
 
+import vtbdrake as vtb
 from tests.cli.program import ROOT, error_of, run
 from vtbdrake.project import SMALL_ARM, read_robot, read_station, write_project
+from vtbdrake.testing.checks import CHECKS
+from vtbdrake.testing.lock_step import LockStep
+from vtbdrake.testing.subject import Subject
 from vtbdrake_diagrams.station import FILE
 
 MODELS = Path(__file__).parent / "models"
@@ -22,6 +31,7 @@ ROBOTS = {
     "mujoco_arm": MODELS / "arm.xml",
     "hand": MODELS / "hand.sdf",
     "head": MODELS / "bare.urdf",
+    "finger": MODELS / "finger.urdf",
     "fourbar": MODELS / "fourbar.sdf",
     "acrobot": EXAMPLES / "acrobot" / "Acrobot.urdf",
     "acrobot_sdf": EXAMPLES / "acrobot" / "Acrobot.sdf",
@@ -32,24 +42,51 @@ ROBOTS = {
     "planar_brick": EXAMPLES / "planar_gripper" / "planar_brick.sdf",
     "desk": EXAMPLES / "kuka_iiwa_arm" / "models" / "desk" / "transcendesk55inch.sdf",
 }
+# Robots with free bases: on feet that are spheres, and on soles.
+LEGGED = {"quadruped": MODELS / "quadruped.urdf", "biped": MODELS / "biped.xml"}
+FLYING = {"x2": MODELS / "x2.xml"}
 
 STATIONS = {"torque_station": "Torque", "position_station": "Position", "mixed_station": "PositionAndTorque"}
-# A robot for each parser of Drake, one with joints that no motor drives, and a station pass all of their tests.
-CHECKED = ("small_arm", "mujoco_arm", "hand", "fourbar", "torque_station")
-ON_BOTH_PYTHONS = ("small_arm", "mujoco_arm", "hand")
-# What depends on the robot; how rollouts, forks and the fallback work depends on the code, which is the same for all.
-OF_THE_ROBOT = "hold or move or believed or machine or signals or bounds or safe or round_trip or alike"
+# A robot whose joints are all driven, one with joints that no motor drives, and a station pass all of their tests, as a
+# user runs them. How rollouts, forks and the fallback work depends on the code, which is the same for all.
+CHECKED = ("small_arm", "fourbar", "torque_station")
+# What depends on the robot, for all others, in this process.
+OF_ROBOTS = ("test_robot_holds_its_posture", "test_robot_moves_to_a_posture", "test_measurements_are_believed")
+OF_STATIONS = ("test_arms_hold_their_postures", "test_arms_move_to_postures", "test_measurements_are_believed")
+OF_THE_ROBOT = {
+    "check_builds_alike_twice",
+    "check_yaml_round_trip",
+    "check_pickle_round_trip",
+    "check_signals_have_units",
+    "check_signals_have_limits",
+    "check_parameters_have_bounds",
+    "check_values_fit_their_signals",
+    "check_sim_and_real_alike",
+    "check_deployment_is_safe",
+    "check_loop_commands_its_machine",
+}
+# The parsers of Drake beside the parser of URDF; with couplings, and actuators that are replaced.
+OFTEN = ("mujoco_arm", "hand")
+
+
+class Projects:
+    """A folder with a project for each robot and station, written when it is first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, name: str) -> Path:
+        project = self.folder / f"my_{name}"
+        if not project.exists():
+            robots = ROBOTS | LEGGED | FLYING
+            model = read_robot(robots[name]) if name in robots else read_station(f"{FILE}#{STATIONS[name]}")
+            write_project(self.folder, project.name, model)
+        return project
 
 
 @pytest.fixture(scope="module")
-def projects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a project for each robot."""
-    folder = tmp_path_factory.mktemp("projects")
-    for name, path in ROBOTS.items():
-        write_project(folder, f"my_{name}", read_robot(path))
-    for name, key in STATIONS.items():
-        write_project(folder, f"my_{name}", read_station(f"{FILE}#{key}"))
-    return folder
+def projects(tmp_path_factory: pytest.TempPathFactory) -> Projects:
+    return Projects(tmp_path_factory.mktemp("projects"))
 
 
 def python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -68,63 +105,167 @@ def check_tests_pass(project: Path, *options: str) -> None:
 
 
 @pytest.mark.one_python
-def test_projects_pass_ruff(projects: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        (*CHECKED, "acrobot", "biped", "x2"),
+        pytest.param((*ROBOTS, *LEGGED, *FLYING, *STATIONS), marks=pytest.mark.slow),
+    ],
+)
+def test_projects_pass_ruff(projects: Projects, names: tuple[str, ...]) -> None:
+    folders = [projects[name] for name in names]
     for command in (("check",), ("format", "--check", "--diff")):
-        done = python("-m", "ruff", *command, "--no-cache", ".", cwd=projects)
+        done = python("-m", "ruff", *command, "--no-cache", *map(str, folders), cwd=projects.folder)
         assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_project_passes_its_quickest_tests(projects: Projects) -> None:
+    check_tests_pass(projects["small_arm"], "-k", "hold or believed or stopped")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[] if name in ON_BOTH_PYTHONS else [pytest.mark.one_python]) for name in CHECKED],
+    [pytest.param(name, marks=[] if name == "small_arm" else [pytest.mark.one_python]) for name in CHECKED],
 )
-def test_projects_pass_their_tests(projects: Path, name: str) -> None:
-    check_tests_pass(projects / f"my_{name}")
+def test_projects_pass_their_tests(projects: Projects, name: str) -> None:
+    check_tests_pass(projects[name])
+
+
+def module_of_tests(projects: Projects, name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return what is in the module of a project's tests, run in this process."""
+    project = projects[name]
+    monkeypatch.syspath_prepend(project)
+    return runpy.run_path(str(project / "tests" / f"test_my_{name}.py"))
+
+
+@pytest.mark.slow_cases
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.slow, pytest.mark.one_python])
+        for name in sorted({*ROBOTS, *STATIONS} - {*CHECKED})
+    ],
+)
+def test_other_robots_hold_move_and_drive_a_machine(
+    projects: Projects, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tests = module_of_tests(projects, name, monkeypatch)
+    for test in OF_STATIONS if name in STATIONS else OF_ROBOTS:
+        tests[test]()
+    scenario = next(v for v in tests.values() if isinstance(v, type) and issubclass(v, vtb.Scenario))()
+    subject = Subject(tests.get("CHECKED", scenario))
+    for check in CHECKS:
+        if check.__name__ in OF_THE_ROBOT and (error := subject.outcome(check)):
+            raise error
+    with LockStep(scenario) as loop:
+        runtime = loop.runtime
+        runtime.take_over(timeout=1.0)
+        runtime.run(cycles=1)  # The first command continues what is measured.
+        runtime.write(tests.get("COMMANDS") or {"u.posture": np.squeeze(tests["AWAY"])})
+        runtime.run(cycles=round(tests["SECONDS"] / runtime.period), until=lambda: bool(runtime.guards.latched))
+        assert not runtime.guards.latched
+        if name in STATIONS:
+            for arm, away in tests["AWAY"].items():
+                assert np.abs(runtime.read(f"real.sense.{arm}_position_measured") - away).max() < tests["TOLERANCE"]
+        else:
+            assert tests["distance"](runtime.read("real.sense.position"), np.array(tests["AWAY"])) < tests["TOLERANCE"]
 
 
 @pytest.mark.one_python
-@pytest.mark.parametrize("name", sorted({*ROBOTS, *STATIONS} - {*CHECKED}))
-def test_other_robots_hold_move_and_drive_a_machine(projects: Path, name: str) -> None:
-    check_tests_pass(projects / f"my_{name}", "-k", OF_THE_ROBOT)
+def test_a_robot_with_legs_stands_on_them(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
+    module_of_tests(projects, "quadruped", monkeypatch)["test_robot_stands"]()
+
+
+@pytest.mark.one_python
+def test_a_finger_moves_in_spite_of_its_damping(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
+    module_of_tests(projects, "finger", monkeypatch)["test_robot_moves_to_a_posture"]()
+
+
+@pytest.mark.one_python
+def test_joints_that_fall_are_not_guarded(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
+    tests = module_of_tests(projects, "acrobot", monkeypatch)
+    signals = {signal.name: signal for signal in tests["MyAcrobotScenario"]().interface().sense}
+    shoulder, elbow = range(2)
+    assert list(tests["JOINTS"]) == ["shoulder", "elbow"]
+    assert signals["velocity"].upper[shoulder] == 500.0 and signals["velocity"].upper[elbow] < 500.0
+    assert signals["position"].upper[shoulder] > 100.0 and signals["position"].upper[elbow] < 20.0
+
+
+@pytest.mark.one_python
+def test_a_drone_hovers(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
+    module_of_tests(projects, "x2", monkeypatch)["test_robot_takes_off_and_hovers"]()
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_the_program_of_a_project_drives_a_machine(projects: Path) -> None:
-    done = python("-m", "my_small_arm.drive", cwd=projects / "my_small_arm")
+@pytest.mark.parametrize("name", [*LEGGED, *FLYING])
+def test_projects_of_robots_with_a_free_base_pass_their_tests(projects: Projects, name: str) -> None:
+    check_tests_pass(projects[name])
+
+
+@pytest.mark.slow
+@pytest.mark.one_python
+def test_the_program_of_a_project_drives_a_machine(projects: Projects) -> None:
+    done = python("-m", "my_small_arm.drive", cwd=projects["small_arm"])
     assert "the log repeats, bit for bit: True" in done.stdout, done.stdout + done.stderr
     assert "stopped by the guards" not in done.stdout
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_optimization_of_a_project_finds_feasible_gains(projects: Path) -> None:
-    done = python("-m", "my_small_arm.optimize", cwd=projects / "my_small_arm")
+def test_optimization_of_a_project_finds_feasible_gains(projects: Projects) -> None:
+    program = projects["small_arm"] / "my_small_arm" / "optimize.py"
+    assert program.read_text().count("rollouts=30") == 1
+    program.write_text(program.read_text().replace("rollouts=30", "rollouts=8"))
+    done = python("-m", "my_small_arm.optimize", cwd=projects["small_arm"])
     assert "dps.frequency" in done.stdout, done.stdout + done.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
 @pytest.mark.parametrize("name", ["pendulum", "torque_station"])
-def test_notebook_of_a_project_runs(projects: Path, name: str) -> None:
+def test_notebook_of_a_project_runs(projects: Projects, name: str) -> None:
     import nbformat
     from nbclient import NotebookClient
 
-    project = projects / f"my_{name}"
+    project = projects[name]
     notebook = nbformat.read(project / f"my_{name}.ipynb", as_version=4)
     nbformat.validate(notebook)
+    for cell in notebook.cells:
+        cell.source = cell.source.replace("rollouts=8", "rollouts=3")
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(project)}}).execute()
 
 
 @pytest.mark.one_python
-def test_new_writes_a_project_and_says_what_is_assumed(tmp_path: Path) -> None:
+def test_new_writes_a_project_and_says_first_what_is_assumed(tmp_path: Path) -> None:
     result = run("new", "head", "--urdf", MODELS / "bare.urdf", cwd=tmp_path)
     assert result.exit_code == 0
-    assert "no limit of the effort of pan, tilt" in result.stderr
+    lines = result.stderr.splitlines()
+    kinds = [line.partition(": ")[0] for line in lines]
+    assert kinds == ["assumed"] * 3 + ["note"] * (len(lines) - 3)
+    assert "no limit of the effort, assumed is pan " in lines[0] and " N m, tilt " in lines[0]
     assert "assumed: effort, range, speed" in (tmp_path / "head" / "head" / "robot.py").read_text()
+    assert lines[0].removeprefix("assumed: ") in (tmp_path / "head" / "README.md").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["head"]  # nothing else is left
     assert json.loads((tmp_path / "head" / "head.ipynb").read_text())["nbformat"] == 4
+
+
+@pytest.mark.one_python
+def test_drives_get_the_limits_of_a_file_without_transmissions(tmp_path: Path) -> None:
+    """The commanded torques and the machine's guards take them from the project's robot.py."""
+    text = re.sub(r"<transmission.*?</transmission>", "", SMALL_ARM.read_text(), flags=re.DOTALL)
+    stated = {"turn": 40.0, "shoulder": 60.0, "elbow": 20.0}
+    (tmp_path / "bare_arm.urdf").write_text(text)
+    result = run("new", "arm", "--urdf", "bare_arm.urdf", cwd=tmp_path)
+    assert result.exit_code == 0 and "assumed" not in result.stderr
+    module = runpy.run_path(str(tmp_path / "arm" / "arm" / "robot.py"), run_name="robot")
+    plant = MultibodyPlant(0.001)
+    module["add_robot"](plant)
+    plant.Finalize()
+    drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    assert {drive.joint().name(): drive.effort_limit() for drive in drives} == stated
+    assert module["limits"]("effort").tolist() == list(stated.values())
 
 
 @pytest.mark.one_python

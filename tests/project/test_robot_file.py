@@ -39,6 +39,13 @@ def test_drives_follow_the_order_of_the_actuators() -> None:
     assert lift.home == pytest.approx(0.11)  # 0 is outside its range
 
 
+def test_damping_takes_half_of_the_effort_at_most() -> None:
+    """The file says 7 rad/s and 15 N m; at this speed, damping of 3 and 8 N m s/rad would take 21 and 56 N m."""
+    robot = read_robot(MODELS / "finger.urdf")
+    assert [joint.speed for joint in robot.joints] == [2.5, 0.94]
+    assert any("the speeds (rad/s or m/s) are therefore base 2.5, tip 0.94" in note for note in robot.notes)
+
+
 def test_a_joint_without_actuator_moves_freely() -> None:
     robot = read_robot(EXAMPLES / "acrobot" / "Acrobot.urdf")
     assert robot.driven == ("elbow",)
@@ -51,6 +58,63 @@ def test_all_joints_are_driven_where_the_file_has_no_actuators() -> None:
     for joint in robot.joints:
         assert joint.assumed == ("effort", "range", "speed")
         assert np.isfinite([joint.lower, joint.upper, joint.speed, joint.effort]).all() and joint.effort > 0.0
+
+
+DRIVE = '<transmission name="t"><type>SimpleTransmission</type><joint name="hinge"/><actuator name="a"/></transmission>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "drive", "effort", "speed", "assumed"),
+    [
+        pytest.param("revolute", LIMIT, DRIVE, 5.0, 1.0, (), id="transmission"),
+        pytest.param("revolute", LIMIT, "", 5.0, 1.0, (), id="no_transmission"),
+        pytest.param("prismatic", LIMIT, "", 5.0, 1.0, (), id="prismatic"),
+        pytest.param(
+            "continuous", '<limit effort="87" velocity="2.175"/>', "", 87.0, 2.175, ("range",), id="continuous"
+        ),
+        pytest.param(
+            "revolute",
+            LIMIT,
+            DRIVE.replace("Simple", "FourBarLinkage"),
+            5.0,
+            1.0,
+            (),
+            id="transmission_unknown_to_drake",
+        ),
+        pytest.param(
+            "revolute",
+            '<limit lower="0" upper="0" effort="5" velocity="1"/>',
+            "",
+            5.0,
+            1.0,
+            ("range",),
+            id="zero_range",
+        ),
+        # M = 0.01 kg m^2 without weight: 3 rad/s within 20 ms need 1.5 N m.
+        pytest.param("continuous", '<limit effort="0" velocity="3"/>', "", 1.5, 3.0, ("effort", "range"), id="zero"),
+        pytest.param("continuous", "", "", 1.5, 3.0, ("effort", "range", "speed"), id="no_limit"),
+        pytest.param("continuous", "", DRIVE, 1.5, 3.0, ("effort", "range", "speed"), id="no_limit_transmission"),
+    ],
+)
+def test_limits_are_those_of_the_file(
+    tmp_path: Path, kind: str, limit: str, drive: str, effort: float, speed: float, assumed: tuple[str, ...]
+) -> None:
+    robot = read_robot(urdf(tmp_path, kind=kind, joint=limit, further=drive))
+    (joint,) = robot.joints
+    assert (joint.effort, joint.speed, joint.assumed) == (effort, speed, assumed)
+    named = {
+        name for name in ("effort", "range", "speed") for text in robot.assumptions if f"the {name}, assumed" in text
+    }
+    assert named == {*assumed}
+
+
+def test_assumptions_name_joint_value_and_unit(tmp_path: Path) -> None:
+    robot = read_robot(urdf(tmp_path, kind="continuous", joint='<limit effort="0" velocity="3"/>'))
+    assert robot.assumptions[0].endswith(
+        "robot.urdf:5 gives no limit of the effort, assumed is hinge 1.5 N m: compare JOINTS in robot.py with the data "
+        "sheet"
+    )
+    assert not any("assumed" in note for note in robot.notes)
 
 
 def test_an_assumed_drive_carries_the_robot_in_every_posture() -> None:
@@ -89,6 +153,22 @@ def test_motors_of_mujoco_act_by_their_gear() -> None:
     assert robot.servos == ("m3",)  # a <position>
 
 
+def test_a_range_of_positions_is_no_limit_of_the_torque(tmp_path: Path) -> None:
+    """Drake takes the larger end, 1.5 rad, for a limit of 1.5 N m."""
+    path = tmp_path / "robot.xml"
+    servo = '<position name="servo" joint="hinge" kp="9" ctrlrange="-1.5 0"{}/>'
+    text = (
+        '<mujoco model="r"><worldbody><body name="a"><joint name="hinge" axis="0 1 0" range="-1.5 0"/>'
+        f'<geom type="sphere" size="0.1"/></body></worldbody><actuator>{servo}</actuator></mujoco>'
+    )
+    path.write_text(text.format(""))
+    (joint,) = read_robot(path).joints
+    assert joint.assumed == ("effort", "speed")
+    path.write_text(text.format(' forcerange="-7 7"'))
+    (joint,) = read_robot(path).joints
+    assert (joint.effort, joint.assumed) == (7.0, ("speed",))
+
+
 def test_bodies_that_touch_at_home_are_listed() -> None:
     robot = read_robot(EXAMPLES / "planar_gripper" / "planar_gripper.sdf")
     assert set(robot.touching) == {f"finger{k}_{link}" for k in (1, 2, 3) for link in ("link2", "tip_link")}
@@ -96,10 +176,7 @@ def test_bodies_that_touch_at_home_are_listed() -> None:
 
 def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
     heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')
-    drive = (
-        '<transmission name="t"><type>SimpleTransmission</type><joint name="hinge"/><actuator name="a"/></transmission>'
-    )
-    robot = read_robot(urdf(tmp_path, link=heavy, further=drive))
+    robot = read_robot(urdf(tmp_path, link=heavy, further=DRIVE))
     assert any("cannot carry the robot at home: its limit is 5, the weight 9.81" in note for note in robot.notes)
 
 
@@ -116,7 +193,7 @@ def test_files_of_a_package_come_along(tmp_path: Path) -> None:
     robot = read_robot(urdf(package / "urdf", link=INERTIA + visual))
     names = ("package.xml", "urdf/robot.urdf", "meshes/arm.obj", "meshes/arm.mtl")
     assert {path.as_posix() for path in robot.files} == {f"my_robot/{name}" for name in names}
-    assert robot.packages and robot.model == Path("my_robot/urdf/robot.urdf")
+    assert robot.packages == {"my_robot": Path("my_robot")} and robot.model == Path("my_robot/urdf/robot.urdf")
 
 
 def test_files_beside_the_model_keep_their_places(tmp_path: Path) -> None:
@@ -134,7 +211,7 @@ def test_files_beside_the_model_keep_their_places(tmp_path: Path) -> None:
         ({"link": ""}, 4, "give the link arm an <inertial>"),
         ({"kind": "planar", "joint": ""}, 5, "hinge is planar.* replace it by several"),
         ({"kind": "revolut"}, 5, "unrecognized type"),
-        ({"joint": '<limit lower="0" upper="0" effort="1" velocity="1"/>'}, 5, "range of hinge is empty, 0 to 0"),
+        ({"joint": '<limit lower="1" upper="1" effort="1" velocity="1"/>'}, 5, "range of hinge is empty, 1 to 1"),
         (
             {"link": f'{INERTIA}<visual><geometry><mesh filename="no.obj"/></geometry></visual>'},
             4,
@@ -143,7 +220,7 @@ def test_files_beside_the_model_keep_their_places(tmp_path: Path) -> None:
         (
             {"link": f'{INERTIA}<visual><geometry><mesh filename="package://pkg/no.obj"/></geometry></visual>'},
             4,
-            "unknown package 'pkg'.* with its package.xml",
+            "unknown package 'pkg': no folder around the file is named pkg.* --package pkg=FOLDER",
         ),
     ],
 )
@@ -170,7 +247,7 @@ def test_loops_of_joints_are_refused_with_a_remedy(tmp_path: Path) -> None:
     loop += "<axis><xyz>0 1 0</xyz></axis></joint>"
     path = tmp_path / "loop.sdf"
     path.write_text(text[:begin] + loop + text[end + len("</drake:ball_constraint>") :])
-    with pytest.raises(RobotFileError, match=r"loop\.sdf: .*open each loop at one joint"):
+    with pytest.raises(RobotFileError, match=r"loop\.sdf:\d+: .*loop closes.*open each loop at one joint"):
         read_robot(path)
 
 

@@ -57,7 +57,7 @@ class Law(AddressedSystem):
 
 
 def missed_by(state: np.ndarray, goal: float) -> float:
-    """How far from the goal the mass is in the end."""
+    """Return the distance of the mass from the goal in the end."""
     return float(abs(state[0] - goal))
 
 
@@ -70,7 +70,7 @@ class PusherScenario(Scenario):
 
     simulator_config: SimulatorConfig = field(default_factory=SimulatorConfig)
     latency: float = 0.2
-    # Of the receding horizon; 0 decides on request.
+    # The period of the receding horizon; 0 decides on request.
     every: float = 0.0
     rollouts: int = 12
     # Whether a loop waits for decisions, however long they take; else their time is limited by the latency.

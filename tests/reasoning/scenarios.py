@@ -1,4 +1,4 @@
-"""Small testbeds of which the best decision is known."""
+"""Small testbeds whose best decision is known."""
 
 from __future__ import annotations
 

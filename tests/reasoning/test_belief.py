@@ -109,6 +109,7 @@ def _future(task, testbed, simulator, address):
 # -- perfect beliefs
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("executor", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
 def test_with_a_perfect_belief_the_mental_rollout_is_the_true_future(executor):
     scenario, elbow = AcrobotScenario(time_step=0.01), "sim.sys.Acrobot.elbow.position"
@@ -192,7 +193,7 @@ def test_a_rule_leads_its_estimates_to_the_present(latency, instant):
     # Measured 1 + latency periods before the DPS sampled it, which was at 0.6 or at 0.62 s.
     late = (1 + latency) * T + instant - (0.6 if instant == 0.62 else 0.62)
     assert believed == pytest.approx(testbed.read(context, "dps.angle") + late * rate, abs=1e-9)
-    # It falls at up to g / l = 19.62 rad/s^2; the rate is that of half a period before.
+    # It falls at up to g / l = 19.62 rad/s^2; the rate belongs to half a period before.
     assert abs(believed - true) < 19.62 * (late**2 + late * T) / 2.0 < abs(late * rate)
 
 
@@ -204,6 +205,13 @@ def test_the_mental_dps_gets_the_values_that_the_dps_received_last(tracked):
     # At 0.64 s the value shown, up to 0.70 s those in transit, and then what the sensor itself has measured.
     np.testing.assert_array_equal(record[2:9], shown)
     assert abs(record[-1] - shown) > 0.01
+
+
+def test_a_belief_shows_what_the_dps_received_and_what_is_believed_of_the_world(tracked):
+    testbed, context, _ = tracked
+    table = Belief.of(testbed, context)._repr_html_()
+    assert "belief at t = " in table and "<td>received</td><td>angle</td>" in table and "<td>world</td>" not in table
+    assert "<td>world</td><td>sim." in Belief.perfect(testbed, context)._repr_html_()
 
 
 def test_a_belief_of_the_dps_alone_gives_the_same_start(tracked):
@@ -263,6 +271,19 @@ def test_samples_have_the_covariance_that_is_given(tracked):
     np.testing.assert_allclose(drawn.std(axis=0), [0.1, 0.5 / np.sqrt(3.0)], rtol=0.1)
     again = to_start.starts(belief, samples=2)
     np.testing.assert_array_equal(again[1].contents.numbers, starts[1].contents.numbers)
+
+
+def test_samples_of_a_perfect_belief_lie_around_the_true_world(tracked):
+    testbed, context, mental = tracked
+    to_start = BeliefToStart(mental, uncertainty={THETA: 0.1, ARM_MASS: 0.5}, seed=3)
+    starts = to_start.starts(Belief.perfect(testbed, context), samples=400)
+    runner = RolloutRunner(RolloutTask(mental.scenario, 0.05, record=[THETA, ARM_MASS]))
+    begun = [runner.run({}, start=start).record for start in starts[:40]]
+    drawn = np.array([[record[THETA][0], record[ARM_MASS][0]] for record in begun])
+    truth = [testbed.read(context, address) for address in (THETA, ARM_MASS)]
+    np.testing.assert_allclose(drawn.mean(axis=0), truth, atol=3.0 * 0.5 / np.sqrt(40.0))
+    np.testing.assert_allclose(drawn.std(axis=0), [0.1, 0.5], rtol=0.4)
+    np.testing.assert_allclose([np.std([s.values[THETA] for s in starts])], 0.1, rtol=0.1)
 
 
 def test_a_covariance_matrix_correlates_the_entries_of_a_variable():

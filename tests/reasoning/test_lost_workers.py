@@ -13,6 +13,7 @@ from tests.reasoning.scenarios import MassScenario
 from tests.reasoning.test_reasoner import make
 from tests.rollout.scenarios import child_pids
 from vtbdrake.reasoning import Belief, Budget
+from vtbdrake.rollout import worker_processes
 
 # So long a worker waits at the gate, at most, in s; so that a test that fails ends.
 PATIENCE = 60.0
@@ -46,6 +47,7 @@ def gated(tmp_path):
     assert not Path(f"{scenario.gate}.ignored").exists(), "a decision has waited for a worker that was building"
 
 
+@pytest.mark.slow
 def test_after_a_killed_worker_the_other_one_decides(gated):
     belief, reasoner, workers, gate = gated
     expected = reasoner.decide(belief)
@@ -70,15 +72,16 @@ def test_after_a_killed_worker_the_other_one_decides(gated):
         os.kill(worker, signal.SIGKILL)
     decision = reasoner.decide(belief, budget=Budget(seconds=0.1))
     assert not decision
-    assert "not even that of the plan in use" in decision.warnings[0]
+    assert "not even of the plan in use" in decision.warnings[0]
 
 
-def test_after_a_hung_worker_the_other_one_decides(gated):
+def test_after_a_hung_worker_the_other_one_decides(gated, monkeypatch):
+    monkeypatch.setattr(worker_processes, "GRACE", 3.0)  # s; the other one keeps to it on a computer that is busy.
     belief, reasoner, workers, gate = gated
     first, second = workers()
     gate.touch()
     os.kill(first, signal.SIGSTOP)
-    # Half a second after the end of its budget the worker is given up.
+    # Some time after the end of its budget the worker is given up.
     assert reasoner.decide(belief, budget=Budget(seconds=0.1)).end == "time"
     assert first not in workers()
     decision = reasoner.decide(belief)
@@ -86,6 +89,7 @@ def test_after_a_hung_worker_the_other_one_decides(gated):
     assert second in workers()
 
 
+@pytest.mark.slow
 def test_after_an_interrupted_decision_new_workers_warm_up(gated, monkeypatch):
     belief, reasoner, workers, _ = gated
     run, before, calls = reasoner.executor.run, workers(), []

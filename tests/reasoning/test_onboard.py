@@ -11,9 +11,9 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from tests.reasoning.pusher import CANDIDATE, PERIOD, PLANNER, STATE, PusherScenario
+from vtbdrake.common.pickling import dumps
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.optimization import Parameter
-from vtbdrake.pickling import dumps
 from vtbdrake.reasoning import Budget, OnboardReasoner, SearchConfig, Trajectory
 from vtbdrake.rollout import Quality, RolloutTask, Start
 from vtbdrake.rollout.runner import RolloutRunner
@@ -56,6 +56,7 @@ def best_setpoint():
     return (GOAL - at_0) / (at_1 - at_0)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "scenario", [PusherScenario(rollouts=50, method="predictive-sampling"), PusherScenario(rollouts=51, method="grid")]
 )

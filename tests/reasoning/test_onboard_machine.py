@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.cli.program import run
 from tests.cli.test_run import PATIENCE, start
@@ -106,6 +107,7 @@ def test_it_decides_beside_the_loop_as_in_a_simulation():
     assert shown == [target.read(context, f"{PLANNER}.{name}") for name in ("decision", "quality", "rollouts", "valid")]
 
 
+@pytest.mark.slow
 def test_latency_of_three_periods_is_enough() -> None:
     scenario = PusherScenario(rollouts=100_000, latency=0.3)
     clock = WallClock()
@@ -124,6 +126,7 @@ def test_latency_of_three_periods_is_enough() -> None:
         assert runtime.target.read(runtime.context, f"{PLANNER}.taken") == request
 
 
+@pytest.mark.slow
 def test_alarm_of_the_residuals_asks_for_a_decision() -> None:
     scenario = PusherScenario(rollouts=6, latency=0.5, waits=True)
     machine = Machine(scenario, MachineConfig(period=PERIOD))
@@ -148,6 +151,7 @@ def test_alarm_of_the_residuals_asks_for_a_decision() -> None:
     assert monitor.alarms and read["taken"] >= 1.0 and read["valid"] == 1.0
 
 
+@pytest.mark.slow
 def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
     with Loop(PusherScenario(rollouts=100_000, latency=0.5)) as real:
         worker = real.worker
@@ -171,6 +175,7 @@ def test_worker_that_is_killed_while_it_thinks_is_a_missing_decision():
         assert real.worker != worker
 
 
+@pytest.mark.slow
 def test_dps_that_reasons_decides_acts_and_is_replayed(tmp_path: Path) -> None:
     log_file, options = tmp_path / "pusher.lcm", ("--field", "latency=0.5", "--set", "u.goal=0.4")
     with (

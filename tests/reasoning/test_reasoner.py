@@ -70,6 +70,7 @@ def decide(reasoner, testbed, *, values=None, at=0.0, **options):
 # -- known answers
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("method", ["CEM", "predictive-sampling", "MPPI", "CMA-ES", "LN_COBYLA"])
 def test_a_double_integrator_switches_at_half_the_time_of_bang_bang(method, mass):
     # 1 m from rest to rest with 1 m/s^2 takes 2 s.
@@ -79,6 +80,7 @@ def test_a_double_integrator_switches_at_half_the_time_of_bang_bang(method, mass
     assert decision.quality < 0.1
 
 
+@pytest.mark.slow
 def test_swing_up_time_agrees_with_ode_solver():
     torque, horizon = 2.5, 1.6
 
@@ -166,9 +168,12 @@ def test_a_given_plan_is_tried_and_starts_the_method(mass):
 # -- budgets
 
 
-@pytest.mark.parametrize("method", ["CEM", "predictive-sampling", "MPPI", "random"])
+@pytest.mark.parametrize(
+    "method",
+    ["CEM", *(pytest.param(name, marks=pytest.mark.slow) for name in ("predictive-sampling", "MPPI", "random"))],
+)
 def test_the_quality_never_falls_with_the_budget(method, mass):
-    for seed in range(3):
+    for seed in range(2):
         costs = [
             decide(make(method=method, budget=Budget(rollouts=budget), seed=seed), mass).quality
             for budget in (1, 2, 5, 12, 30)
@@ -213,7 +218,8 @@ def test_all_executors_give_the_same_decision(name, executors, mass):
     assert all(a.rollouts[0].identical(b.rollouts[0]) for a, b in zip(other.candidates, serial.candidates, strict=True))
 
 
-@pytest.mark.parametrize("name", ["serial", "threads", "processes"])
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ["serial", "threads", pytest.param("processes", marks=pytest.mark.slow)])
 def test_when_the_time_is_over_rollouts_under_way_are_cancelled(name, executors, mass):
     # A rollout of a million samples takes longer than any budget of the test.
     reasoner = make(horizon=1e4, sample_period=0.01, executor=executors[name], budget=Budget(seconds=0.05))
@@ -223,12 +229,17 @@ def test_when_the_time_is_over_rollouts_under_way_are_cancelled(name, executors,
     assert [candidate.status for candidate in decision.candidates] == ["unfinished"]
     assert "1 did not finish" in decision.message
     assert "the budget of 0.05 s is spent" in decision.message
-    assert "not even that of the plan in use" in decision.warnings[0]
+    assert "not even of the plan in use" in decision.warnings[0]
+
+
+HALF = {"u.switch": 0.5}
 
 
 def test_a_budget_of_time_gives_the_best_so_far(mass):
-    # Enough for one rollout, also on a computer that is busy.
-    decision = decide(make(method="random", budget=Budget(seconds=2.0)), mass, values={"u.switch": 0.5})
+    seconds = 0.2
+    # On a computer that is busy, it may not be enough for a rollout.
+    while not (decision := decide(make(method="random", budget=Budget(seconds=seconds)), mass, values=HALF)):
+        seconds *= 2.0
     finished = [c.quality for c in decision.candidates if c.status == "eligible"]
     assert decision.end == "time"
     assert decision.quality == min(finished)
@@ -266,10 +277,11 @@ def test_a_decision_may_have_a_budget_of_its_own(mass):
         decide(make(), mass, budget=4)
 
 
+@pytest.mark.slow
 def test_workers_that_die_or_hang_make_a_decision_poor(mass):
     scenario = MassScenario(treacherous=True)
     options = {"decision": [Choice("u.switch", [1.0, KILL, HANG])], "method": "grid", "executor": "processes"}
-    with make(scenario, **options, workers=2, time_limit=0.5) as reasoner:
+    with make(scenario, **options, workers=2, time_limit=3.0) as reasoner:
         reasoner.warm_up()
         belief = Belief.perfect(mass, mass.default_context())
         decision = reasoner.decide(belief)
@@ -365,7 +377,7 @@ def test_pruning_gives_the_same_decision_in_processes(executors, mass):
         ({"patience": 0.0}, "patience is a time in seconds, above 0"),
         ({"gain": -1.0}, "gain is at least 0"),
         ({"of": STATE}, "but no bound"),
-        ({"bound": 3.0}, "a bound is a function"),
+        ({"bound": 3.0}, "the bound of a pruning is a function of the remaining time, not 3.0"),
     ],
 )
 def test_a_senseless_pruning_is_refused(options, message):
@@ -428,13 +440,13 @@ def test_uncertain_beliefs_are_judged_by_the_risk(mass):
 def test_a_wrong_belief_costs_and_its_spread_warns_of_it(mass):
     context = mass.default_context()
     mass.write(context, {"dps.estimate": [0.36, 0.0]})  # It is at 0.
-    settings = {"method": "grid", "options": {"points": 31}, "budget": Budget(rollouts=32 * 4)}
-    with make(**settings) as reasoner:
+    with make(method="grid", options={"points": 31}, budget=Budget(rollouts=32)) as reasoner:
         decision = reasoner.decide(mass, context)
     # From 0.36 m it has 0.8^2 m to go.
     assert decision.values["u.switch"] == pytest.approx(0.8)
     assert decision.quality == pytest.approx(0.0, abs=1e-9)
     uncertainty = {"sim.sys.mass.discrete_state_0": [0.36, 0.0]}
+    settings = {"method": "grid", "options": {"points": 7}, "budget": Budget(rollouts=8 * 4)}
     with make(**settings, samples=4, uncertainty=uncertainty) as reasoner:
         assert reasoner.decide(mass, context).health.spread > 0.05
     decision.apply(mass, context)
@@ -628,7 +640,10 @@ def test_a_senseless_budget_is_refused(arguments, message):
         ({"method": "simulated annealing"}, "there is no solver 'simulated annealing'"),
         ({"method": "CEM", "options": {"popsize": 3}}, "CEM has no option 'popsize'"),
         ({"method": "CEM", "decision": [Choice("u.switch", [0.5, 1.0])]}, "CEM varies numbers"),
-        ({"method": "grid", "options": {"points": 50}}, "the grid has 50 points, and the budget is 29"),
+        (
+            {"method": "grid", "options": {"points": 50}},
+            "budget is 29 .*: of the 30 rollouts, the plan in use takes 1 rollout$",
+        ),
         ({"horizon": -1.0}, "horizon t_m must be positive"),
         ({"executor": "gpu"}, "an executor is one of"),
     ],
@@ -718,6 +733,7 @@ def test_a_second_decision_at_the_same_time_is_refused(mass):
         assert reasoner.decide(Belief.perfect(mass, context)).values == decision.values
 
 
+@pytest.mark.slow
 def test_a_closed_reasoner_decides_nothing(mass):
     reasoner = make()
     reasoner.close()

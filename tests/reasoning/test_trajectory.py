@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from vtbdrake.common.spline import ORDERS, Spline
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Trajectory
-from vtbdrake.spline import ORDERS, Spline
 
 TIMES = np.linspace(0.0, 2.0, 1001)
 LIMITS: dict[str, dict[str, Any]] = {
@@ -44,6 +44,7 @@ def assert_kept(plan: Trajectory, knots: np.ndarray) -> None:
     assert (np.abs(np.diff(y, n=2, axis=0)) / step**2 <= np.array(plan.acceleration) * (1 + 1e-4)).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("start", [None, [3.0, 0.4]])
 @pytest.mark.parametrize("order", ORDERS)
 def test_limited_trajectories_keep_all_limits_between_the_knots(order: str, start: list[float] | None) -> None:
@@ -178,6 +179,7 @@ def test_bad_knots_are_refused(knots: np.ndarray) -> None:
         trajectory("cubic").limited(knots)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize("duration", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("order", ["linear", "cubic", "bspline"])

@@ -126,6 +126,7 @@ def test_a_reading_that_the_belief_reaches_is_not_judged():
     assert next(_decisions(CartScenario(seen_place=0.1))).warnings == ()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("scenario", [CartPoleScenario(), SpaceClimberScenario(), SatelliteScenario()], ids=repr)
 def test_complete_rules_reach_every_encoder(scenario):
     testbed = scenario.build()

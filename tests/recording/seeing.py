@@ -15,9 +15,9 @@ from pydrake.systems.sensors import ImageGrey8U
 
 from tests.control.scripted import PERIOD
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command
-from vtbdrake.lcm.drake_messages import image_map
+from vtbdrake.lcm.iiwa_messages import iiwa_command
 from vtbdrake.lcm.protocol import Protocol
+from vtbdrake.lcm.sensor_messages import image_map
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 WIDTH, HEIGHT = 8, 6

@@ -55,6 +55,28 @@ def test_pandas_reads_numbers_exactly(log: ControlLog, tmp_path: Path, suffix: s
     assert table["command.velocity[0]"].isna().sum() == 15
 
 
+def permissions(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_what_records_a_machine_is_read_by_its_owner_alone(log: ControlLog, tmp_path: Path) -> None:
+    assert permissions(Path(log.path)) == 0o600
+    for suffix in (".csv", ".parquet", ".mcap"):
+        path = tmp_path / f"run{suffix}"
+        export(log, path)
+        assert permissions(path) == 0o600
+        export(log, path, mode=0o640)
+        assert permissions(path) == 0o640
+    servo = Servo(alone=False, begun=False)
+    with Recorder(servo.runtime, tmp_path / "shared.lcm", mode=0o644):
+        pass
+    assert permissions(tmp_path / "shared.lcm") == 0o644
+    (tmp_path / "shared.lcm").chmod(0o666)
+    with Recorder(Servo(alone=False, begun=False).runtime, tmp_path / "shared.lcm", overwrite=True):
+        pass
+    assert permissions(tmp_path / "shared.lcm") == 0o600
+
+
 def test_unknown_suffix_is_rejected(log: ControlLog, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"ends in .csv, .mcap, .parquet, unlike '.*run.xlsx'"):
         export(log, tmp_path / "run.xlsx")

@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -102,7 +103,7 @@ def test_damaged_byte_costs_one_cycle(
     bounds = ends(reference)
     begin = reference.events.on("VTB_STATE")[0][3]
     chosen = random.Random(1)
-    for place in chosen.sample(range(begin, bounds[-1]), 150):
+    for place in chosen.sample(range(begin, bounds[-1]), 60):
         content = bytearray(whole)
         content[place] ^= 1 << chosen.randrange(8)
         log = read(tmp_path, bytes(content))
@@ -203,6 +204,36 @@ def test_clock_jump_is_reported_and_harmless(
     assert list(log.clock_jumps) == [7] and not log.damages and not log.gaps
     assert f"the clock jumps at cycle {reference.numbers[7]}" in caplog.text
     assert replay(log).identical
+
+
+@pytest.mark.parametrize("first", [6, 7, 8, CYCLES - 1])
+def test_log_is_read_part_by_part(
+    whole: bytes, reference: ControlLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    monkeypatch.setattr("vtbdrake.recording.log_reader.RECORDS_TOGETHER", 3)
+    log = read(tmp_path, shifted(whole, reference, first, 3600.0))
+    assert list(log.clock_jumps) == [first] and not log.damages and not log.gaps
+    fed, sources = log.fed_in(first - 2, first + 1)
+    for name, values in reference.fed.items():
+        assert np.array_equal(fed[name], values[first - 2 : first + 1], equal_nan=True)
+        assert np.array_equal(sources[name], reference.sources[name][first - 2 : first + 1])
+    log = read(tmp_path, whole)
+    assert_same(log, reference, list(range(CYCLES)))
+
+
+def test_opening_a_log_takes_less_memory_than_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vtbdrake.recording.log_reader.RECORDS_TOGETHER", 128)
+    servo = Servo()
+    with Recorder(servo.runtime, tmp_path / "run.lcm"):
+        servo.runtime.run(cycles=1500)
+    read_log(tmp_path / "run.lcm")  # What is imported and kept by it does not count.
+    tracemalloc.start()
+    log = read_log(tmp_path / "run.lcm")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # A number, a time and some places for each cycle, and one part of the log; its columns alone are as large as the
+    # file, and are read when they are asked for.
+    assert len(log) == 1500 and peak < 0.8 * len(log.events.content)
 
 
 def test_delayed_cycle_is_no_clock_jump(tmp_path: Path) -> None:

@@ -120,6 +120,7 @@ def simulated(scenario: Scenario, **values: ArrayLike) -> dict[str, np.ndarray]:
     return dict(zip(("time", *STANDING, "force"), np.array(samples).T, strict=True))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("scheme", ["discrete", "continuous"])
 @pytest.mark.parametrize("begin", [0.0, 123.4])
 def test_log_drives_the_world_along_the_same_motion(scheme: str, begin: float) -> None:
@@ -152,6 +153,7 @@ def test_driven_scenario_is_sent_to_other_processes_and_refuses_what_does_not_fi
     assert copied.record() == same.record() != other.record()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("executor", ["serial", "threads", "processes", "compiled"])
 def test_sweep_of_a_driven_world(executor: str) -> None:
     times = 0.02 * np.arange(10)

@@ -22,8 +22,8 @@ from tests.recording.servo import Servo
 from tests.testbed.test_dps_state import PlannedScenario
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.lcm.bridge import LcmBridge
 from vtbdrake.lcm.hub import Hub
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.log_reader import ControlLog, read_log
@@ -42,6 +42,7 @@ def recorded(tmp_path: Path, servo: Servo, act: Callable[[], None] = lambda: Non
     return read_log(tmp_path / "run.lcm")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("alone", [True, False], ids=["dps", "testbed"])
 def test_replay_is_identical(tmp_path: Path, alone: bool) -> None:
     servo = Servo(alone=alone)
@@ -69,6 +70,7 @@ def test_testbed_replays_every_switch(tmp_path: Path) -> None:
     assert np.array_equal(world[-1], servo.runtime.target.read(servo.runtime.context, "sim.sys.axes.discrete_state_0"))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("before", [18, 19])
 def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
     """Values at the real ports count: the position comes in every other cycle only."""
@@ -79,7 +81,7 @@ def test_recording_begun_later_is_replayed(tmp_path: Path, before: int) -> None:
 
 
 class Prepared(ServoSystem):
-    """A DPS that is initialized to count from 100 on; its ports are those of `ServoSystem`."""
+    """A DPS that is initialized to count from 100 on; it has the ports of `ServoSystem`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,6 +96,7 @@ class PreparedScenario(ServoScenario):
         return Prepared()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("begun", [False, True], ids=["before", "after"])
 def test_recorded_initialization_is_replayed(tmp_path: Path, begun: bool) -> None:
     servo = Servo(begun=begun, scenario=PreparedScenario(rate=0.0))
@@ -205,7 +208,7 @@ def test_unknown_address_is_rejected(tmp_path: Path) -> None:
 
 
 class Worse(ServoSystem):
-    """A DPS that changes the last bit of its actuator command in one cycle; its ports are those of `ServoSystem`."""
+    """A DPS that changes the last bit of its actuator command in one cycle; it has the ports of `ServoSystem`."""
 
     def _update(self, context: Context, discrete: object) -> None:
         super()._update(context, discrete)
@@ -289,6 +292,7 @@ def rushing(t: float) -> Mapping[str, list[float]]:
     return {"position": [np.sin(300.0 * t), np.cos(170.0 * t)]}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("function", [chaotic, picky], ids=["results", "missing results"])
 def test_results_of_slow_parts_are_replayed(tmp_path: Path, function: Callable[..., object]) -> None:
     """They are not computed again: missing results are missing again."""
@@ -367,7 +371,7 @@ class Seeing:
 
 
 def test_images_are_replayed_from_raw_messages(hub: Hub, tmp_path: Path) -> None:
-    """Of several images in a cycle the last accepted one counts."""
+    """The last accepted one of several images in a cycle counts."""
     loop = Seeing(hub)
     shown = []
     with Recorder(loop.runtime, tmp_path / "run.lcm", digest_period=PERIOD):

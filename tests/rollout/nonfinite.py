@@ -72,7 +72,7 @@ def compiled_law(bad, *, sampled):
 
 
 class Tank(LeafSystem):
-    """The level x of a tank, in m, whose rate is a root that ends at t = 0.25 s: that of a negative number is NaN."""
+    """The level x of a tank, in m, whose rate is a root until t = 0.25 s: the root of a negative number is NaN."""
 
     def __init__(self, root):
         super().__init__()
@@ -104,7 +104,7 @@ class NonfiniteScenario(Scenario):
     compiled: bool = False  # the DPS consists of systems in C++
     plant: bool = False
     time_step: float = 0.0
-    # The force is that of a system of the world, and is not finite from the beginning.
+    # The force comes from a system of the world, and is not finite from the beginning.
     in_world: bool = False
     # There is a `Tank` in the world.
     root: str = ""

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from tests.rollout.scenarios import HANG, KILL, TreacherousScenario
+from tests.rollout.scenarios import HANG, KILL, TreacherousScenario, child_pids
 from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Cutoff, ProcessExecutor, Quality, RolloutTask, SerialExecutor, worker_processes
 
@@ -19,10 +19,17 @@ GAIN = "dps.gain[0]"
 TASK = RolloutTask(PendulumScenario(), 0.3, Quality(abs, THETA))
 
 
+@pytest.fixture(scope="module")
+def one():
+    """A worker process that several tests share."""
+    with ProcessExecutor(1) as executor:
+        yield executor
+
+
 @pytest.fixture
 def always(monkeypatch):
     """However long rollouts take on this computer."""
-    monkeypatch.setattr(worker_processes, "_BRIEF", inf)
+    monkeypatch.setattr(worker_processes, "BRIEF", inf)
 
 
 @pytest.fixture
@@ -39,7 +46,7 @@ def _watched(executor, task, points):
     for index, result in executor.run(task, points):
         assert index not in results
         results[index] = result
-        most = max(most, *(len(worker.jobs) for worker in executor._workers))
+        most = max(most, *executor.rollouts_of_workers)
     return results, most
 
 
@@ -47,18 +54,16 @@ def _points(count):
     return [{THETA: 0.1 * i} for i in range(count)]
 
 
-def test_a_worker_has_its_next_rollout_before_it_finishes(always):
-    with ProcessExecutor(1) as executor:
-        results, most = _watched(executor, TASK, _points(5))
+def test_a_worker_has_its_next_rollout_before_it_finishes(one, always):
+    results, most = _watched(one, TASK, _points(5))
     assert most == 2
     expected = dict(SerialExecutor().run(TASK, _points(5)))
     assert all(results[i].identical(expected[i]) for i in range(5))
 
 
-def test_long_rollouts_go_to_whoever_is_free(monkeypatch):
-    monkeypatch.setattr(worker_processes, "_BRIEF", 0.0)
-    with ProcessExecutor(1) as executor:
-        assert _watched(executor, TASK, _points(5))[1] == 1
+def test_long_rollouts_go_to_whoever_is_free(one, monkeypatch):
+    monkeypatch.setattr(worker_processes, "BRIEF", 0.0)
+    assert _watched(one, TASK, _points(5))[1] == 1
 
 
 def test_the_last_rollouts_go_to_whoever_is_free(always):
@@ -68,16 +73,15 @@ def test_the_last_rollouts_go_to_whoever_is_free(always):
         assert _watched(executor, TASK, _points(9))[1] == 2
 
 
-def test_what_would_fill_the_socket_is_not_given_ahead(always):
+def test_what_would_fill_the_socket_is_not_given_ahead(one, always):
     # Both sides would wait for the other to read: the worker sends a result that repeats its point.
     points = [{THETA: np.full(200_000, 0.1 * i)} for i in range(4)]
-    with ProcessExecutor(1) as executor:
-        results, most = _watched(executor, TASK, points)
+    results, most = _watched(one, TASK, points)
     assert most == 1
     assert all(results[i].failed and "200000" in results[i].message for i in range(4))
 
 
-@pytest.mark.parametrize(("how", "time_limit"), [(KILL, inf), (HANG, 2.0)])
+@pytest.mark.parametrize(("how", "time_limit"), [(KILL, inf), pytest.param(HANG, 2.0, marks=pytest.mark.slow)])
 def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, always, treacherous, caplog):
     points = [{SHOULDER: 0.1 * i, GAIN: 0.0} for i in range(6)]
     with SerialExecutor() as serial:
@@ -93,6 +97,7 @@ def test_a_lost_worker_has_not_tried_what_it_was_given_ahead(how, time_limit, al
     assert all(results[i].identical(expected[i]) for i in (0, 2, 3, 4, 5))
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, treacherous, caplog):
     points = [{SHOULDER: 0.01 * i, GAIN: 0.0} for i in range(24)]
     with SerialExecutor() as serial:
@@ -107,6 +112,7 @@ def test_a_worker_that_dies_within_its_share_loses_one_rollout(always, treachero
     assert all(results[i].identical(expected[i]) for i in range(24) if i != 5)
 
 
+@pytest.mark.slow
 def test_rollouts_that_kill_their_workers_have_two_tries_each(always, treacherous):
     points = [{GAIN: gain} for gain in (0.0, -KILL, -KILL, 0.0)]
     with ProcessExecutor(1) as executor:
@@ -121,6 +127,7 @@ def _slow(theta):
     return abs(theta)
 
 
+@pytest.mark.slow
 def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
     # Each has two samples, of 1.5 s together, and has stood behind another one.
     task = RolloutTask(PendulumScenario(), 0.5, Quality(_slow, THETA), sample_period=0.5)
@@ -130,11 +137,14 @@ def test_the_time_limit_counts_from_where_a_rollout_begins(always, caplog):
     assert caplog.text == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [inf, 0.2])
 def test_a_worker_that_is_stopped_between_rollouts_is_replaced(seconds, caplog):
+    others = set(child_pids())
     with ProcessExecutor(1, time_limit=2.0 if seconds == inf else inf) as executor:
         list(executor.run(TASK, _points(1)))
-        os.kill(executor._workers[0].child.pid, signal.SIGSTOP)
+        (worker,) = set(child_pids()) - others
+        os.kill(worker, signal.SIGSTOP)
         results = dict(executor.run(TASK, _points(2), cutoff=Cutoff(deadline=time.monotonic() + seconds)))
         assert len(results) == (2 if seconds == inf else 0)
         assert not any(result.failed for result in results.values())

@@ -62,6 +62,7 @@ print([trial.value for trial in study.trials] == [trial.value for trial in alone
 """
 
 
+@pytest.mark.slow
 def test_a_scenario_of_notebook_cells_is_studied_with_the_defaults(tmp_path):
     cells = [nbformat.v4.new_code_cell(text) for text in (ACROBOT, STUDY)]
     notebook = nbformat.v4.new_notebook(cells=cells)
@@ -99,7 +100,9 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("kind", ["processes", "pool", "dask"])
+@pytest.mark.parametrize(
+    "kind", ["processes", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pool", "dask"))]
+)
 def test_a_system_of_the_main_script_runs_in_workers(kind, tmp_path, request):
     script = tmp_path / "script.py"
     script.write_text(ACROBOT + textwrap.dedent(SCRIPT))

@@ -29,6 +29,7 @@ def differences(stated, point, by, step=1e-4):
     return np.array([(value(a, step) - value(a, -step)) / (2.0 * step) for a in by])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("reading", ["best", "worst", "end", "integral"])
 @pytest.mark.parametrize("minimize", [False, True])
 def test_derivatives_are_those_of_central_differences(reading, minimize):

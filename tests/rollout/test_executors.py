@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from io import StringIO
 from pathlib import Path
 from types import ModuleType
@@ -29,7 +30,7 @@ from vtbdrake.rollout import (
     WorkerError,
 )
 from vtbdrake.rollout.cluster import DaskExecutor
-from vtbdrake.rollout.compiled import CompiledExecutor
+from vtbdrake.rollout.compiled_executor import CompiledExecutor
 from vtbdrake.rollout.executor import run_rollouts, watched
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,34 +45,38 @@ def _bad_at_half(t):
     return -1.0 if t > 0.5 else 0.0
 
 
-@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
-def test_an_error_in_the_quality_reaches_the_user_as_itself(make):
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ["serial", "threads", "processes"])
+def test_an_error_in_the_quality_reaches_the_user_as_itself(name, request):
     task = RolloutTask(AcrobotScenario(), 1.0, Quality(_bad_at_half, "time"))
-    with make() as executor, pytest.raises(QualityError, match="_bad_at_half at t = 0.55 s"):
+    with (
+        EXECUTORS[name](request.getfixturevalue) as executor,
+        pytest.raises(QualityError, match="_bad_at_half at t = 0.55 s"),
+    ):
         run_rollouts(executor, task, [{}] * 4, progress=False)
 
 
-def test_what_cannot_travel_is_an_error_with_the_remedy():
+def test_what_cannot_travel_is_an_error_with_the_remedy(processes):
     lock = threading.Lock()
     task = RolloutTask(AcrobotScenario(), 1.0, Quality(lambda t: float(lock.locked()), "time"))
-    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
-        run_rollouts(executor, task, [{}], progress=False)
+    with pytest.raises(WorkerError, match="use executor='threads' or 'serial'"):
+        run_rollouts(processes, task, [{}], progress=False)
 
 
-def test_a_value_that_cannot_travel_is_named():
+def test_a_value_that_cannot_travel_is_named(processes):
     task = RolloutTask(AcrobotScenario(), 0.1, Quality(_angle, SHOULDER))
     points = [{SHOULDER: 0.1, "dps.gain": threading.Lock()}]
-    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="dps.gain = <unlocked .* cannot be sent"):
-        list(executor.run(task, points))
+    with pytest.raises(WorkerError, match="dps.gain = <unlocked .* cannot be sent"):
+        list(processes.run(task, points))
 
 
-def test_a_module_that_workers_do_not_have_is_named(monkeypatch):
+def test_a_module_that_workers_do_not_have_is_named(monkeypatch, processes):
     module = ModuleType("only_here")
     exec("def f(theta):\n    return theta ** 2", module.__dict__)
     monkeypatch.setitem(sys.modules, "only_here", module)
     task = RolloutTask(AcrobotScenario(), 0.1, Quality(module.f, SHOULDER))
-    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match="No module named 'only_here'"):
-        list(executor.run(task, [{}]))
+    with pytest.raises(WorkerError, match="No module named 'only_here'"):
+        list(processes.run(task, [{}]))
 
 
 @pytest.mark.parametrize(
@@ -95,6 +100,7 @@ def test_progress_is_shown_in_a_kernel_only(monkeypatch):
     assert watched()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "kind"), [(KILL, "died"), (STOP, "time limit")])
 def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp_path, caplog):
     fuse = tmp_path / "fuse"
@@ -111,6 +117,7 @@ def test_a_lost_worker_costs_its_own_rollout_which_is_tried_again(how, kind, tmp
     assert all(a.identical(b) for i, (a, b) in enumerate(zip(results, expected, strict=True)) if i != 3)
 
 
+@pytest.mark.slow
 def test_a_rollout_that_kills_every_worker_fails_alone(tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -122,6 +129,7 @@ def test_a_rollout_that_kills_every_worker_fails_alone(tmp_path):
     assert results[1].message.count("died (exit code -9)") == 2
 
 
+@pytest.mark.slow
 def test_unguarded_script_uses_processes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
@@ -156,7 +164,14 @@ def test_unguarded_script_uses_processes(tmp_path):
     assert eval(done.stdout.replace("np.float64", "")) == [0.25, 1.0]
 
 
-@pytest.mark.parametrize(("executor", "workers"), [("serial", None), ("threads", 2), ("processes", 2)])
+@pytest.mark.parametrize(
+    ("executor", "workers"),
+    [
+        pytest.param("serial", None, marks=pytest.mark.slow),
+        ("threads", 2),
+        pytest.param("processes", 2, marks=pytest.mark.slow),
+    ],
+)
 def test_ctrl_c_keeps_what_is_finished(executor, workers, tmp_path):
     """A real SIGINT to a whole group of processes, as a terminal sends it."""
     script = tmp_path / "sweep.py"
@@ -219,7 +234,7 @@ THETA = "sim.sys.Pendulum.theta.position"
 EXECUTORS = {
     "serial": lambda get: SerialExecutor(),
     "threads": lambda get: ThreadExecutor(2),
-    "processes": lambda get: ProcessExecutor(2),
+    "processes": lambda get: nullcontext(get("processes")),
     "thread pool": lambda get: FuturesExecutor(ThreadPoolExecutor(2)),
     "process pool": lambda get: FuturesExecutor(get("process_pool")),
     "loky": lambda get: FuturesExecutor(get("loky_pool")),
@@ -247,10 +262,13 @@ def case(request):
     return task, points, expected
 
 
-@pytest.mark.parametrize("make", EXECUTORS.values(), ids=EXECUTORS)
-def test_all_executors_give_identical_results(make, case, request):
+@pytest.mark.slow_cases
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in ("loky", "dask") else []) for name in EXECUTORS]
+)
+def test_all_executors_give_identical_results(name, case, request):
     task, points, expected = case
-    with make(request.getfixturevalue) as executor:
+    with EXECUTORS[name](request.getfixturevalue) as executor:
         # Used a second time, it gives the same.
         for _ in range(2):
             results = run_rollouts(executor, task, points, progress=False)

@@ -138,8 +138,9 @@ def test_threads_build_their_testbeds_one_after_another():
     assert not WatchedScenario.overlap.is_set()
 
 
+@pytest.mark.slow
 def test_more_threads_than_testbeds_are_kept_take_them_from_each_other():
-    points = [{STIFFNESS: float(k), THETA: 0.5} for k in range(60)]
+    points = [{STIFFNESS: float(k), THETA: 0.5} for k in range(24)]
     with ThreadExecutor(4, max_testbeds=1) as threads, SerialExecutor(max_testbeds=1) as serial:
         results, expected = (_results(executor, _task(), points) for executor in (threads, serial))
     assert all(ours.identical(theirs) for ours, theirs in zip(results, expected, strict=True))
@@ -175,6 +176,7 @@ def test_what_cannot_be_built_is_a_failed_rollout(make):
     )
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", EXECUTORS.values(), ids=EXECUTORS)
 @pytest.mark.parametrize(
     ("point", "message"),

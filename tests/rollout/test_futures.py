@@ -39,22 +39,22 @@ class Counting(concurrent.futures.Executor):
         self.num_workers = workers
         self.submitted = 0
         self.most = 0
-        self._open = 0
+        self.open = 0
         self._lock = threading.Lock()
-        self._inner = ThreadPoolExecutor(workers)
+        self.inner = ThreadPoolExecutor(workers)
 
     def submit(self, fn, /, *args, **kwargs):
         with self._lock:
             self.submitted += 1
-            self._open += 1
-            self.most = max(self.most, self._open)
-        future = self._inner.submit(fn, *args, **kwargs)
+            self.open += 1
+            self.most = max(self.most, self.open)
+        future = self.inner.submit(fn, *args, **kwargs)
         future.add_done_callback(self._done)
         return future
 
     def _done(self, future):
         with self._lock:
-            self._open -= 1
+            self.open -= 1
 
 
 @pytest.mark.parametrize(("in_flight", "most"), [(None, 4), (3, 3)])
@@ -70,10 +70,10 @@ def test_interruption_cancels_what_has_not_begun():
     rollouts = FuturesExecutor(pool, in_flight=8).run(TASK, _points(100))
     next(rollouts)
     rollouts.close()
-    pool._inner.shutdown(wait=True)
+    pool.inner.shutdown(wait=True)
     # What was in flight, and what took the place of the one that came back.
     assert pool.submitted <= 9
-    assert pool._open == 0
+    assert pool.open == 0
 
 
 @pytest.mark.parametrize("pool", POOLS)
@@ -121,8 +121,9 @@ def _loky(**options):
     return pytest.importorskip("loky").ProcessPoolExecutor(1, **options)
 
 
-@pytest.mark.parametrize("make", [_standard, _loky])
-@pytest.mark.parametrize("how", [KILL, -KILL])
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [_standard, pytest.param(_loky, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("how", [KILL, pytest.param(-KILL, marks=pytest.mark.slow)])
 def test_killed_process_costs_its_own_rollout(make, how, tmp_path, caplog):
     """Once, and then it is run again; or each time."""
     fuse = tmp_path / "fuse"
@@ -142,6 +143,7 @@ def test_killed_process_costs_its_own_rollout(make, how, tmp_path, caplog):
     assert "processes of vtbdrake take its place" in caplog.text
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("make", "error"), [(_standard, "BrokenProcessPool"), (_loky, "TerminatedWorkerError")])
 def test_broken_pool_without_replacement_loses_its_rollouts(make, error, tmp_path):
     fuse = tmp_path / "fuse"

@@ -9,7 +9,7 @@ import pytest
 from tests.interruptions import hanging_fails, interrupt, places
 from tests.rollout.scenarios import child_pids
 from tests.testbeds import PendulumScenario
-from vtbdrake import child_process
+from vtbdrake.common import child_process
 from vtbdrake.rollout import (
     FuturesExecutor,
     ProcessExecutor,
@@ -40,7 +40,7 @@ def expected():
 
 
 def survives(make, expected, *modules, lines=False, every=1, warm=(False, True), begins=None):
-    """Interrupt the first rollouts of an executor, and those of a warm one, at every place; return how many there are.
+    """Interrupt rollouts of an executor, the first ones and later ones, at every place; return the number of places.
 
     Args:
         make: Makes the executor.
@@ -77,10 +77,12 @@ def survives(make, expected, *modules, lines=False, every=1, warm=(False, True),
     return interrupted
 
 
-def test_ctrl_c_in_many_lines_of_a_serial_executor(expected):
-    assert survives(SerialExecutor, expected, executor, testbeds, runner, lines=True, every=2) > 40
+@pytest.mark.parametrize("every", [8, pytest.param(2, marks=pytest.mark.slow)])
+def test_ctrl_c_in_many_lines_of_a_serial_executor(expected, every):
+    assert survives(SerialExecutor, expected, executor, testbeds, runner, lines=True, every=every) > 80 / every
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_many_lines_while_rollouts_begin_elsewhere():
     testbed = TASK.scenario.build()
     context = testbed.default_context()
@@ -91,12 +93,14 @@ def test_ctrl_c_in_many_lines_while_rollouts_begin_elsewhere():
     assert survives(SerialExecutor, expected, testbeds, runner, start, lines=True, every=2, begins=begins) > 40
 
 
+@pytest.mark.slow
 def test_ctrl_c_anywhere_in_threads(expected):
     before = threading.active_count()
     assert survives(lambda: ThreadExecutor(2), expected, executor, testbeds, runner) > 40
     assert threading.active_count() == before
 
 
+@pytest.mark.slow
 def test_ctrl_c_anywhere_in_a_pool(expected):
     with ThreadPoolExecutor(2) as pool:
         assert survives(lambda: FuturesExecutor(pool), expected, futures, pickled_task, executor) > 40

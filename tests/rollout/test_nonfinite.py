@@ -18,6 +18,8 @@ from pydrake.systems.primitives import LinearSystem
 from tests.interruptions import hanging_fails
 from tests.rollout.nonfinite import NonfiniteScenario, Tank, compiled_law
 from tests.testbeds import AcrobotScenario, PendulumScenario
+from vtbdrake.drake_workarounds import step_watch
+from vtbdrake.drake_workarounds.step_watch import NoProgressError
 from vtbdrake.rollout import (
     ProcessExecutor,
     Quality,
@@ -28,8 +30,7 @@ from vtbdrake.rollout import (
     make_executor,
     worker_processes,
 )
-from vtbdrake.testbed import SignalError, step_watch
-from vtbdrake.testbed.step_watch import NoProgressError
+from vtbdrake.testbed import SignalError
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 SHOULDER = "sim.sys.Acrobot.shoulder.position"
@@ -50,10 +51,13 @@ def result(process, scheme, **fields):
     return only
 
 
-WORLDS = [
-    (scheme, False) for scheme in ("runge_kutta3", "runge_kutta5", "bogacki_shampine3", "implicit_euler", "radau3")
-]
-WORLDS += [(scheme, True) for scheme in ("runge_kutta3", "implicit_euler", "radau3", "cenic")]
+# An explicit integrator with error control, an implicit one, and CENIC, which integrates a plant; the others are slow.
+OFTEN = [("runge_kutta3", False), ("implicit_euler", False), ("cenic", True)]
+SELDOM = [("runge_kutta5", False), ("bogacki_shampine3", False), ("radau3", False)]
+SELDOM += [("runge_kutta3", True), ("implicit_euler", True), ("radau3", True)]
+WORLDS = [*OFTEN, *(pytest.param(*world, marks=pytest.mark.slow) for world in SELDOM)]
+SLOW_SCHEMES = ("implicit_euler", "runge_kutta5", "bogacki_shampine3", "radau3")
+SCHEMES = ["runge_kutta3", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_SCHEMES)]
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["python", "compiled"])
@@ -100,7 +104,7 @@ ROOTS = ["of time", "of state", "of input", "of wind"]
 NO_STEP = r"the time derivative of sim.env.tank.continuous_state\S* is not finite at t = (0.[\d]+) s"
 
 
-@pytest.mark.parametrize("scheme", ["runge_kutta3", "runge_kutta5", "bogacki_shampine3", "implicit_euler", "radau3"])
+@pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("root", ROOTS)
 def test_world_that_becomes_nan_in_a_step_fails_with_the_address(process, scheme, root):
     failed = result(process, scheme, root=root)
@@ -121,12 +125,12 @@ def quick_look(monkeypatch):
 
 def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_step(quick_look, monkeypatch):
     begun, held_up, looks, looked = threading.Event(), threading.Event(), [], threading.Condition()
-    state_before_attempts, derivatives_of = step_watch.StepWatch._state_before_attempts, Tank.DoCalcTimeDerivatives
+    state_before_attempts, derivatives_of = step_watch.state_before_attempts, Tank.DoCalcTimeDerivatives
 
-    def look_from_the_midst(self, integrator, context):
+    def look_from_the_midst(integrator, context, **limits):
         begun.set()
         held_up.wait()
-        return state_before_attempts(self, integrator, context)
+        return state_before_attempts(integrator, context, **limits)
 
     def look_again(seconds):
         with looked:
@@ -144,7 +148,7 @@ def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_ste
         derivatives_of(self, context, derivatives)
 
     monkeypatch.setattr(step_watch, "time", SimpleNamespace(sleep=look_again))
-    monkeypatch.setattr(step_watch.StepWatch, "_state_before_attempts", look_from_the_midst)
+    monkeypatch.setattr(step_watch, "state_before_attempts", look_from_the_midst)
     monkeypatch.setattr(Tank, "DoCalcTimeDerivatives", hold_up)
     config = SimulatorConfig(integration_scheme="radau3", max_step_size=0.05, accuracy=1e-3)
     task = RolloutTask(NonfiniteScenario(config, root="of input"), 1.0, Quality(abs, "time"))
@@ -153,6 +157,7 @@ def test_state_is_named_although_the_integrator_is_held_up_in_the_midst_of_a_ste
     assert float(t) == 0.25
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("executor", [SerialExecutor, lambda: ThreadExecutor(2)], ids=["serial", "threads"])
 @pytest.mark.parametrize("root", ROOTS)
 def test_world_that_becomes_nan_ends_in_this_process_too(process, quick_look, executor, root):
@@ -172,6 +177,15 @@ def test_plain_simulation_is_refused_too(process, compiled):
     context = testbed.default_context()
     with pytest.raises(SignalError, match=r"the DPS commands force = \[nan\] at t = 0.3 s, which is not finite"):
         testbed.simulator(context).AdvanceTo(1.0)
+
+
+@pytest.mark.parametrize(("scheme", "time_step"), [("runge_kutta3", 0.01), ("cenic", 0.0)])
+def test_plain_simulation_of_a_plant_names_the_command(process, scheme, time_step):
+    assert result(process, scheme, plant=True, time_step=time_step).end == "failed"  # here it would hang
+    config = SimulatorConfig(integration_scheme=scheme)
+    simulator = NonfiniteScenario(config, plant=True, time_step=time_step).build().simulator()
+    with pytest.raises(SignalError, match=r"the DPS commands force = \[nan\] at t = .* s, which is not finite; "):
+        simulator.AdvanceTo(1.0)
 
 
 def test_ctrl_c_reaches_an_integrator_that_hangs(process, quick_look, monkeypatch):
@@ -264,6 +278,7 @@ def test_processes_have_a_time_limit_by_default():
         assert made.time_limit == inf
 
 
+@pytest.mark.slow
 def test_thread_that_does_not_stop_is_left_behind(monkeypatch, caplog):
     begun, release = threading.Event(), threading.Event()
 

@@ -59,7 +59,11 @@ def _assert_right(executor, task, points):
     assert not any(result.failed for result in results)
 
 
-@pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+@pytest.mark.slow_cases
+@pytest.mark.parametrize(
+    "make",
+    [SerialExecutor, lambda: ThreadExecutor(2), pytest.param(lambda: ProcessExecutor(2), marks=pytest.mark.slow)],
+)
 def test_second_task_gets_its_own_results(make):
     with make() as executor:
         _assert_right(executor, ANGLE, POINTS)
@@ -67,7 +71,9 @@ def test_second_task_gets_its_own_results(make):
         _assert_right(executor, ANGLE, POINTS)
 
 
-@pytest.mark.parametrize("make", [lambda: ThreadExecutor(2), lambda: ProcessExecutor(2)])
+@pytest.mark.parametrize(
+    "make", [lambda: ThreadExecutor(2), pytest.param(lambda: ProcessExecutor(2), marks=pytest.mark.slow)]
+)
 def test_executor_works_after_a_quality_error(make, tmp_path):
     samples = tmp_path / "samples"
 
@@ -87,11 +93,12 @@ def test_executor_works_after_a_quality_error(make, tmp_path):
         _assert_right(executor, ANGLE, POINTS[:2])
         with pytest.raises(QualityError, match="_large_angles at t = 0 s, .* raises RuntimeError: too large"):
             list(executor.run(troubled, [{SHOULDER: 3.1}, {SHOULDER: 0.1}]))
-        assert not any(worker.jobs for worker in getattr(executor, "_workers", []))
+        assert not any(getattr(executor, "rollouts_of_workers", ()))
         assert not samples.exists() or samples.stat().st_size < 600
         _assert_right(executor, OTHER, POINTS)
 
 
+@pytest.mark.slow
 def test_worker_that_died_while_idle_costs_nothing(caplog):
     others = set(child_pids())
     with ProcessExecutor(2) as executor:
@@ -106,6 +113,7 @@ def test_worker_that_died_while_idle_costs_nothing(caplog):
     assert caplog.text == ""
 
 
+@pytest.mark.slow
 def test_worker_killed_while_starting_costs_nothing():
     others = set(child_pids())
     with ProcessExecutor(2) as executor:
@@ -126,10 +134,10 @@ def test_all_workers_killed_while_starting_is_an_error(monkeypatch, tmp_path):
 
 def test_closed_executor_leaves_no_processes():
     others = set(child_pids())
-    executor = ProcessExecutor(2)
+    executor = ProcessExecutor(1)
     _assert_right(executor, ANGLE, POINTS[:2])
     workers = set(child_pids()) - others
-    assert len(workers) == 2
+    assert len(workers) == 1
     executor.close()
     assert not workers & set(child_pids())
 
@@ -157,6 +165,7 @@ def test_error_in_a_thread_stops_the_others():
     assert len(calls) <= 3
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", [SerialExecutor, lambda: ThreadExecutor(2), lambda: ProcessExecutor(1)])
 def test_testbed_is_built_once(make, tmp_path):
     file = tmp_path / "built"
@@ -168,6 +177,7 @@ def test_testbed_is_built_once(make, tmp_path):
         assert len(file.read_text().split()) == 1 + 4
 
 
+@pytest.mark.slow
 def test_worker_that_has_grown_is_replaced(tmp_path):
     file = tmp_path / "built"
     task = RolloutTask(GreedyScenario(file=str(file)), 0.1, Quality(_angle, THETA))
@@ -190,6 +200,7 @@ def test_impossible_growth_is_refused(growth):
         ProcessExecutor(1, growth=growth)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("finished", [1, 2])
 def test_closing_during_a_call_is_an_error(finished):
     with ProcessExecutor(1) as executor:
@@ -200,13 +211,14 @@ def test_closing_during_a_call_is_an_error(finished):
         list(rollouts)
 
 
+@pytest.mark.slow
 def test_closing_from_another_thread_loses_no_worker(tmp_path, caplog):
     others, fuse = set(child_pids()), tmp_path / "fuse"
     fuse.touch()
     task = RolloutTask(TreacherousScenario(fuse=str(fuse)), 0.3, Quality(_angle, SHOULDER))
     points = [{SHOULDER: 0.1, "dps.gain[0]": gain} for gain in (HANG, 0.0, 0.0)]
     executor = ProcessExecutor(3)
-    executor.start_workers(3)  # Here, as those of another thread are not among `child_pids`.
+    executor.start_workers(3)  # Here, as another thread's are not among `child_pids`.
     with ThreadPoolExecutor(1) as pool:
         call = pool.submit(lambda: list(executor.run(task, points)))
         while fuse.exists():  # Until the first one hangs.
@@ -217,6 +229,7 @@ def test_closing_from_another_thread_loses_no_worker(tmp_path, caplog):
     assert caplog.text == "" and set(child_pids()) == others
 
 
+@pytest.mark.slow
 def test_second_call_during_a_call_is_refused():
     with ProcessExecutor(1) as executor:
         first = executor.run(ANGLE, POINTS)

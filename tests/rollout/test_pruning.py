@@ -1,4 +1,4 @@
-"""What a rollout can still reach, by each reading, and when it ends."""
+"""A rollout ends when it can no longer reach enough, by each reading."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,7 +15,7 @@ READINGS = ["best", "worst", "end", "integral"]
 
 
 def ending(quality, samples, *, to_beat, pruning=None, measures=()):
-    """How many samples are taken, how it ends, and what was reachable."""
+    """Return the number of samples, the end, and the reachable values."""
     prospect = Prospect(pruning or Pruning(), quality, measures, HORIZON, to_beat)
     for count, (t, sample) in enumerate(zip(TIMES, samples, strict=True), 1):
         end = prospect.update(t, [sample] * (1 + len(measures)), [])

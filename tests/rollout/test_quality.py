@@ -80,7 +80,7 @@ def test_the_definitions_word_by_word(values, threshold):
     g2 = {t for t in times if all(values[t] >= values[s] for s in times)}
     assert best_sample(np.array(values), threshold=threshold) == (min(g1) if g1 else min(g2))
     assert set(np.flatnonzero(exceeds(np.array(values), threshold))) == g1
-    # Of a cost, all is mirrored.
+    # For a cost, all is mirrored.
     g1 = {t for t in times if values[t] < threshold}
     g2 = {t for t in times if all(values[t] <= values[s] for s in times)}
     cost = best_sample(np.array(values), threshold=threshold, minimize=True)
@@ -112,7 +112,6 @@ def test_costs_of_any_size_are_compared_themselves(scale):
         (lambda t: 1 / 0, "raises ZeroDivisionError: division by zero"),
         (lambda t: "good", "raises ValueError"),
         (lambda t: sys.exit("failure in Drake"), "raises SystemExit: failure in Drake"),
-        (lambda t, pitch: 1.0, "raises TypeError"),
     ],
 )
 def test_invalid_quality_error_names_time_and_place(f, message):

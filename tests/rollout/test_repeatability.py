@@ -48,6 +48,7 @@ class ForgetfulScenario(AcrobotScenario):
         return Forgetful(self.again)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("scenario", [AcrobotScenario(), PendulumScenario()])
 def test_nothing_is_found_where_nothing_is_wrong(scenario):
     found = _problem(scenario, of=SHOULDER if isinstance(scenario, AcrobotScenario) else THETA).check_repeatability()
@@ -56,6 +57,7 @@ def test_nothing_is_found_where_nothing_is_wrong(scenario):
     assert str(found).startswith("nothing found: rollouts repeat over ")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("again", "what"),
     [(False, "a second rollout of the same point"), (True, "a rollout that runs beside another one")],

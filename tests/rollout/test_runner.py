@@ -45,6 +45,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", TASKS)
 def test_a_used_runner_repeats_a_new_one_bit_for_bit(name):
     task, address = TASKS[name]
@@ -85,6 +86,7 @@ def test_it_is_the_simulation_that_drake_would_do():
     np.testing.assert_array_equal(RolloutRunner(task).run({address: 0.3}).quality, expected)
 
 
+@pytest.mark.slow
 def test_an_undamped_pendulum_has_the_period_of_theory():
     accurate = SimulatorConfig(accuracy=1e-9, max_step_size=0.05)
     task = RolloutTask(PendulumScenario(simulator_config=accurate), 4.0, sample_period=0.005, record=(THETA,))
@@ -92,7 +94,7 @@ def test_an_undamped_pendulum_has_the_period_of_theory():
     testbed = runner.testbed
     amplitude = 2.0
     result = runner.run({THETA: amplitude, DAMPING: 0.0})
-    # Of the linearized pendulum about its rest, from the plant: I qddot = -k q.
+    # The frequency of the linearized pendulum about its rest, from the plant: I qddot = -k q.
     context = testbed.default_context()
     plant_context = testbed.plant.GetMyContextFromRoot(context)
     inertia = testbed.plant.CalcMassMatrix(plant_context)[0, 0]
@@ -425,6 +427,7 @@ def _amplitude(scenario):
     return RolloutTask(scenario, 1.0, Quality(abs, THETA))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", [SerialExecutor, ThreadExecutor])
 def test_an_executor_with_a_testbed_runs_the_scenario_of_its_task(make):
     soft, stiff = PendulumScenario(stiffness=0.0), PendulumScenario(stiffness=50.0)

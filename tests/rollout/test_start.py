@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import pickle
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +29,9 @@ from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 ELBOW = "sim.sys.Acrobot.elbow.position"
 DISCRETE = AcrobotScenario(time_step=0.01)
 EXECUTORS = {
-    "serial": SerialExecutor,
-    "threads": lambda: ThreadExecutor(2),
-    "processes": lambda: ProcessExecutor(2),
+    "serial": lambda get: SerialExecutor(),
+    "threads": lambda get: ThreadExecutor(2),
+    "processes": lambda get: nullcontext(get("processes")),
 }
 
 
@@ -55,7 +56,7 @@ def _future(task, testbed, simulator, address):
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_rollouts_from_two_starts_equal_the_true_future(executor):
+def test_rollouts_from_two_starts_equal_the_true_future(executor, request):
     testbed, simulator = _running(DISCRETE, 0.5)
     task = RolloutTask(DISCRETE, 0.5, record=[ELBOW])
     starts, futures = [], []
@@ -63,7 +64,7 @@ def test_rollouts_from_two_starts_equal_the_true_future(executor):
         starts.append(Start.of(testbed, simulator.get_context()))
         futures.append(_future(task, testbed, simulator, ELBOW))
     assert starts[1].time == 1.0
-    with EXECUTORS[executor]() as workers:
+    with EXECUTORS[executor](request.getfixturevalue) as workers:
         found = dict(workers.run(task, [{}] * 4, start=[starts[0], starts[1], starts[0], starts[1]]))
         again = dict(workers.run(task, [{}], start=starts[0]))
         default = dict(workers.run(task, [{}]))
@@ -83,6 +84,7 @@ def test_starts_reach_pools_and_the_processes_that_replace_a_broken_one():
     assert all(result.identical(expected) for result in results.values())
 
 
+@pytest.mark.slow
 def test_a_worker_in_the_place_of_a_lost_one_begins_there(tmp_path):
     fuse = tmp_path / "fuse"
     fuse.touch()
@@ -152,10 +154,13 @@ def test_samples_of_a_start_lie_at_the_testbeds_events():
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_a_start_of_another_testbed_is_refused_by_name(executor):
+def test_a_start_of_another_testbed_is_refused_by_name(executor, request):
     testbed = AcrobotScenario().build()
     start = Start.of(testbed, testbed.default_context())
-    with EXECUTORS[executor]() as workers, pytest.raises(StartError, match=r"it lacks .*plant/discrete/0"):
+    with (
+        EXECUTORS[executor](request.getfixturevalue) as workers,
+        pytest.raises(StartError, match=r"it lacks .*plant/discrete/0"),
+    ):
         list(workers.run(RolloutTask(DISCRETE, 0.1), [{}, {}], start=start))
 
 

@@ -11,11 +11,11 @@ from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study
 from vtbdrake.rollout import RolloutResult
 
-SLOTS, ROLLOUTS = 100, 500
+SLOTS, ROLLOUTS = 40, 160
 
 
 def waiting_study(path: str | None = None) -> Study:
-    """Return a study of so many points side by side as the cluster has slots."""
+    """Return a study with as many points side by side as the cluster has slots."""
     return pendulum_problem().study(path, solver="cmaes", seed=3, parallel=SLOTS)
 
 

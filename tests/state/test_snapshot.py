@@ -128,6 +128,7 @@ def test_another_version_is_refused(tmp_path, monkeypatch):
         Snapshot.load(tmp_path / "s.vtb")
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_killed_leaves_the_old_file_whole(tmp_path):
     path = tmp_path / "s.vtb"
     program = textwrap.dedent(f"""

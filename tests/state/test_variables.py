@@ -172,7 +172,7 @@ def test_an_entry_of_an_array_is_a_variable(world):
         ("plant.box.mass", np.array(2.0 + 1.0j), "takes numbers"),
         ("plant.box.friction", -0.1, r"must lie in \[0, inf\], but"),
         ("plant.box.pitch", 0.1, "is derived"),
-        ("plant.box.inertia", [1.0, 1.0, 3.0, 0.0, 0.0, 0.0], "is not that of any rigid body"),
+        ("plant.box.inertia", [1.0, 1.0, 3.0, 0.0, 0.0, 0.0], "belongs to no rigid body"),
         ("plant.box.locked", 0.5, "is 0 .free. or 1 .locked."),
     ],
 )

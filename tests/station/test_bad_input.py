@@ -39,6 +39,7 @@ CASE = "<box><size>0.146 0.073 0.05</size></box>"
 MESH = "<mesh><uri>case.obj</uri></mesh>"
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
@@ -111,6 +112,49 @@ def test_error_names_place_and_remedy(tmp_path: Path, file: str, old: str, new: 
     assert str(path) in str(error.value)
 
 
+@pytest.mark.slow_cases
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("iiwa_joint_4: [-1.2]", "iiwa_joint_4: [-2.5]", 13),
+        ("  model_drivers:", "  initial_position: {iiwa: {iiwa_joint_4: [-2.5]}}\n  model_drivers:", 45),
+    ],
+)
+def test_default_position_outside_its_limits_is_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, old: str, new: str, line: int
+) -> None:
+    path = written(tmp_path, "station.yaml", old, new)
+    for _ in range(2):
+        ArmStation(f"{path}#Torque").build()
+    warning = (
+        f"{path}, line {line}: the default position of iiwa_joint_4 of iiwa is -2.5 rad, outside its limits, "
+        "-2.094395 to 2.094395 rad"
+    )
+    assert [record.getMessage()[: len(warning)] for record in caplog.records if "outside" in record.message] == [
+        warning
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "control_mode: torque_only",
+            "control_mode: torque_only\n      lcm_status_period: 0",
+            "line 49: the lcm_status_p",
+        ),
+        ("control_mode: torque_only", "control_mode: torque_only\n      lcm_status_period: -1", "not -1"),
+        ("width: 64", "width: 64\n      fps: 0", "line 40: the fps of overview is a positive number .* not 0"),
+    ],
+)
+def test_impossible_period_is_told_with_its_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = written(tmp_path, "station.yaml", old, new)
+    with pytest.raises(ScenarioError, match=message) as error:
+        ArmStation(f"{path}#Torque").interface()
+    assert str(error.value).startswith(f"{path}, line ")
+
+
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("limit", ["position", "velocity", "effort"])
 def test_missing_limits_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, limit: str) -> None:
     path = written(tmp_path, ARM, LIMIT, "")
@@ -166,7 +210,7 @@ def test_station_without_a_dps_is_told() -> None:
         vtb.Station(f"{FILE}#Torque").build()
     with pytest.raises(ScenarioError, match="returns a new System for a station, not 3"):
         vtb.Station(f"{FILE}#Torque", dps=lambda station: 3).build()
-    with pytest.raises(ScenarioError, match="runs its code: import no_module first"):
+    with pytest.raises(ScenarioError, match="runs its code: if .*, import no_module first, or add --trust no_m"):
         vtb.Station(f"{FILE}#Torque", dps="no_module:make").build()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import vtbdrake as vtb
 from tests.station.partner import PERIOD, HardwareSim
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.testbed import DpsAlone, VirtualTestbed
 from vtbdrake_diagrams.station import FILE, HOME, ArmStation
 
 
@@ -33,6 +35,12 @@ class Session:
         return np.abs(np.diff(self.machine.actuation, axis=0)).max(axis=0)
 
 
+@cache
+def target(key: str, *, alone: bool) -> DpsAlone | VirtualTestbed:
+    scenario = ArmStation(f"{FILE}#{key}")
+    return DpsAlone(scenario) if alone else scenario.build()
+
+
 @contextmanager
 def session(
     key: str, *, alone: bool = False, offset: float = 0.0, record: Path | None = None, cameras: bool = False
@@ -40,10 +48,9 @@ def session(
     scenario = ArmStation(f"{FILE}#{key}")
     signal = "iiwa_torque" if key == "Torque" else "iiwa_position"
     deployment = vtb.Deployment.of(scenario).in_lock_step("iiwa_position_measured")
-    target = vtb.DpsAlone(scenario) if alone else scenario.build()
     with (
         vtb.Hub(port=0, protect=["IIWA_COMMAND", "SCHUNK_WSG_COMMAND"]) as hub,
-        scenario.deploy(hub.url, target=target, record=record, deployment=deployment) as runtime,
+        scenario.deploy(hub.url, target=target(key, alone=alone), record=record, deployment=deployment) as runtime,
         HardwareSim(hub.url, key, offset=offset, cameras=cameras) as machine,
     ):
         yield Session(runtime, machine, signal)
@@ -61,6 +68,16 @@ def allowed_jumps(key: str) -> np.ndarray:
     return np.abs(arm.CalcMassMatrix(context)) @ np.asarray(signal.acceleration)
 
 
+def test_station_is_taken_over_without_a_jump() -> None:
+    with session("Torque", offset=0.004) as s:
+        for position in ("sim", "shadow", "real"):
+            s.runtime.switch(position)
+            s.run(12)
+            assert s.runtime.guards.latched == ()
+        assert (s.jumps() < allowed_jumps("Torque")).all()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "offset"), [("Torque", 0.004), ("Position", 0.0005), ("PositionAndTorque", 0.0005)])
 def test_station_is_taken_over_and_handed_back_without_a_jump(key: str, offset: float, tmp_path: Path) -> None:
     with session(key, offset=offset, record=tmp_path / "log") as s:
@@ -77,6 +94,7 @@ def test_station_is_taken_over_and_handed_back_without_a_jump(key: str, offset: 
     assert vtb.replay(vtb.read_log(tmp_path / "log")).identical
 
 
+@pytest.mark.slow
 def test_arm_that_is_elsewhere_is_not_taken_over() -> None:
     with session("Torque", offset=0.05) as s:
         s.run(2)
@@ -86,6 +104,7 @@ def test_arm_that_is_elsewhere_is_not_taken_over() -> None:
             s.runtime.switch("real")
 
 
+@pytest.mark.slow
 def test_dps_alone_commands_arm_and_gripper(tmp_path: Path) -> None:
     with session("Position", alone=True, record=tmp_path / "log") as s:
         s.run(2)
@@ -108,7 +127,7 @@ class Watcher(AddressedSystem):
             self.DeclareAbstractInputPort(name, station.signals()[name].abstract_value())
         torque = self.declare_discrete_state(torque=Quantity(np.zeros(7), "N m"))
         self.DeclareStateOutputPort("iiwa_torque", torque.index)
-        opening = self.declare_discrete_state(opening=Quantity([0.02], "m"))  # that of a gripper without commands
+        opening = self.declare_discrete_state(opening=Quantity([0.02], "m"))  # kept without commands
         self.DeclareStateOutputPort("wsg_position", opening.index)
 
 
@@ -121,6 +140,7 @@ def test_loop_is_paced_by_what_every_dps_gets() -> None:
     assert set(deployment.guards["max_delay"]) == {deployment.pace, "wsg_position_measured"} < sensed
 
 
+@pytest.mark.slow
 def test_images_come_from_drakes_camera_as_from_the_simulated_one() -> None:
     scenario = vtb.Station(f"{FILE}#Torque", dps=Watcher)
     deployment = vtb.Deployment.of(scenario).in_lock_step("iiwa_position_measured")

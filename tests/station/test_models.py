@@ -16,7 +16,7 @@ from vtbdrake_diagrams.station import FILE, ArmStation, JointControl
 
 
 def gravity(file: Path) -> np.ndarray:
-    """Return the torques (10, 7) with which Drake's driver carries the arm, compared with those of its model."""
+    """Return the torques (10, 7) with which Drake's driver carries the arm, compared with the torques of its model."""
     urls = {"iiwa": "memq://null", "wsg": "memq://wsg"}
     sim = hardware_sim_loop.build(file, "Torque", urls=urls, sources={"torque": ConstantVectorSource(np.zeros(7))})
     context = sim.simulator.get_mutable_context()
@@ -54,7 +54,7 @@ def test_measured_values_are_plausible_as_fast_and_strong_as_a_gripper_is() -> N
     sense = {signal.name: signal for signal in ArmStation().signals().values()}
     velocity, force = sense["wsg_velocity_measured"], sense["wsg_force_measured"]
     assert (velocity.lower, velocity.upper) == (-10.0, 10.0)
-    # A force has no sign; ten times that of both fingers is impossible.
+    # A force has no sign; ten times the force of both fingers is impossible.
     assert (force.lower, force.upper) == (0.0, 10.0 * 160.0)
     assert {velocity.max_age, force.max_age, sense["wsg_position_measured"].max_age} == {10 * 0.05}  # ten messages
 

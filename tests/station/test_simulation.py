@@ -58,6 +58,7 @@ def commander(key: str, opening: float, force: float) -> Callable[[vtb.Station],
     return make_dps
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("key", "opening", "gains"),
     [
@@ -88,6 +89,7 @@ def test_motion_is_that_of_hardware_sim_bit_for_bit(key: str, opening: float, ga
     assert np.ptp(expected[:, : reference.plant.num_positions()], axis=0).max() > 0.01
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("key", ["Torque", "Position"])
 def test_fork_is_the_future(key: str) -> None:
     scenario = ArmStation(f"{FILE}#{key}")
@@ -108,6 +110,7 @@ def test_fork_is_the_future(key: str) -> None:
     assert np.ptp(future[FINGER]) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["Torque", "Position"])
 def test_snapshot_continues_in_another_build(key: str, tmp_path: Path) -> None:
     def motion(testbed: VirtualTestbed, context: Context) -> np.ndarray:
@@ -133,6 +136,7 @@ def test_snapshot_continues_in_another_build(key: str, tmp_path: Path) -> None:
     assert np.ptp(there, axis=0).min() > 0.001
 
 
+@pytest.mark.slow
 def test_contexts_run_side_by_side() -> None:
     testbed = ArmStation().build()
 
@@ -153,6 +157,7 @@ def test_contexts_run_side_by_side() -> None:
     assert one_by_one[1] == one_by_one[3] != one_by_one[2]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("signal", ["iiwa_torque", "wsg_position", "wsg_force_limit"])
 def test_command_that_is_not_finite_ends_the_simulation(signal: str, value: float) -> None:

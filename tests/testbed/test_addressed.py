@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from vtbdrake.testbed.addressed import making
+from vtbdrake.drake_workarounds.making import making
 
 
 @pytest.mark.one_python

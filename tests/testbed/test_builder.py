@@ -8,9 +8,14 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, PassThrough
-from pydrake.systems.sensors import ImageRgba8U
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from tests.testbeds import PoseRelay
+from vtbdrake.common.scan import Scan
+from vtbdrake.components.environment import Light
+from vtbdrake.components.ray_casting import RayCaster
+from vtbdrake.components.sensors.camera import Camera
+from vtbdrake.components.sensors.laser_scanner import LaserScanner
 from vtbdrake.reasoning import Belief, BeliefToStart
 from vtbdrake.state import AddressedSystem, Quantity, VariableError
 from vtbdrake.testbed import Interface, Signal, VirtualTestbedBuilder
@@ -309,6 +314,52 @@ def test_a_sensor_is_added_and_connected_to_the_plant():
     plant = testbed.plant
     joints = plant.GetPositions(plant.GetMyContextFromRoot(context))[7:]
     np.testing.assert_allclose(testbed.read(context, "sim.sense.encoders.joint_encoders"), joints, atol=0.05)
+
+
+@pytest.fixture
+def world():
+    """A builder with a plant, a camera with a depth image, a light, and a laser scanner."""
+    images = [Signal("image", model_value=ImageRgba8U(8, 6)), Signal("depth", model_value=ImageDepth32F(8, 6))]
+    builder = VirtualTestbedBuilder(Interface([*images, Signal("scan", model_value=Scan.empty())], []))
+    plant, scene_graph = builder.add_plant()
+    plant.Finalize()
+    camera = Camera(plant, plant.world_frame(), period=0.1, info=CameraInfo(8, 6, 0.8), depth=True)
+    scanner = LaserScanner(plant, plant.world_frame(), RayCaster(plant, scene_graph))
+    return builder, camera, builder.add("env", "sun", Light()), scanner
+
+
+def test_cameras_and_scanners_are_sensors(world):
+    builder, camera, sun, scanner = world
+    builder.add_sensor("image", camera, name="eye", output="color_image", inputs={"light": sun.GetOutputPort("light")})
+    builder.sim_sensor("depth", camera.GetOutputPort("depth_image"))
+    builder.add_sensor("scan", scanner)
+    connected = {
+        (
+            source.get_name(),
+            source.get_output_port(output).get_name(),
+            target.get_name(),
+            target.get_input_port(n).get_name(),
+        )
+        for (target, n), (source, output) in builder.build_diagram("world").connection_map().items()
+    }
+    assert connected >= {
+        ("scene_graph", "query", "sim.sense.eye", "geometry_query"),
+        ("sim.env.sun", "light", "sim.sense.eye", "light"),
+        ("plant", "body_poses", "sim.sense.scan", "body_poses"),
+        ("plant", "body_spatial_velocities", "sim.sense.scan", "body_spatial_velocities"),
+    }
+    assert builder.sensors["image"].get_name() == "color_image"
+
+
+def test_a_sensor_whose_ports_are_not_clear_is_rejected(world):
+    builder, camera, sun, _ = world
+    with pytest.raises(ValueError, match="output= of Camera, for image, is one of color_image, depth_image$"):
+        builder.add_sensor("image", camera)
+    with pytest.raises(ValueError, match="neither plant nor SceneGraph has an output u, which PassThrough needs: give"):
+        builder.add_sensor("depth", PassThrough(2))
+    wrong = {"u": sun.GetOutputPort("light"), "lamp": sun.GetOutputPort("light")}
+    with pytest.raises(ValueError, match="PassThrough has no input 'lamp'; it has: u"):
+        builder.add_sensor("depth", PassThrough(sun.GetOutputPort("light").size()), name="other", inputs=wrong)
 
 
 def test_a_sensor_without_a_plant_is_rejected():

@@ -18,8 +18,8 @@ import vtbdrake.testbed
 import vtbdrake_diagrams
 from tests.lcm.iiwa import IiwaScenario
 from tests.testbeds import PendulumScenario
+from vtbdrake.drake_workarounds import step_watch
 from vtbdrake.state import AddressedSystem
-from vtbdrake.testbed import step_watch
 
 for package in (vtbdrake.components, vtbdrake.testbed, vtbdrake_diagrams):
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
@@ -52,6 +52,7 @@ def _plants():
     return {id(thing): thing for thing in gc.get_objects() if isinstance(thing, MultibodyPlant)}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("make", [PendulumScenario, IiwaScenario])
 def test_a_dropped_testbed_is_freed(make):
     before = _plants()

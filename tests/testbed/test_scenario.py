@@ -38,6 +38,7 @@ def test_a_file_names_its_class_and_what_differs(tmp_path):
     assert load_scenario(NAME) == AcrobotScenario()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -284,6 +285,7 @@ def test_a_scenario_with_drake_configs_pickles():
     assert copied.plant_config.contact_model == "point"
 
 
+@pytest.mark.slow
 def test_a_scenario_is_sent_to_a_process_pool_before_anything_else_was():
     program = (
         "from concurrent.futures import ProcessPoolExecutor as Pool; from multiprocessing import get_context\n"

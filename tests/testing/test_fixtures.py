@@ -95,6 +95,7 @@ def test_missing_scenario_is_told(user: pytest.Pytester) -> None:
     result.stdout.fnmatch_lines(["*test the scenario that a fixture `scenario` of yours returns: define it*"])
 
 
+@pytest.mark.slow
 def test_shadow_sees_what_the_machine_measures() -> None:
     """The DPS that listens commands what the one that drives commands, bit for bit; its own world is elsewhere."""
     commands = []
@@ -120,6 +121,13 @@ def test_phase_of_a_scenario_without_protocol() -> None:
             loop.run(0.1)
     with pytest.raises(ValueError, match="a phase is one of sim, shadow, machine, not 'real'"):
         Phase(scenario, "real")
+
+
+def test_phase_that_has_not_begun_has_no_loop() -> None:
+    phase = Phase(ServoScenario(), "sim")
+    for use in (lambda: phase.runtime, lambda: phase.read("dps.ticks"), lambda: phase.run(0.1)):
+        with pytest.raises(RuntimeError, match="the phase sim has not begun: use it in a block"):
+            use()
 
 
 def test_fallback_in_a_phase_is_a_failure() -> None:

@@ -17,6 +17,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from tests.control.scripted import PERIOD, Servo, ServoScenario
 from tests.control.servo_machine import ServoMachineScenario
 from vtbdrake.control.clock import SimulatedClock
+from vtbdrake.control.guards import GuardDecision, Guards
 from vtbdrake.control.limits import Bounds, PassThrough
 from vtbdrake.lcm.protocol import ProtocolError
 from vtbdrake.machine import Delay, Machine
@@ -65,15 +66,19 @@ def run(scenario: Scenario, *, examples: int = 25, **options: Any) -> None:
 # -- loops that keep the rules
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_servo_keeps_the_rules(alone: bool) -> None:
-    run(MovedServo(), alone=alone)
+@pytest.mark.parametrize(
+    ("alone", "examples"), [(False, 8), *(pytest.param(alone, 25, marks=pytest.mark.slow) for alone in (False, True))]
+)
+def test_servo_keeps_the_rules(alone: bool, examples: int) -> None:
+    run(MovedServo(), alone=alone, examples=examples)
 
 
-def test_cart_pole_keeps_the_rules() -> None:
-    run(CartPoleScenario(), examples=10)
+@pytest.mark.parametrize("examples", [2, pytest.param(10, marks=pytest.mark.slow)])
+def test_cart_pole_keeps_the_rules(examples: int) -> None:
+    run(CartPoleScenario(), examples=examples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", [False, True])
 def test_arm_keeps_the_rules(alone: bool) -> None:
     run(ManipulatorScenario(), examples=4, alone=alone, values=FOLLOW)
@@ -99,39 +104,47 @@ def test_commands_from_inside_are_not_written() -> None:
 MANY = 300
 
 
+@pytest.mark.slow
 def test_loop_without_staleness_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vtbdrake.control.guards.faults_at", lambda now, monitors, received: [])
     with pytest.raises(AssertionError, match=r"the DPS commands, although \w+ is .* s old, and 0.0105 s are allowed"):
         run(MovedServo(), examples=MANY)
 
 
+@pytest.mark.slow
 def test_loop_that_forgets_its_faults_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vtbdrake.control.guards.Guards._latch", lambda self, faults, **_: None)
+    judge = Guards.judge
+
+    def judge_anew(self: Guards, now: float, received: Any, *arguments: Any, **options: Any) -> GuardDecision:
+        self.reset(now, received)
+        return judge(self, now, received, *arguments, **options)
+
+    monkeypatch.setattr(Guards, "judge", judge_anew)
     with pytest.raises(AssertionError, match="although|without a reset"):
         run(MovedServo(), examples=MANY)
 
 
+@pytest.mark.slow
 def test_loop_without_limits_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     class Unlimited(PassThrough):
         def __init__(self, signal: Signal, *, period: float) -> None:
             super().__init__()
 
-    monkeypatch.setattr("vtbdrake.control.guards.RateLimiter", Unlimited)
+    monkeypatch.setattr("vtbdrake.control.guarded_signal.RateLimiter", Unlimited)
     with pytest.raises(AssertionError, match="is not within its limits|beyond its rate|does not depart from"):
         run(MovedServo(), examples=MANY)
 
 
+@pytest.mark.slow
 def test_rate_that_counts_cycles_instead_of_time_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vtbdrake.control.runtime.Runtime._time_of_commands", lambda self, due, now: nan)
+    monkeypatch.setattr("vtbdrake.control.cycle_pace.ClockPace.time_of_commands", lambda self, due, now: nan)
     with pytest.raises(AssertionError, match="beyond its rate|does not depart from"):
         run(MovedServo(), examples=MANY, alone=True)
 
 
+@pytest.mark.slow
 def test_command_that_outlasts_its_leave_time_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(self: Any, released: bool) -> None:
-        return
-
-    monkeypatch.setattr("vtbdrake.control.guards.Guards._end_leaving", never)
+    monkeypatch.setattr("vtbdrake.control.guarded_signal.GuardedSignal.goes_on_leaving", lambda self, released: True)
     with pytest.raises(AssertionError, match="a command velocity is sent, which has not been on real for"):
         run(MovedServo(), examples=MANY)
 
@@ -213,6 +226,7 @@ def test_bad_samples_are_not(case: tuple[Signal, Any]) -> None:
     assert Bounds(signal).violation(value) != ""
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("reason", ["not finite", "limits", "size", "type"])
 def test_every_kind_of_bad_sample_occurs(reason: str) -> None:
     from hypothesis import find

@@ -177,6 +177,7 @@ STRONG = """
 """
 
 
+@pytest.mark.slow
 def test_weak_test_file_notices_nothing_and_is_refused(user: pytest.Pytester) -> None:
     user.makepyfile(test_weak=WEAK)
     result = user.runpytest_subprocess("-q", "--vtb-mutants=0.5", timeout=100)
@@ -204,6 +205,7 @@ def test_strong_test_file_notices_most(user: pytest.Pytester) -> None:
     assert not (user.path / ".vtb_failures").exists()
 
 
+@pytest.mark.slow
 def test_failing_tests_have_no_score(user: pytest.Pytester) -> None:
     user.makepyfile("def test_it(testbed):\n    assert False")
     result = user.runpytest_subprocess("-q", "--vtb-mutants", timeout=60)

@@ -15,7 +15,7 @@ from tests.testbeds import PendulumScenario
 from vtbdrake.rollout import Quality, RolloutTask
 from vtbdrake.rollout.course import Course, DrivenRollout, task_without_problem
 from vtbdrake.state import Snapshot
-from vtbdrake.testbed.scenario_file import scenario_text
+from vtbdrake.testbed.scenario_text import scenario_text
 from vtbdrake.testing.saved_course import SavedCourseError, drive_again, save_course
 from vtbdrake_diagrams.cube_toss import CubeTossScenario
 
@@ -83,6 +83,7 @@ def run(folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_saved_tests_pass_and_notice_a_changed_model(model: Any, tmp_path: Path) -> None:
     testbed = model.Swinging().build()
     save_course(tmp_path / "test_tilt.py", course(model), testbed, task=task(model))

@@ -1,4 +1,4 @@
-"""The table of the page about tests is that of the docstrings."""
+"""The table of the page about tests says what the docstrings say."""
 
 import inspect
 import re
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from vtbdrake.testing.check import check_names
 from vtbdrake.testing.checks import CHECKS
+from vtbdrake.testing.scenario_check import check_names
 
 pytestmark = pytest.mark.one_python
 

@@ -1,10 +1,15 @@
 """Every check fails on its bad diagram, and on no other."""
 
+import re
+
 import pytest
 
 from tests.testing import zoo
 from vtbdrake.testing import ScenarioCheckError, check_scenario
-from vtbdrake.testing.check import check_names
+from vtbdrake.testing.checks import CHECKS
+from vtbdrake.testing.checks.repetition_checks import check_dropped_testbed_is_freed
+from vtbdrake.testing.scenario_check import check_names
+from vtbdrake.testing.subject import CheckFailedError, Subject
 
 HORIZON = 0.3
 
@@ -25,6 +30,7 @@ def test_every_check_has_its_bad_diagram():
     assert list(zoo.BAD) and set(zoo.BAD) == set(check_names())
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", [zoo.GoodScenario, zoo.Differentiable])
 def test_good_diagram_passes_every_check_that_concerns_it(kind):
     results = statuses(kind())
@@ -56,7 +62,7 @@ MESSAGES = {
     "check_snapshot_resumes": "simulated from a snapshot at 0.15 s",
     "check_dropped_testbed_is_freed": "1 DiscreteTimeIntegrator",
     "check_runs_keep_no_memory": "leaves 30 objects of Python behind",
-    "check_sim_and_real_alike": "position measures [0.03984], of which [0.0398] arrives",
+    "check_sim_and_real_alike": "position measures [0.03984], but [0.0398] arrives",
     "check_dps_cannot_tell_the_switch": "[0.1] instead of [0.2]",
     "check_dps_alone_commands_the_same": "[0.8] instead of [0.801]",
     "check_deployment_is_safe": "give continuity={'velocity'",
@@ -69,12 +75,36 @@ MESSAGES = {
 }
 
 
+# One for the quick suite; below, all of them.
+@pytest.mark.parametrize("name", [*zoo.BAD][:1])
+def test_bad_diagram_fails_its_check(name):
+    (check,) = (check for check in CHECKS if check.__name__ == name)
+    error = Subject(zoo.BAD[name](), horizon=HORIZON).outcome(check)
+    assert isinstance(error, CheckFailedError) and MESSAGES[name] in str(error)
+
+
+def test_function_that_keeps_a_testbed_is_named():
+    error = Subject(zoo.CacheByLambda(), horizon=HORIZON).outcome(check_dropped_testbed_is_freed)
+    assert "1 ByLambda" in str(error)
+    assert re.search(r"keeps it: ByLambda.__init__.<lambda> \(zoo.py, line \d+\). Declare ports .* methods", str(error))
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("check_simulates", "the disc is broken"), ("check_builds", "no input port")]
+)
+def test_failure_that_others_presuppose_is_told_once(name, reason):
+    with pytest.raises(ScenarioCheckError) as failure:
+        check_scenario(zoo.BAD[name](), horizon=HORIZON)
+    assert str(failure.value).count(reason) == 1
+    assert sum(name in result.message for result in failure.value.report if result.status == "skipped") > 10
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", zoo.BAD)
 def test_bad_diagram_fails_its_check_alone(name):
     results = statuses(zoo.BAD[name]())
     failures = {result.name: result.message for result in results.values() if result.status == "failed"}
-    assert failures.keys() == {name}, failures
-    assert MESSAGES[name] in failures[name]
+    assert failures.keys() == {name} and MESSAGES[name] in failures[name], failures
     for result in results.values():
         if result.status == "skipped" and result.name not in NOT_CONCERNED and name not in EVERYTHING_NEEDS:
             assert name in result.message, result

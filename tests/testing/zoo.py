@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -391,7 +392,7 @@ class check_reset_equals_a_new_build(GoodScenario):  # noqa: N801
 
 
 class Buffer:
-    """What all copies of a context share, and change."""
+    """A value that all copies of a context share, and change."""
 
     def __init__(self, total=0.0):
         self.total = total
@@ -458,6 +459,18 @@ class check_dropped_testbed_is_freed(GoodScenario):  # noqa: N801
     """All encoders are in a list."""
 
     make_encoder = with_encoder(Listed)
+
+
+class ByLambda(Encoder):
+    def __init__(self):
+        super().__init__()
+        self.again = self.declare_cache("again", lambda context: self.error(context), {self.nothing_ticket()})
+
+
+class CacheByLambda(GoodScenario):
+    """A cache entry of the encoder is declared with a function that refers to the encoder."""
+
+    make_encoder = with_encoder(ByLambda)
 
 
 LOG: list[Any] = []
@@ -590,7 +603,7 @@ class check_late_samples_end_in_the_fallback(GoodScenario):  # noqa: N801
 # -- derivatives
 
 
-@TemplateSystem.define("Square_", T_list=[float, AutoDiffXd])
+@TemplateSystem.define("Square_", T_list=[float, AutoDiffXd], scope=sys.modules[__name__])
 def Square_(T):
     class Impl(LeafSystem_[T]):
         __slots__ = NO_DICT

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -24,14 +25,14 @@ INTRODUCTION = """\
 # Verification
 
 What is verified here is what you simulate with: scenarios are built into testbeds, their integrators are chosen by a
-`SimulatorConfig`, and bodies, contact, sensors, drives and compiled plants are those of the package. The reference of
+`SimulatorConfig`, and bodies, contact, sensors, drives and compiled plants come from the package. The reference of
 each case is a published number, a closed form, or another engine; never the same computation. The cases are in four
 groups, because an integrator that controls its error hides the errors of a model, and one that conserves energy looks
 right while its answer is wrong.
 
 `make verify` runs all of them and prints this table (they are among the tests that CI runs, too):
 {cases} cases with {rows} comparisons. `python -m tests.verification --page docs/verification.md` writes this page. The
-errors are those of the computer that has written it; where they are of rounding, others differ.
+errors were measured on the computer that has written it; errors of rounding differ on others.
 
 Error and tolerance are the largest of all entries of the quantity, in its unit. Where a case is run in several ways,
 by several integrators, say, each has its rows.
@@ -53,7 +54,7 @@ class Case:
     rows: list[tuple[str, str, str, float, float]] = field(default_factory=list)
 
     def worst(self) -> list[tuple[str, str, str, float, float]]:
-        """Return the rows, of those of one variant, quantity and unit only the one nearest to its tolerance."""
+        """Return one row per variant, quantity and unit: the one nearest to its tolerance."""
         worst: dict[tuple[str, str, str], tuple[float, float]] = {}
         for variant, quantity, unit, error, tolerance in self.rows:
             key = variant, quantity, unit
@@ -123,7 +124,13 @@ def case_section(case: Case) -> str:
     """Return the heading and the text of a case."""
     title, _, rest = case.title.partition(": ")
     text = case.text.replace("Reference:", "**Reference:**").replace("Tolerance:", "**Tolerance:**")
-    return f"### {title.rstrip('.')}\n\n" + (f"{_sentence(rest)}\n\n" if rest else "") + f"{text.strip(chr(10))}\n"
+    paragraphs = (_filled(paragraph) for paragraph in text.strip("\n").split("\n\n"))
+    return "\n\n".join([f"### {title.rstrip('.')}", *([_sentence(rest)] if rest else []), *paragraphs]) + "\n"
+
+
+def _filled(paragraph: str) -> str:
+    """Return a paragraph in lines of a page; equations, which are indented, stay as they are."""
+    return paragraph if paragraph.startswith(" ") else textwrap.fill(paragraph, 120, break_on_hyphens=False)
 
 
 def _sentence(text: str) -> str:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 def mjcf(plant: MultibodyPlant, context: Context, *, time_step: float, integrator: str) -> str:
     """Return the model of a tree of welds, hinges, sliders and floating bodies, without contact, stops and actuators.
 
-    The child frame of a joint is that of its body. The joints have their names, damping and reflected inertia.
+    The child frame of a joint is its body's. The joints have their names, damping and reflected inertia.
 
     Args:
         plant: The plant, finalized.

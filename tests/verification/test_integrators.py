@@ -17,8 +17,8 @@ from scipy.special import ellipj
 from tests.components.compiled_plant.plants import floating
 from tests.verification.conftest import Verify
 from tests.verification.worlds import G, Pendulum, Run, Slider, discrete, scheme
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.compiled_plant import BaseReaction, MomentumModel
-from vtbdrake.spline import Spline
 
 # What Drake 1.58 has changed.
 NEW_DRAKE = tuple(int(part) for part in version("drake").split(".")[:2]) >= (1, 58)
@@ -94,7 +94,7 @@ def _error(scenario: Pendulum) -> float:
 def _fixed(name: str, step: float) -> SimulatorConfig:
     if name == "cenic" and not CENIC_IS_FRESH:
         pytest.skip("scenarios refuse CENIC without error control with this Drake")
-    # The accuracy is that of Newton's method within a step of the implicit schemes.
+    # Newton's method limits the accuracy within a step of the implicit schemes.
     return scheme(name, max_step_size=step, accuracy=1e-10, fixed=True)
 
 
@@ -119,14 +119,15 @@ def test_order_of_fixed_steps(verify: Verify, name: str) -> None:
     verify("order", np.log2(errors[0] / errors[1]), p, tolerance=0.04 * p)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", [name for name in SCHEMES if name not in WITHOUT_ESTIMATE])
 def test_error_follows_the_accuracy(verify: Verify, name: str) -> None:
     """Error control: a pendulum of 1 m, released at 1.2 rad, after 1 s, at accuracies a of 1e-5 and 1e-7.
 
         error = C a^e,  e = p / q,  where an estimate of order h^q bounds the error of each step
 
-    The embedded estimates of schemes of order 3 and 5 have q = p: e = 1; those of order 1 compare one step with two,
-    q = 2: e = 1/2. Radau3 keeps the Jacobian of its Newton iteration for several steps; its error falls in jumps.
+    The embedded estimates of schemes of order 3 and 5 have q = p: e = 1; the schemes of order 1 compare one step with
+    two, q = 2: e = 1/2. Radau3 keeps the Jacobian of its Newton iteration for several steps; its error falls in jumps.
     Reference: these exponents; for Radau3 no error. Tolerance: 0.1, as steps change in jumps; for Radau3, 20 a.
     """
     exponent = 0.5 if ORDERS[name] == 1 else 1.0

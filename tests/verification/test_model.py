@@ -39,7 +39,7 @@ MOTION_GENESIS = {
         0.0008649076642538979,
     ),
 }
-"""Of the benchmark's third state, from the code that MotionGenesis 5.9 generated and Drake's benchmark compiles."""
+"""Values for the benchmark's third state, from code that MotionGenesis 5.9 generated and Drake's benchmark compiles."""
 Q = np.radians([60.0, 30.0, 60.0, 30.0, 60.0, 30.0, 60.0])
 V = np.arange(1, 8) / 10.0
 A = np.arange(7, 0, -1) / 10.0
@@ -61,7 +61,7 @@ def test_iiwa_moves_as_motion_genesis_computes(verify: Verify) -> None:
         p(q), R(q);  w = J_w(q) v,  v = J_v(q) v;  a = J vdot + Jdot v
 
     Reference: MotionGenesis 5.9, from Drake's benchmark `kuka_iiwa_robot`, with v = 0.1 ... 0.7 rad/s and
-    vdot = 0.7 ... 0.1 rad/s^2. The accelerations are those of the testbed whose DPS commands the published torques.
+    vdot = 0.7 ... 0.1 rad/s^2. The accelerations come from the testbed whose DPS commands the published torques.
     Tolerance: rounding.
     """
     run = _iiwa()
@@ -235,6 +235,7 @@ def allan_variance(y: np.ndarray, n: int) -> float:
     return float(np.mean((means[n:] - means[:-n]) ** 2) / 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["white noise", "random walk"])
 def test_allan_deviation(verify: Verify, kind: str) -> None:
     """Allan deviation: encoders at rest, averaged over n samples of the period T.

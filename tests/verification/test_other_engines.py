@@ -1,4 +1,4 @@
-"""Other engines: MuJoCo on the same masses, and the compiled plants against those of Drake.
+"""Other engines: MuJoCo on the same masses, and the compiled plants against Drake's.
 
 No engine's answer is a reference of the other groups: what two engines have in common, a wrong model, say, shows there.
 """
@@ -121,7 +121,7 @@ def test_compiled_cart_pole_moves_as_in_mujoco(verify: Verify) -> None:
 
 @pytest.mark.parametrize("make", PLANTS)
 def test_compiled_derivatives_are_those_of_the_plant(verify: Verify, make: Callable[[float], MultibodyPlant]) -> None:
-    """Derivatives of compiled plants: those of cart-pole, acrobot, arm, a floating tree and the space climber.
+    """Derivatives of compiled plants: cart-pole, acrobot, arm, a floating tree and the space climber.
 
         qdot = N(q) v,   v' = (M(q) + diag(N^2 I_rotor))^-1 (B u - D v - C(q, v) v + g(q))
 
@@ -130,6 +130,7 @@ def test_compiled_derivatives_are_those_of_the_plant(verify: Verify, make: Calla
     _verify_derivatives(verify, make(0.0), 5, tolerance=1e-12)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(12))
 def test_compiled_random_plants_move_as_those_of_drake(verify: Verify, seed: int) -> None:
     """Random compiled plants: trees of five random links, joints, frames, motors and rotors; half of them float.
@@ -203,7 +204,7 @@ def test_compiled_floating_tree_conserves_momentum_and_energy(verify: Verify) ->
 
         L = const,  p = const,  v' M v / 2 = const
 
-    Reference: the values at the start; momentum by Drake. Tolerance: that of SUNDIALS' CVODES, 1e-12 per step.
+    Reference: the values at the start; momentum by Drake. Tolerance: as SUNDIALS' CVODES, 1e-12 per step.
     """
     plant = floating(0.0, gravity=False, damping=0.0)
     context = plant.CreateDefaultContext()

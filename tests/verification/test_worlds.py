@@ -121,6 +121,7 @@ def test_dzhanibekov_effect(verify: Verify) -> None:
         verify(f"flip {k + 1}", t - rates[1] / (rates[2] * rates[0]), t, tolerance=1e-6, unit="s")
 
 
+@pytest.mark.slow
 def test_nasas_tumbling_brick(verify: Verify) -> None:
     """NASA's tumbling brick: a body with three moments of inertia, without drag, from (10, 20, 30) deg/s.
 
@@ -150,6 +151,7 @@ def test_conical_pendulum(verify: Verify) -> None:
     verify("position", tip, [-sqrt(0.5), 0.0, -sqrt(0.5)], tolerance=1e-10, unit="m")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
 def test_four_bar_linkage(verify: Verify, approximation: str) -> None:
     """Four-bar linkage: crank 0.4 m, coupler 1 m, rocker 0.8 m on a base of 1 m, closed by a constraint.
@@ -244,6 +246,7 @@ def test_geared_wheel_spins_down(verify: Verify) -> None:
     verify("rate", run["axle.velocity"], expected, tolerance=1e-12, unit="rad/s")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("ratio", "published"), [(0.2, 0.52662), (0.7, 0.04599)], ids=["0.2", "0.7"])
 def test_step_of_an_impedance_law(verify: Verify, ratio: float, published: float) -> None:
     """Step of an impedance law: the overshoot, as a DPS computes the law from sampled sensors.
@@ -319,6 +322,7 @@ def test_ball_rests_on_its_springs(verify: Verify, settings: str) -> None:
     verify("depth", 0.1 - run.pose("ball").translation()[2], depth, tolerance=1e-9, unit="m")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("settings", ["lagged", "cenic", "sap", "similar"])
 @pytest.mark.parametrize("friction", [0.5, 0.08], ids=["mu 0.5", "mu 0.08"])
 def test_ball_rolls_down_a_slope(verify: Verify, settings: str, friction: float) -> None:
@@ -363,6 +367,7 @@ def _rolling(settings: str, friction: float) -> np.ndarray:
     return (np.array(speeds[1]) - speeds[0]) / 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SLIDING)
 def test_bowling_ball_slides_until_it_rolls(verify: Verify, settings: str) -> None:
     """Bowling ball: 6.35 kg, r = 0.10795 m, I = 0.0296 kg m^2, thrown at 8 m/s with a side spin of 8 pi rad/s.
@@ -404,6 +409,7 @@ def test_friction_is_mu_times_the_normal_force(verify: Verify, settings: str) ->
     verify("friction", np.linalg.norm(change[:2]) / (G + change[2]), friction, tolerance=1e-5)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("settings", SLIDING_FACES)
 def test_block_slides_down_a_slope(verify: Verify, settings: str) -> None:
     """Sliding block: on a slope of 30 deg with mu = 0.5, from 1 m/s, on four feet, or hydroelastic on its face.
@@ -443,6 +449,7 @@ def test_block_slides_with_convex_friction(verify: Verify, settings: str) -> Non
     verify("distance", distance, reference, tolerance=0.01, relative=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SLIDING_FACES)
 def test_block_slides_to_rest(verify: Verify, settings: str) -> None:
     """Stopping block: on flat ground with mu = 0.4, from 2 m/s.
@@ -489,6 +496,7 @@ def test_block_sticks_with_sap(verify: Verify) -> None:
     verify("creep", run.velocity("block"), np.zeros(3), tolerance=4e-3 * G * STEP, unit="m/s")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SLIDING)
 @pytest.mark.parametrize("direction_deg", [0.0, 45.0], ids=["0 deg", "45 deg"])
 def test_simbenchmark_rolling(verify: Verify, settings: str, direction_deg: float) -> None:
@@ -526,6 +534,7 @@ BOUNCES = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("dissipation", "published"), [(0.1, 0.93748), (0.5, 0.74843), (1.0, 0.59362)])
 @pytest.mark.parametrize("settings", list(BOUNCES))
 def test_bounce_by_hunt_and_crossley(verify: Verify, settings: str, dissipation: float, published: float) -> None:

@@ -55,7 +55,7 @@ def continuous() -> MultibodyPlantConfig:
 
 
 def discrete(time_step: float, approximation: str = "sap", **values: object) -> MultibodyPlantConfig:
-    """Return a discrete plant with point contact, whose outputs are those of its present state."""
+    """Return a discrete plant with point contact, whose outputs belong to its present state."""
     settings = {"contact_model": "point", **values}
     return MultibodyPlantConfig(
         time_step=time_step,

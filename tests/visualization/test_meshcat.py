@@ -1,10 +1,12 @@
 """Tests that read back what Meshcat writes: keyframes, their times, their poses and their paths."""
 
+import logging
 import xml.etree.ElementTree as ElementTree
 from base64 import b64decode
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -17,9 +19,9 @@ from tests.testbeds import AcrobotScenario
 from tests.visualization.meshcat_page import messages
 from vtbdrake.optimization import Motion
 from vtbdrake.visualization import make_meshcat, show_motion, show_motions
-from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.meshcat import picture_bundle
 from vtbdrake.visualization.still import Still
+from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
 UPPER = "Acrobot/upper_link"
 
@@ -94,7 +96,7 @@ def test_tint_and_opacity_are_of_the_moving_bodies(meshcat: Meshcat) -> None:
     tint, strength = {"b": (1.0, 0.0, 0.0)}, {"b": 0.5}
     legend = show_motions(meshcat, {"a": motion(), "b": motion()}, colors=tint, opacity=strength).legend
     assert legend == {"b": "#ff0000"}
-    # Drake's acrobot has a red upper and a blue lower link, of which the tint keeps the brightness.
+    # Drake's acrobot has a red upper and a blue lower link, whose brightness the tint keeps.
     assert set(colors(meshcat, "rollout/a/Acrobot/upper")) == {(0xFF0000, 1.0)}
     ((lower, opacity),) = set(colors(meshcat, "rollout/b/Acrobot/lower"))
     assert (lower >> 16, opacity) == (0xC3, 0.5)
@@ -199,7 +201,7 @@ def test_picture_has_the_begin_of_the_motion_as_a_shadow_of_its_end() -> None:
 
 def test_scene_that_drake_cannot_render_tells_why_it_has_no_picture() -> None:
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"  # without normals
-    still = Still(Camera((2.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
+    still = Still(Viewpoint((2.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
     still.add(
         Mesh(InMemoryMesh(mesh_file=MemoryFile(triangle, ".obj", "triangle"))),
         RigidTransform(),
@@ -221,17 +223,25 @@ def test_camera_has_all_points_in_view_and_one_at_the_edge() -> None:
 
 def test_cameras_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="has no upward direction"):
-        Camera((1.0, 2.0, 5.0), (1.0, 2.0, 0.0))
+        Viewpoint((1.0, 2.0, 5.0), (1.0, 2.0, 0.0))
     with pytest.raises(ValueError, match="finite position"):
-        Camera((1.0, 2.0, np.nan), (1.0, 2.0, 0.0))
+        Viewpoint((1.0, 2.0, np.nan), (1.0, 2.0, 0.0))
 
 
-def test_meshcat_listens_on_this_machine_only(meshcat: Meshcat) -> None:
+def test_meshcat_listens_on_this_machine_only_where_no_page_guesses(
+    meshcat: Meshcat, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
     port = f"{meshcat.port():04X}"
     listening = []
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         if Path(table).exists():
             rows = [line.split() for line in Path(table).read_text().splitlines()[1:]]
             listening += [row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{port}")]
-    assert set(listening) <= {f"0100007F:{port}", f"{'0' * 24}01000000:{port}"}
-    assert meshcat.web_url() == f"http://localhost:{meshcat.port()}"
+    host = urlsplit(meshcat.web_url()).hostname or ""
+    little_endian = "".join(f"{int(part):02X}" for part in reversed(host.split(".")))
+    assert f"{little_endian}:{port}" in listening
+    assert f"00000000:{port}" not in listening and f"{'0' * 32}:{port}" not in listening
+    with caplog.at_level(logging.INFO):
+        hosts = {urlsplit(make_meshcat().web_url()).hostname for _ in range(3)} | {host}
+    assert len(hosts) == 4 and all(name.startswith("127.") for name in hosts)
+    assert "listening" not in capfd.readouterr().err + caplog.text

@@ -231,6 +231,7 @@ def test_quality_of_no_rollout_is_refused() -> None:
             plot_quality(rollouts)
 
 
+@pytest.mark.slow
 def test_notebook_shows_the_figure_once() -> None:
     code = (
         "import sys; from tests.visualization.test_plots import smooth, plot_sweep; figure = plot_sweep(smooth());"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import PATIENCE, needs_chromium, screenshot
+from tests.chromium import needs_chromium, new_page, screenshot
 from tests.testbeds import AcrobotScenario
 from vtbdrake.optimization import Motion
 from vtbdrake.visualization import make_meshcat, show_motions
@@ -18,7 +18,7 @@ from vtbdrake.visualization import make_meshcat, show_motions
 pytestmark = [pytest.mark.slow, needs_chromium]
 
 END = 2.0  # s
-SIZE = {"width": 800, "height": 600}
+SIZE = (800, 600)
 
 
 def motion(speed: float, t_star: float) -> Motion:
@@ -36,8 +36,7 @@ def page(browser: Browser, tmp_path: Path) -> Iterator[Page]:
         make_meshcat(), motions, spacing=(0.0, 2.0, 0.0), colors={"fast": "#ff0000", "<slow>": "#0000ff"}
     )
     replace(scene, title="Moon & Mars").save(tmp_path / "recording.html", shared=True)
-    opened = browser.new_page(viewport=SIZE)
-    opened.set_default_timeout(PATIENCE)
+    opened = new_page(browser, size=SIZE)
     failures: list[str] = []
     opened.on("pageerror", lambda error: failures.append(str(error)))
     opened.goto((tmp_path / "recording.html").as_uri())

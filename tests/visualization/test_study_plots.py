@@ -99,7 +99,6 @@ def test_axis_label_names_cost_and_risk():
     study = one_of_each(qualities={"energy": "minimize"}, conditions=5, risk="CVaR(level=0.2)")
     assert plot_history(study).axes[0].get_ylabel() == "energy (cost, CVaR(level=0.2) of 5 conditions)"
     assert plot_history(one_of_each(conditions=3)).axes[0].get_ylabel() == "speed (worst of 3 conditions)"
-    assert plot_history(one_of_each(qualities={"<lambda>": "maximize"})).axes[0].get_ylabel() == "h(s⁰)"
 
 
 def test_every_quality_has_a_history():
@@ -313,7 +312,7 @@ def test_a_front_of_one_or_more_than_three_qualities_is_refused(count):
 
 
 def explained_by_one(direction: str) -> Study:
-    """The value is that of the first parameter, whatever the others are."""
+    """The value is the first parameter's, whatever the others are."""
     at = np.random.default_rng(1).uniform(size=(200, 3))
     space = [Parameter(name, 0.0, 1.0) for name in "abc"]
     return recorded(space, [point(tuple(x), x[0]) for x in at.tolist()], qualities={"h": direction})
@@ -321,7 +320,6 @@ def explained_by_one(direction: str) -> Study:
 
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])
 def test_the_parameter_that_explains_all_has_nearly_all_of_the_importance(direction, recwarn):
-    pytest.importorskip("optuna")
     axes = plot_importances(explained_by_one(direction)).axes[0]
     assert not recwarn.list
     shares = [bar.get_width() for bar in axes.patches]
@@ -332,7 +330,6 @@ def test_the_parameter_that_explains_all_has_nearly_all_of_the_importance(direct
 
 
 def test_every_quality_has_its_importances():
-    pytest.importorskip("optuna")
     at = np.random.default_rng(1).uniform(size=(200, 2)).tolist()
     study = recorded(
         [Parameter(name, 0.0, 1.0) for name in "ab"],
@@ -344,18 +341,11 @@ def test_every_quality_has_its_importances():
 
 
 def test_importances_of_few_or_equal_points_are_refused():
-    pytest.importorskip("optuna")
     with pytest.raises(ValueError, match="at least 10 points with a value, but the study has 4"):
         plot_importances(one_of_each())
     level = recorded([PERIOD], [point((1.0 + k / 20,), 2.0) for k in range(20)], qualities=SPEED)
     with pytest.raises(ValueError, match="speed is 2 at all points"):
         plot_importances(level)
-
-
-def test_without_optuna_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'vtbdrake\[optuna\]'"):
-        plot_importances(explained_by_one("maximize"))
 
 
 # -- all
@@ -384,6 +374,7 @@ def test_a_study_draws_itself():
     assert axes.get_xlabel() == f"{THETA} [rad]"
 
 
+@pytest.mark.slow
 def test_no_window_is_opened():
     code = (
         "import sys; from tests.visualization.test_study_plots import one_of_each;"

@@ -12,32 +12,41 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.argument_checks import counted
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording, Noise, Segments
 from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
+from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques
-from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError, Inertia, JointModel
-from vtbdrake.calibration.posterior import PHYSICAL, body_function, sandwich_covariance
+from vtbdrake.calibration.posterior import sandwich_covariance
+from vtbdrake.common.argument_checks import counted
+from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log
 from vtbdrake.recording.table_reader import GAP
 from vtbdrake.state import VariableError
-from vtbdrake.testbed import Scenario
+from vtbdrake.testbed import Scenario, VirtualTestbed
+from vtbdrake.testbed.inertia import INERTIA_SIZE, PHYSICAL, body_function
 from vtbdrake.testbed.pedigree import Number, Posterior
 
 _log = logging.getLogger(__name__)
 
-# Innovations are called coloured, or a hold-out worse, beyond these; tests of significance reject any real model.
-COLOURED, WORSE = 0.2, 1.3
+# Innovations with a larger autocorrelation are called coloured; a test of significance rejects any real model.
+COLOURED = 0.2
+# A hold-out whose innovations are larger by this factor is called worse; a test of significance rejects any real model.
+WORSE = 1.3
+# Largest number of iterations.
+_ITERATIONS = 25
 # The last iteration moves the parameters by less than this share of their standard deviations.
-_ITERATIONS, _CONVERGED = 25, 0.1
+_CONVERGED = 0.1
 _NOISE_SEGMENTS = 12
 # A discrete plant steps by its own step, so that a position that is missing is a gap.
 _LONGEST = 1.5
-# An interval of 95 %, in deviations, and its deviance; how far beyond a bound the optimum lies when it is doubted.
-_WIDE, _DEVIANCE, _PULLED = 1.959964, 3.841459, 3.0
+# Half width of an interval of 95 %, in standard deviations.
+_WIDE = 1.959964
+# Deviance at the ends of such an interval.
+_DEVIANCE = 3.841459
+# An estimate at a bound is doubted if the optimum lies this many standard deviations beyond it.
+_PULLED = 3.0
 
 
 class Verdict(StrEnum):
@@ -178,19 +187,9 @@ def calibrate(
     """
     if not 0.0 < holdout < 0.9:
         raise CalibrationError(f"the share that is kept back is above 0 and below 0.9, not {holdout}")
+    settings = _Settings(position, torque, measured_torque, period, segment, noise)
     with _one_thread():
-        prepared = _Prepared(
-            scenario,
-            logs,
-            parameters,
-            inertias=inertias,
-            position=position,
-            torque=torque,
-            measured_torque=measured_torque,
-            period=period,
-            segment=segment,
-            noise=noise,
-        )
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings)
         return prepared.fitted(scenario, holdout)
 
 
@@ -207,27 +206,29 @@ def information(
     segment: float = 1.0,
     noise: Noise | None = None,
 ) -> Information:
-    """Return what recordings, measured or simulated, can tell about parameters.
+    """Return the information about parameters in recordings, measured or simulated.
 
-    It is that of the likeliest noise, or of the noise that is given, at the parameters that fit all segments best:
-    deviations by the model alone, without verdicts. The arguments are those of `calibrate`.
+    The noise is the likeliest one, or the given one, at the parameters that fit all segments best:
+    deviations by the model alone, without verdicts.
+
+    Args:
+        scenario: The scenario; the fit begins at the values of its default context.
+        logs: The recordings.
+        parameters: Numbers of the plant and of its `JointDrives`, with their ranges, see `JointModel`.
+        inertias: Bodies whose ten inertial parameters are varied together.
+        position: The sensor signal of the joint positions, in the plant's order.
+        torque: The actuator signal of the joint torques.
+        measured_torque: The torques were measured in the drives, and act at once; they are no commands.
+        period: About the time between two positions that are compared, in s; by default, every one is.
+        segment: Duration in s of a segment of the recordings.
+        noise: The noise, of an earlier calibration of this machine; by default the likeliest one.
 
     Raises:
         CalibrationError: As in `calibrate`, but for parameters that change nothing.
     """
+    settings = _Settings(position, torque, measured_torque, period, segment, noise)
     with _one_thread():
-        prepared = _Prepared(
-            scenario,
-            logs,
-            parameters,
-            inertias=inertias,
-            position=position,
-            torque=torque,
-            measured_torque=measured_torque,
-            period=period,
-            segment=segment,
-            noise=noise,
-        )
+        prepared = _Prepared.of(scenario, logs, parameters, inertias, settings)
         z, noise = prepared.converged(np.ones(prepared.segments.count, bool))
         return prepared.information(noise, z)
 
@@ -235,8 +236,8 @@ def information(
 def _one_thread() -> AbstractContextManager[object]:
     """Return a context in which BLAS computes in this thread alone.
 
-    The filter's matrices are small, and those of the fit slim: what other threads do is mostly to wait for work, in a
-    loop that takes processor time. And the last digits do not depend on the number of threads.
+    The filter's matrices are small, and the fit's matrices slim: other threads would mostly wait for work, in a loop
+    that takes processor time. And the last digits do not depend on the number of threads.
     """
     from threadpoolctl import threadpool_limits
 
@@ -244,68 +245,121 @@ def _one_thread() -> AbstractContextManager[object]:
     return limits
 
 
-class _Prepared:
-    """Model and recordings, checked, with a start of the fit and what it can tell."""
+@dataclass(frozen=True)
+class _Settings:
+    """The arguments of `calibrate` about the reading and the filtering of recordings."""
 
-    def __init__(
-        self,
+    position: str
+    torque: str
+    measured_torque: bool
+    period: float | None
+    segment: float
+    noise: Noise | None
+
+    def check(self) -> None:
+        """Check the times.
+
+        Raises:
+            CalibrationError: One is not positive and finite.
+        """
+        for name, value in (("period", self.period), ("segment", self.segment)):
+            if value is not None and not 0.0 < value < inf:
+                raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """Model and recordings, checked, with a start of the fit and what it can tell.
+
+    Attributes:
+        testbed: The testbed of the scenario.
+        model: Its model, with the parameters.
+        logs: The digests of the recordings, by source.
+        remarks: What is worth saying of the recordings.
+        doubts: What speaks against a fit to them.
+        segments: The recordings in segments.
+        some: Some of the segments, by which the noise is found.
+        start: The parameters by inverse dynamics.
+        noise: The noise that is given; None: it is found.
+        guess: Where the search of the noise begins.
+    """
+
+    testbed: VirtualTestbed
+    model: JointModel
+    logs: Mapping[str, str]
+    remarks: tuple[str, ...]
+    doubts: tuple[str, ...]
+    segments: Segments
+    some: Segments
+    start: Array
+    noise: Noise | None
+    guess: Noise
+
+    @classmethod
+    def of(
+        cls,
         scenario: Scenario,
         logs: Log | Sequence[Log],
         parameters: Sequence[Parameter],
-        *,
         inertias: Sequence[Inertia],
-        position: str,
-        torque: str,
-        measured_torque: bool,
-        period: float | None,
-        segment: float,
-        noise: Noise | None,
-    ) -> None:
+        settings: _Settings,
+    ) -> _Prepared:
+        """Read and check the recordings, and find a start.
+
+        Raises:
+            CalibrationError: As in `calibrate`.
+        """
         logs = [logs] if isinstance(logs, Log) else list(logs)
         if not (parameters or inertias):
             raise CalibrationError("nothing is varied: give parameters=[Parameter(address, lower, upper)] or inertias=")
         if not logs:
             raise CalibrationError("there is no recording to calibrate with")
-        for name, value in (("period", period), ("segment", segment)):
-            if value is not None and not 0.0 < value < inf:
-                raise CalibrationError(f"{name} is a positive, finite time in s, not {value}")
-        self.testbed = scenario.build()
-        self.model = model = JointModel(self.testbed, parameters, inertias, measured_torque=measured_torque)
-        if noise is not None:
-            noise.check(model.nq)
-        self.logs = {log.source: log.digest for log in logs}
-        whole = [JointRecording.of(log, model, position=position, torque=torque, period=period) for log in logs]
+        settings.check()
+        position, torque = settings.position, settings.torque
+        testbed = scenario.build()
+        model = JointModel(testbed, parameters, inertias, measured_torque=settings.measured_torque)
+        if settings.noise is not None:
+            settings.noise.check(model.nq)
+        whole = [
+            JointRecording.of(log, model, position=position, torque=torque, period=settings.period) for log in logs
+        ]
         longest = _LONGEST if model.step_size > 0.0 else GAP
         recordings = [piece for recording in whole for piece in recording.pieces(longest=longest)]
         checks = [check_log(log, scenario.interface(), position=position, torque=torque) for log in logs]
         dynamics = InverseDynamics(model)
         fit = dynamics.fit(recordings, start=model.start)
         checks.append(check_torques(model, dynamics, recordings, fit))
-        self.remarks = tuple(remark for check in checks for remark in check.remarks)
-        self.doubts = tuple(doubt for check in checks for doubt in check.doubts)
-        for remark in self.remarks:
+        remarks = tuple(remark for check in checks for remark in check.remarks)
+        for remark in remarks:
             _log.warning("%s", remark)
-        self.segments = Segments(model, recordings, duration=segment)
-        self._some = Segments(model, recordings, duration=segment, most=_NOISE_SEGMENTS)
-        self._start = fit.z
-        self._noise = noise
-        self._guess = Noise.guess(recordings, fit.unexplained)
+        return cls(
+            testbed=testbed,
+            model=model,
+            logs={log.source: log.digest for log in logs},
+            remarks=remarks,
+            doubts=tuple(doubt for check in checks for doubt in check.doubts),
+            segments=Segments(model, recordings, duration=settings.segment),
+            some=Segments(model, recordings, duration=settings.segment, most=_NOISE_SEGMENTS),
+            start=fit.z,
+            noise=settings.noise,
+            guess=Noise.guess(recordings, fit.unexplained),
+        )
 
     def converged(self, used: NDArray[np.bool]) -> tuple[Array, Noise]:
         """Return the parameters that fit the chosen segments best, and the likeliest noise.
 
-        The noise is that of some segments, beside the parameters that fit these best.
+        The noise is estimated from some segments, beside the parameters that fit these best.
         """
         try:
-            z, noise = self._start, self._noise
+            z, noise = self.start, self.noise
             if noise is None:
-                z, noise = _gauss_newton(self._some, z, self._guess, fits_noise=True)
+                z, noise = _gauss_newton(self.some, z, self.guess, fits_noise=True)
             return _gauss_newton(self.segments, z, noise, used)
         except CalibrationError as error:
             raise CalibrationError(". ".join([str(error), *self.doubts])) from error
 
     def information(self, noise: Noise, z: Array) -> Information:
-        """Return what the recordings tell with this noise, at these parameters."""
+        """Return the information in the recordings with this noise, at these parameters."""
         slopes = self.segments.innovations(noise, self.segments.linearized(z)).slopes
         return information_of(slopes.reshape(-1, len(z)), self.model.names, self.model.scales)
 
@@ -321,7 +375,12 @@ class _Prepared:
 
 
 def kept_back(count: int, share: float) -> NDArray[np.bool]:
-    """Return which parts are kept back, spread over all of them; one at least, unless there is only one."""
+    """Return a mask (count,) of the parts that are kept back, spread over all; one at least, if there are several.
+
+    Args:
+        count: Number of parts.
+        share: Share of the parts that is kept back, rounded to whole parts; at least one part is left.
+    """
     number = min(max(round(share * count), 1), count - 1)
     held_back = np.zeros(count, bool)
     held_back[np.linspace(0, count - 1, number + 2)[1:-1].astype(int) if number else []] = True
@@ -428,7 +487,15 @@ def calibrated_scenario(
     logs: Mapping[str, str],
     reasons: Sequence[str],
 ) -> Scenario:
-    """Return the scenario with the estimates, and their pedigree."""
+    """Return the scenario with the estimates, and their pedigree.
+
+    Args:
+        scenario: The scenario that was calibrated; it is left as it is.
+        results: The estimates, by address.
+        posterior: The joint distribution of the parameters, for the pedigree.
+        logs: Digests of the recordings by name, for the pedigree.
+        reasons: Why the model is discrepant, or there is no evidence, as sentences.
+    """
     calibrated = scenario.with_values({address: each.value for address, each in results.items()})
     pedigree = calibrated.pedigree
     for address, each in results.items():
@@ -465,9 +532,9 @@ class _Bounds:
     Args:
         model: The model.
         z: The estimate.
-        gradient: Of half the sum of squares, by the scaled parameters.
+        gradient: The gradient of half the sum of squares by the scaled parameters.
         info: The information at the estimate.
-        variances: Of the scaled parameters.
+        variances: The variances of the scaled parameters.
     """
 
     def __init__(self, model: JointModel, z: Array, gradient: Array, info: Information, variances: Array) -> None:

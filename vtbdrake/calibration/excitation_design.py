@@ -22,12 +22,12 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import Noise
 from vtbdrake.calibration.fisher import Information
-from vtbdrake.calibration.model import CalibrationError, Inertia, JointModel
+from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.spline import Spline
 from vtbdrake.optimization import Parameter
-from vtbdrake.spline import Spline
 from vtbdrake.testbed import Scenario
 
 CRITERIA = ("determinant", "smallest")
@@ -83,18 +83,18 @@ def excitation(
     """Design the motion that tells the parameters of a calibration, within limits.
 
     It begins and ends at rest where the scenario's arm stands. Positions and rates keep their limits at every instant
-    (those of a cubic B-spline stay within its Bezier points), torques at eight instants of each of its pieces. It may
-    touch what stands around the arm, or the arm itself: then give narrower ``lower`` and ``upper``.
+    (a cubic B-spline and its rates stay within their Bezier points), torques at eight instants of each of its pieces.
+    It may touch what stands around the arm, or the arm itself: then give narrower ``lower`` and ``upper``.
 
     Args:
         scenario: The scenario; every joint of its plant has an actuator.
         parameters: As in `calibrate`; the motion is designed for their values in the scenario.
         inertias: As in `calibrate`.
         spline: A curve of order ``bspline`` with nine knots at least.
-        lower: The least positions of the joints, (nq,), in rad or m; by default those of the plant.
+        lower: The least positions of the joints, (nq,), in rad or m; by default the plant's limits.
         upper: The largest positions.
-        rate: The largest rates, (nq,); by default those of the plant.
-        torque: The largest torques, (nq,), in N m or N; by default those of the actuators.
+        rate: The largest rates, (nq,); by default the plant's limits.
+        torque: The largest torques, (nq,), in N m or N; by default the actuators' limits.
         margin: The share of each limit that is kept free, for feedback and disturbances.
         noise: The disturbances of the torques; by default 1 N m of 50 ms at each joint.
         criterion: ``determinant`` makes the determinant of H largest (D-optimal), ``smallest`` about the least
@@ -107,6 +107,42 @@ def excitation(
         CalibrationError: A limit is missing or excludes the pose of the scenario, the arm lacks actuators, or no
             motion within the limits was found.
     """
+    _check_search(spline, margin, criterion, starts)
+    testbed = scenario.build()
+    model, plant = JointModel(testbed, parameters, inertias), testbed.plant
+    assert plant is not None
+    if model.nu != model.nq:
+        raise CalibrationError(f"{model.nu} actuators do not move {model.nq} joints along a motion")
+    low = _limit("lower", lower, plant.GetPositionLowerLimits())
+    high = _limit("upper", upper, plant.GetPositionUpperLimits())
+    fastest = (1.0 - margin) * _limit("rate", rate, plant.GetVelocityUpperLimits())
+    strongest = (1.0 - margin) * _limit("torque", torque, model.selection @ plant.GetEffortUpperLimits())
+    room = 0.5 * margin * (high - low)
+    low, high = low + room, high - room
+    rest = plant.GetPositions(plant.GetMyContextFromRoot(testbed.default_context()))
+    if ((rest < low) | (rest > high)).any():
+        raise CalibrationError(
+            f"the motion begins where the scenario stands, at {rest.tolist()}, which is not from {low.tolist()} to "
+            f"{high.tolist()}"
+        )
+    noise = noise or Noise(np.zeros(model.nq), np.ones(model.nq), 0.05)
+    design = _Design(model, noise, spline, rest, rate=fastest, torque=strongest)
+    free = spline.knots - 2 * _RESTING
+    lower_knots, upper_knots = np.repeat(low, free), np.repeat(high, free)
+    solver, cost = design.solver(criterion, iterations), design.cost(criterion)
+    generator, results = np.random.default_rng(seed), []
+    for _ in range(starts):
+        drawn = lower_knots + (upper_knots - lower_knots) * generator.uniform(size=free * model.nq)
+        limits = {"lbx": lower_knots, "ubx": upper_knots, "lbg": -design.largest, "ubg": design.largest}
+        solution = solver(x0=design.within(drawn), **limits)
+        # The iterations may have ended before all limits held.
+        free_knots = design.within(np.clip(np.asarray(solution["x"]).ravel(), lower_knots, upper_knots))
+        results.append((float(cost(free_knots)), free_knots))
+    return design.excitation(min(results, key=itemgetter(0))[1])
+
+
+def _check_search(spline: Spline, margin: float, criterion: str, starts: int) -> None:
+    """Refuse what no motion can be designed with."""
     if criterion not in CRITERIA:
         raise CalibrationError(f"the criterion is one of {', '.join(CRITERIA)}, not {criterion!r}")
     if spline.order != "bspline" or spline.knots < 2 * _RESTING + 3:
@@ -118,41 +154,6 @@ def excitation(
         raise CalibrationError(f"the margin is a share from 0 to below 1, not {margin}")
     if starts < 1:
         raise CalibrationError(f"a search has one start at least, not {starts}")
-    testbed = scenario.build()
-    model, plant = JointModel(testbed, parameters, inertias), testbed.plant
-    assert plant is not None
-    if model.nu != model.nq:
-        raise CalibrationError(f"{model.nu} actuators do not move {model.nq} joints along a motion")
-    low, high, fastest, strongest = (
-        _limit(name, value, model.nq)
-        for name, value in (
-            ("lower", plant.GetPositionLowerLimits() if lower is None else lower),
-            ("upper", plant.GetPositionUpperLimits() if upper is None else upper),
-            ("rate", plant.GetVelocityUpperLimits() if rate is None else rate),
-            ("torque", model.selection @ plant.GetEffortUpperLimits() if torque is None else torque),
-        )
-    )
-    room = 0.5 * margin * (high - low)
-    low, high, fastest, strongest = low + room, high - room, (1.0 - margin) * fastest, (1.0 - margin) * strongest
-    rest = plant.GetPositions(plant.GetMyContextFromRoot(testbed.default_context()))
-    if ((rest < low) | (rest > high)).any():
-        raise CalibrationError(
-            f"the motion begins where the scenario stands, at {rest.tolist()}, which is not from {low.tolist()} to "
-            f"{high.tolist()}"
-        )
-    noise = noise or Noise(np.zeros(model.nq), np.ones(model.nq), 0.05)
-    design = _Design(model, noise, spline, rest, rate=fastest, torque=strongest)
-    free = spline.knots - 2 * _RESTING
-    bounds = {"lbx": np.repeat(low, free), "ubx": np.repeat(high, free)}
-    solver = design.solver(criterion, iterations)
-    generator, results = np.random.default_rng(seed), []
-    for _ in range(starts):
-        begin = design.within(bounds["lbx"] + (bounds["ubx"] - bounds["lbx"]) * generator.uniform(size=free * model.nq))
-        solution = solver(x0=begin, lbg=-design.largest, ubg=design.largest, **bounds)
-        # The iterations may have ended before all limits held.
-        free_knots = design.within(np.clip(np.asarray(solution["x"]).ravel(), bounds["lbx"], bounds["ubx"]))
-        results.append((float(design.cost(criterion)(free_knots)), free_knots))
-    return design.excitation(min(results, key=itemgetter(0))[1])
 
 
 class _Design:
@@ -184,7 +185,7 @@ class _Design:
         self._results = casadi.Function("results", [self._x], [w, self._H, torques])
 
     def _cost(self, criterion: str) -> Any:
-        """Return what is made small, of the information about scaled parameters, each known to half of its range."""
+        """Return the cost to minimize: a measure of the information about scaled parameters (half a range is 1)."""
         n = self._H.shape[0]
         symbol = casadi.SX.sym("H", n, n)
         R = casadi.chol(symbol + casadi.SX.eye(n))
@@ -224,8 +225,8 @@ class _Design:
         return Excitation(self._spline, knots, information, abs(torques).max(axis=1))
 
 
-def _limit(name: str, value: ArrayLike, size: int) -> Array:
-    limit = np.broadcast_to(np.asarray(value, dtype=float), (size,))
+def _limit(name: str, value: ArrayLike | None, default: Array) -> Array:
+    limit = np.broadcast_to(np.asarray(default if value is None else value, dtype=float), default.shape)
     if not np.isfinite(limit).all():
         raise CalibrationError(f"the plant has no finite {name} limit of every joint: give {name}=")
     return limit

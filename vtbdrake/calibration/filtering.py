@@ -8,8 +8,8 @@ Math. 41, 1981). Its state is [q; v; d], with the torque disturbances
     d_(k+1) = r d_k + sqrt(1 - r^2) D w_k,    r = exp(-period / T),
 
 of the deviations D by joint and the correlation time T, and the positions are measured with the deviations s. D, T and
-s are those of the largest likelihood. The filter is linear, about a trajectory x that is improved in each iteration:
-its innovations, and their derivatives by the parameters, are those of the defects f(x_k) - x_(k+1).
+s have the largest likelihood. The filter is linear, about a trajectory x that is improved in each iteration:
+its innovations, and their derivatives by the parameters, follow from the defects f(x_k) - x_(k+1).
 """
 
 from __future__ import annotations
@@ -26,20 +26,25 @@ import scipy.linalg
 import scipy.signal
 from numpy.typing import NDArray
 
-from vtbdrake.argument_checks import counted
-from vtbdrake.arrays import Array
-from vtbdrake.calibration.model import CalibrationError, JointModel
+from vtbdrake.calibration.joint_model import CalibrationError, JointModel
+from vtbdrake.common.argument_checks import counted
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.compiler import compiled_if_possible
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.table_reader import GAP
 
 # How far the period of a recording may differ from a multiple of the plant's step, as a share of that step.
 _ON_GRID = 0.05
-# The least number of samples, and the number of samples of a local polynomial of third order.
-_FEWEST, _SMOOTHED = 50, 15
-# Of the search for the likeliest noise: its iterations, the least gain of log L that is worth another, and the largest
-# change of a logarithm in one.
-_SCORINGS, _GAIN, _FARTHEST = 30, 0.1, 2.0
+# Least number of samples of a recording.
+_FEWEST = 50
+# Number of samples of a local polynomial of third order.
+_SMOOTHED = 15
+# Largest number of iterations of the search for the likeliest noise.
+_SCORINGS = 30
+# Least gain of log L in an iteration that is worth another one.
+_GAIN = 0.1
+# Largest change of the logarithm of a noise in one iteration.
+_FARTHEST = 2.0
 # Commands with less jitter than this share of their period come by a clock.
 _REGULAR = 0.2
 _LEAST = 1e-9  # of a deviation, in rad or m
@@ -54,7 +59,7 @@ class JointRecording:
         times: (n,), in s.
         q: Measured positions, (n, nq).
         u: Means of the commands that acted from each time to the next one, (n, nu).
-        stride: Of how many recorded positions each is one.
+        stride: Number of recorded positions per compared position.
     """
 
     source: str
@@ -68,6 +73,13 @@ class JointRecording:
         cls, log: Log, model: JointModel, *, position: str, torque: str, period: float | None = None
     ) -> JointRecording:
         """Return the two signals of a log, with about the given period.
+
+        Args:
+            log: The recording.
+            model: The model of the joints, nq of them.
+            position: Name of the sensor signal with the positions, (nq,), in rad or m.
+            torque: Name of the actuator signal with the torques, (nu,), in N m or N.
+            period: Time between two compared positions, in s; by default every recorded position.
 
         Raises:
             CalibrationError: A signal is missing or has another size than the model, or the positions are too few.
@@ -129,7 +141,7 @@ class Noise:
     Attributes:
         measurement: Deviation of the positions, (nq,), in rad or m.
         torque: Deviation of the torque disturbance, (nq,), in N m or N.
-        correlation_time: Of the disturbance, in s.
+        correlation_time: Correlation time of the disturbance, in s.
     """
 
     measurement: Array
@@ -138,13 +150,18 @@ class Noise:
 
     @classmethod
     def guess(cls, recordings: Sequence[JointRecording], unexplained: Array) -> Noise:
-        """Return where to start: fourth differences are mostly noise, unexplained torques are disturbances."""
+        """Return the noise to start with: fourth differences are mostly noise, unexplained torques are disturbances.
+
+        Args:
+            recordings: The recordings; all their positions are used.
+            unexplained: Torques that the model does not explain, (n, nq), in N m or N.
+        """
         differences = np.concatenate([np.diff(recording.q, 4, axis=0) for recording in recordings])
         measurement = np.sqrt(np.mean(differences**2, axis=0) / 70.0)
         return cls(np.maximum(measurement, _LEAST), np.maximum(np.std(unexplained, axis=0), 1e-6), 0.05)
 
     def check(self, joints: int) -> None:
-        """Refuse a noise that no recording of so many joints can have."""
+        """Raise an error for a noise that a recording with this number of joints cannot have."""
         sizes = {np.shape(self.measurement), np.shape(self.torque)}
         if sizes != {(joints,)} or not (
             np.min(self.measurement) > 0.0 and np.min(self.torque) >= 0.0 and 0.0 < self.correlation_time < inf
@@ -171,8 +188,8 @@ class Likelihood(NamedTuple):
 
     Attributes:
         log: log L, but for a constant.
-        gradient: Of log L, (2 nq + 1,).
-        information: What the recordings tell, (2 nq + 1, 2 nq + 1).
+        gradient: Gradient of log L, (2 nq + 1,).
+        information: Information in the recordings, (2 nq + 1, 2 nq + 1).
     """
 
     log: float
@@ -187,7 +204,7 @@ class Linearization(NamedTuple):
         A: By the state, (N, W, 2 nq, 2 nq).
         B: By a torque at each joint, (N, W, 2 nq, nq).
         defects: f(x_k) - x_(k+1), (N, W, 2 nq).
-        slopes: Of the defects by the parameters, (N, W, 2 nq, nz).
+        slopes: Derivatives of the defects by the parameters, (N, W, 2 nq, nz).
     """
 
     A: Array
@@ -211,7 +228,7 @@ class Innovations(NamedTuple):
 
 
 def _means(commands: Series, times: Array) -> Array:
-    """Return the means of commands, each of which acts until the next one, from each time to the next, (n, nu)."""
+    """Return the means of commands from each time to the next, (n, nu); a command acts until the next one."""
     # The integral from the first command on bends where a command begins.
     steps = np.diff(commands.times)[:, np.newaxis]
     integral = np.concatenate(
@@ -224,7 +241,12 @@ def _means(commands: Series, times: Array) -> Array:
 
 
 def stale(commands: Series, times: Array) -> NDArray[np.bool]:
-    """Return at which times the newest command is older than commands of a regular clock can be: some are missing."""
+    """Return at which times the newest command is older than commands of a regular clock can be: some are missing.
+
+    Args:
+        commands: The commands, by time.
+        times: The times to judge, (n,), in s.
+    """
     period, jitter, _ = commands.uniformity
     if not jitter < _REGULAR * period:  # They are recorded when they change.
         return np.zeros(len(times), bool)
@@ -250,13 +272,33 @@ class _Pass(NamedTuple):
     shared: Array
 
 
+class _Score(NamedTuple):
+    """The derivatives r by means and (r r' - M) / 2 by covariances of log L, along W segments of N steps.
+
+    Attributes:
+        score: The inverse of the positions' covariance times measured - expected positions, (N, W, nq, 1).
+        u, D: As r and M, by each measurement, (N, W, nq, 1) and (N, W, nq, nq).
+        r_before: r by each state before its measurement, (N, W, 3 nq, 1).
+        M_before: The last nq columns of M by this state, (N, W, 3 nq, nq).
+        r, M: By the state at the start, (W, 3 nq, 1) and (W, 3 nq, 3 nq).
+    """
+
+    score: Array
+    u: Array
+    D: Array
+    r_before: Array
+    M_before: Array
+    r: Array
+    M: Array
+
+
 class Segments:
     """Recordings in segments of equal length.
 
     Args:
         model: The model.
         recordings: The recordings, with the same period.
-        duration: Of a segment, in s.
+        duration: Duration of a segment, in s.
         most: About the largest number of segments: then some all over the recordings are taken.
 
     Attributes:
@@ -306,7 +348,7 @@ class Segments:
     def _compile(self) -> casadi.Function:
         """Return the function (x, change, m, h, z) -> following x, and its Jacobians by x, m and z, side by side.
 
-        The change is that of the velocities in the step before, which only the friction of a discrete plant feels.
+        The change is the velocities' change in the step before; only the friction of a discrete plant feels it.
         """
         x, change, m, h, z = self.model.step.sx_in()
         following, v_before = x, x[self.model.nq :] - change
@@ -325,7 +367,7 @@ class Segments:
         count = self.steps * self.count
         v = self.trajectory[:, :, n:]
         change = np.diff(v, axis=0) / self._substeps
-        change = np.concatenate([change[:1], change[:-1]])  # That before the first step is about that of the first.
+        change = np.concatenate([change[:1], change[:-1]])  # Before the first step: about its own.
         # CasADi's columns are rows here.
         columns = (self.trajectory[:-1], change, m, self._h, np.tile(z, (count, 1)))
         arguments = [np.ascontiguousarray(argument).reshape(-1) for argument in columns]
@@ -343,7 +385,12 @@ class Segments:
         return Linearization(A, by_m @ self.model.selection.T, following[..., 0] - self.trajectory[1:], slopes.copy())
 
     def innovations(self, noise: Noise, model: Linearization) -> Innovations:
-        """Return the innovations of all segments."""
+        """Return the innovations of all segments.
+
+        Args:
+            noise: The noise of the recordings.
+            model: The model along the trajectory; its slopes give the derivatives of the innovations.
+        """
         passed = self._filtered(noise, model)
         white = passed.whitening @ passed.rest
         states = self.trajectory.copy()
@@ -404,21 +451,33 @@ class Segments:
         noise, the filter whitens V_i V^-1 e, too. The products of these columns are twice the average of the
         observed and the expected information (A. R. Gilmour, R. Thompson and B. R. Cullis, "Average information
         REML", Biometrics 51, 1995).
+
+        Args:
+            noise: The noise, whose numbers the derivatives are by.
+            model: The model along the trajectory; its slopes are not used.
         """
         n = self.model.nq
         model = model._replace(slopes=model.slopes[..., :0])
-        rest, whitening, gain, means, shared = self._filtered(noise, model)
-        information = whitening.mT @ whitening
-        score = information @ rest
-        A, B = model.A, model.B
-        N, W = A.shape[:2]
+        forwards = self._filtered(noise, model)
+        backwards = self._smoothed(noise, model, forwards)
+        columns = self._changed_errors(noise, model, forwards, backwards)
+        white = (forwards.whitening @ columns).reshape(-1, 2 * n + 1)
+        distance = (forwards.rest * backwards.score).sum()
+        log = float(np.log(np.einsum("kwii->kwi", forwards.whitening)).sum() - 0.5 * distance)
+        return Likelihood(log, self._gradient(noise, forwards, backwards), 0.5 * white.T @ white)
+
+    def _smoothed(self, noise: Noise, model: Linearization, forwards: _Pass) -> _Score:
+        """Return the derivatives of log L by means and covariances, from a pass backwards."""
+        n = self.model.nq
+        information = forwards.whitening.mT @ forwards.whitening
+        score = information @ forwards.rest
+        N, W = model.A.shape[:2]
         F, _, _ = self._start(noise, W)
         r, M = np.zeros((W, 3 * n, 1)), np.zeros_like(F)
-        # Those by each measurement, and by each state before it.
         u, D = np.empty_like(score), np.empty_like(information)
         r_before, M_before = np.empty((N, W, 3 * n, 1)), np.empty((N, W, 3 * n, n))
         for k in range(N - 1, -1, -1):
-            K = gain[k]
+            K = forwards.gain[k]
             KM = K.mT @ M
             u[k] = score[k] - K.mT @ r
             D[k] = information[k] + KM @ K
@@ -427,9 +486,16 @@ class Segments:
             M[:, :, :n] -= M @ K
             M[:, :n, :n] += information[k]
             r_before[k], M_before[k] = r, M[:, :, 2 * n :]
-            F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = A[k], B[k]
+            F[:, : 2 * n, : 2 * n], F[:, : 2 * n, 2 * n :] = model.A[k], model.B[k]
             r, M = F.mT @ r, F.mT @ M @ F
-        # Of log L by the variances of measurement, start and what drives the disturbances.
+        return _Score(score, u, D, r_before, M_before, r, M)
+
+    def _gradient(self, noise: Noise, forwards: _Pass, backwards: _Score) -> Array:
+        """Return the derivatives of log L by the logarithms of the noise's numbers, shape (2 n + 1,)."""
+        n = self.model.nq
+        means, shared = forwards.means, forwards.shared
+        _, u, D, r_before, M_before, r, M = backwards
+        # Derivatives by the variances of measurement, start and the noise that drives the disturbances.
         by_R, by_start = (
             0.5 * (vector[..., 0] ** 2 - np.einsum("...ii->...i", matrix)).reshape(-1, vector.shape[-2]).sum(axis=0)
             for vector, matrix in ((u, D), (r, M))
@@ -440,14 +506,23 @@ class Segments:
         # The covariance before the measurement holds decay times that by which the slope is multiplied, and Q.
         by_decay = decay * np.einsum("kwi,kwi->", r_before[1:, :, 2 * n :, 0], means[:-1, :, 2 * n :])
         by_decay += np.einsum("kwij,kwij->", slope, shared) - 2.0 * float(torque @ by_Q)
-        gradient = np.concatenate(
+        return np.concatenate(
             [
                 2.0 * variance * (by_R + by_start[:n] + by_start[n : 2 * n] / self.period**2),
                 2.0 * torque * ((1.0 - decay**2) * by_Q + by_start[2 * n :]),
                 [by_decay * self.period / noise.correlation_time],
             ]
         )
-        # V_i V^-1 e: positions and velocities at the start, disturbances in each step, and errors of measurement.
+
+    def _changed_errors(self, noise: Noise, model: Linearization, forwards: _Pass, backwards: _Score) -> Array:
+        """Return V_i V^-1 e, filtered, for the logarithm i of each number of the noise, shape (N, W, n, 2 n + 1)."""
+        n = self.model.nq
+        A, B = model.A, model.B
+        N, W = A.shape[:2]
+        F, _, _ = self._start(noise, W)
+        u, r, r_before = backwards.u, backwards.r, backwards.r_before
+        variance, torque = noise.measurement**2, noise.torque**2
+        # Positions and velocities at the start, disturbances in each step, and errors of measurement.
         joints = np.arange(n)
         X, columns = np.zeros((W, 3 * n, 2 * n + 1)), np.zeros((N, W, n, 2 * n + 1))
         X[:, joints, joints] = -2.0 * variance * r[:, :n, 0]
@@ -463,13 +538,16 @@ class Segments:
             X[:, : 2 * n, n : 2 * n] -= B[k] * by_torque[k, :, np.newaxis]
             X[:, : 2 * n, 2 * n :] -= B[k] @ by_time[k, :, :, np.newaxis]
             columns[k] -= X[:, :n]
-            X += gain[k] @ columns[k]
-        white = (whitening @ columns).reshape(-1, 2 * n + 1)
-        log = float(np.log(np.einsum("kwii->kwi", whitening)).sum() - 0.5 * (rest * score).sum())
-        return Likelihood(log, gradient, 0.5 * white.T @ white)
+            X += forwards.gain[k] @ columns[k]
+        return columns
 
     def likeliest_noise(self, model: Linearization, guess: Noise) -> Noise:
-        """Return the noise of the largest likelihood, by Fisher scoring (with the average information)."""
+        """Return the noise of the largest likelihood, by Fisher scoring (with the average information).
+
+        Args:
+            model: The model along the trajectory.
+            guess: The noise to start with.
+        """
         n = self.model.nq
         # Correlated for a period at least, for a segment at most.
         lower = np.log([_LEAST] * (2 * n) + [self.period])

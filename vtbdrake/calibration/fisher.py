@@ -10,15 +10,20 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.inverse_dynamics import directions_of
+from vtbdrake.common.arrays import Array
 
 # A parameter changes nothing if its whole range changes all innovations together by less than this.
 _NOTHING = 1e-4
 # A parameter is not told if what the undetermined directions leave of it, when they are known to be within the range
-# (evenly), exceeds this share of its deviation, or this share of the range anyway.
-_UNTOLD_SHARE, _LEAST_UNTOLD = 0.5, 1e-6
-_TERMS, _LEAST_TERM = 6, 0.2
+# (evenly), exceeds this share of its deviation.
+_UNTOLD_SHARE = 0.5
+# It is told in any case if they leave less than this share of the range.
+_LEAST_UNTOLD = 1e-6
+# Largest number of parameters that the text of a direction names.
+_TERMS = 6
+# The text of a direction names parameters with at least this entry in the unit vector.
+_LEAST_TERM = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +69,8 @@ class Information:
         """Return whether functions of the parameters are told, as the undetermined directions leave them alone, (n,).
 
         Args:
-            gradients: Of the functions, by the scaled parameters, (n, nz).
-            deviations: Of the functions, in the directions that are determined, (n,).
+            gradients: Gradients of the functions by the scaled parameters, (n, nz).
+            deviations: Deviations of the functions in the directions that are determined, (n,).
         """
         _, directions, determined = self._directions
         left = np.linalg.norm(gradients @ directions[:, ~determined], axis=1) / np.sqrt(3.0)
@@ -105,6 +110,13 @@ class Information:
 
 
 def information_of(slopes: Array, names: Sequence[str], scales: Array) -> Information:
-    """Return the information in innovations with these derivatives by the parameters, (n, nz)."""
+    """Return the information in innovations with these derivatives by the parameters, (n, nz).
+
+    Args:
+        slopes: Derivatives of the whitened innovations by the parameters, (n, nz).
+        names: Names of the parameters, in the order of the columns.
+        scales: The size of each parameter, (nz,), by which its column is multiplied: half of its range, or 1 for a
+            number of an inertia.
+    """
     J = slopes * scales
     return Information(tuple(names), scales, J.T @ J)

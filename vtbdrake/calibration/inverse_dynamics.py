@@ -9,15 +9,20 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording
-from vtbdrake.calibration.model import JointModel
+from vtbdrake.calibration.joint_model import JointModel
+from vtbdrake.common.arrays import Array
 
 # A direction in which the recordings leave more than this, in units of the parameters' scales, is not determined.
 UNDETERMINED = 0.5
-_ITERATIONS, _CONVERGED = 25, 1e-3
-# Smoothed positions are bad at the ends of a recording; between them, every third is taken.
-_ENDS, _STRIDE = 15, 3
+# Largest number of iterations.
+_ITERATIONS = 25
+# The last iteration moves the parameters by less than this, in units of their scales.
+_CONVERGED = 1e-3
+# Number of samples left out at each end of a recording, where smoothed positions are bad.
+_ENDS = 15
+# Between the ends, every third sample is taken.
+_STRIDE = 3
 
 
 class TorqueFit(NamedTuple):
@@ -93,7 +98,7 @@ class InverseDynamics:
             deviation = np.maximum(e.std(axis=0), 1e-9)
             if moved.max() < _CONVERGED:
                 break
-        # By joint, as torques of a wrist are small beside those of a shoulder; of a passive joint, those of its motion.
+        # By joint, as a wrist's torques are small beside a shoulder's; a passive joint has the torques of its motion.
         power = np.maximum((acting**2).mean(axis=0), ((e + acting) ** 2).mean(axis=0))
         shares = (e**2).mean(axis=0) / np.maximum(power, 1e-12)
         return TorqueFit(z, e, float(shares.mean()))
@@ -125,5 +130,11 @@ def bounded_step(model: JointModel, z: Array, H: Array, g: Array) -> Array:
 
 
 def outward(model: JointModel, z: Array, g: Array) -> NDArray[np.bool]:
-    """Return which parameters stand at an end of their range and are pulled beyond it by the gradient."""
+    """Return a mask of the parameters that stand at an end of their range, which the gradient would leave.
+
+    Args:
+        model: The model, for the ranges of its parameters.
+        z: The parameters, (nz,).
+        g: The gradient of half the sum of squares by the scaled parameters, (nz,).
+    """
     return np.asarray(((z <= model.lower) & (g > 0.0)) | ((z >= model.upper) & (g < 0.0)))

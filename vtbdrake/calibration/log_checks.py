@@ -13,24 +13,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vtbdrake.argument_checks import counted
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording, stale
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
-from vtbdrake.calibration.model import CalibrationError, JointModel
+from vtbdrake.calibration.joint_model import CalibrationError, JointModel
+from vtbdrake.common.argument_checks import counted
+from vtbdrake.common.arrays import Array
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.table_reader import GAP
 from vtbdrake.testbed import Interface
 
-# Shares of a recording from which on something is said: missing time, uneven periods, and equal extreme values.
-_MISSING, _UNEVEN, _SATURATED = 0.02, 0.2, 0.05
-# An extreme value in a row for so many samples is a limit, and for so long, in s, a dead sensor.
-_PLATEAU, _FROZEN = 5, 0.5
-# Beyond this share of unexplained power, a model is not that of the recorded machine.
+# Share of missing time in a recording that is reported.
+_MISSING = 0.02
+# Share of uneven periods that is reported.
+_UNEVEN = 0.2
+# Share of equal extreme values that is reported.
+_SATURATED = 0.05
+# An extreme value that this number of samples in a row have is a limit.
+_PLATEAU = 5
+# An extreme value that lasts this long comes from a dead sensor, in s.
+_FROZEN = 0.5
+# Beyond this share of unexplained power, a model does not describe the recorded machine.
 UNLIKE = 0.5
-# Another reading of the columns is believed if it leaves this share of what the columns as they are leave, and below
-# this share of all; one above an even smaller share is not looked for.
-_BETTER, _EXPLAINED, _GOOD = 1.0 / 9.0, 0.3, 0.02
+# Another reading of the columns is believed if it leaves at most this share of what the columns as they are leave.
+_BETTER = 1.0 / 9.0
+# It leaves at most this share of the power of the torques, too.
+_EXPLAINED = 0.3
+# No other reading is looked for if the columns as they are leave less than this share of the power.
+_GOOD = 0.02
 # Torques that come by another delay are mentioned if they leave this share.
 _ALIGNED = 0.7
 _DELAYS = (1, 2, 4, 8, 16, 32)  # in periods

@@ -9,15 +9,15 @@ from math import inf
 from time import process_time
 from typing import Any
 
-from vtbdrake.argument_checks import as_number
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.calibration import Calibration, calibrate
-from vtbdrake.closing import Closing
+from vtbdrake.common.argument_checks import as_number
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.common.frames import FrameConnection
 from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.frames import FrameConnection
 from vtbdrake.monitoring.residuals import Alarm, ResidualMonitor
 from vtbdrake.optimization import Parameter
 from vtbdrake.recording.log import Log, Series

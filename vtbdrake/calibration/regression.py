@@ -26,12 +26,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from pydrake.systems.framework import Context
 
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.filtering import JointRecording
-from vtbdrake.calibration.model import INERTIA_SIZE, CalibrationError
+from vtbdrake.calibration.joint_model import CalibrationError
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Expression
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.state.multibody import bodies, element_address
+from vtbdrake.testbed.inertia import INERTIA_SIZE
 
 # Names of the inertial parameters of a body: about its origin, in its frame.
 INERTIAL = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
@@ -49,7 +50,7 @@ _BLOCKS_PER_PARAMETER = 3
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveModel:
     """What acts on the joints along a direction, linear in parameters: a motor with its friction, or a spring.
 
     Attributes:
@@ -105,7 +106,7 @@ class TorqueRegressor:
     Attributes:
         nq: Number of joints.
         bodies: Names of the bodies.
-        names: Names of the entries of p: ten of each body, then those of the drives.
+        names: Names of the entries of p: ten of each body, then the drives' entries.
         nominal: p of the plant, with zeros for the drives.
 
     Raises:
@@ -113,7 +114,7 @@ class TorqueRegressor:
     """
 
     def __init__(
-        self, plant: MultibodyPlant, context: Context | None = None, *, drives: Mapping[str, Drive] | None = None
+        self, plant: MultibodyPlant, context: Context | None = None, *, drives: Mapping[str, DriveModel] | None = None
     ) -> None:
         context = plant.CreateDefaultContext() if context is None else context
         carried = [body for body in bodies(plant) if not plant.IsAnchored(body)]
@@ -131,7 +132,7 @@ class TorqueRegressor:
         if drives is None:
             joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
             places = {joint.name(): joint.position_start() for joint in joints if joint.num_positions()}
-            drives = {name: Drive(np.eye(self.nq)[k], friction()) for name, k in places.items()}
+            drives = {name: DriveModel(np.eye(self.nq)[k], friction()) for name, k in places.items()}
         for name, drive in drives.items():
             if np.shape(drive.direction) != (self.nq,):
                 raise CalibrationError(
@@ -160,7 +161,13 @@ class TorqueRegressor:
         return casadi.Function("regressor", [q, v, a], [casadi.densify(Y)], {"cse": True})
 
     def matrix(self, q: Array, v: Array, a: Array) -> Array:
-        """Return Y (n, nq, P) for positions, velocities and accelerations (n, nq)."""
+        """Return Y (n, nq, P) for positions, velocities and accelerations (n, nq).
+
+        Args:
+            q: Positions, (n, nq), in rad or m.
+            v: Velocities, (n, nq), in rad/s or m/s.
+            a: Accelerations, (n, nq), in rad/s^2 or m/s^2.
+        """
         n = len(q)
         columns = np.asarray(self._regressor.map(n)(q.T, v.T, a.T)).reshape(self.nq, n, -1).swapaxes(0, 1)
         parts = [columns]
@@ -199,7 +206,7 @@ def _of_inertial(p: Expression) -> tuple[Expression, Expression, Expression]:
     return m, casadi.vertcat(x, y, z), casadi.vertcat(*(p[4 + k] - m * s for k, s in enumerate(shift)))
 
 
-class Equations(NamedTuple):
+class RegressionEquations(NamedTuple):
     """The equations of one recording, filtered and thinned.
 
     Attributes:
@@ -214,15 +221,20 @@ class Equations(NamedTuple):
     Y: Array
     tau: Array
 
-    def between(self, start: float, end: float) -> Equations:
-        """Return the equations of the times start <= t < end, in s."""
+    def between(self, start: float, end: float) -> RegressionEquations:
+        """Return the equations of the times start <= t < end, in s.
+
+        Args:
+            start: The first time, in s.
+            end: The end, which does not belong to the part, in s.
+        """
         rows = (self.times >= start) & (self.times < end)
-        return Equations(self.source, self.times[rows], self.Y[rows], self.tau[rows])
+        return RegressionEquations(self.source, self.times[rows], self.Y[rows], self.tau[rows])
 
 
 def equations(
     model: TorqueRegressor, recording: JointRecording, *, cutoff: float, band: float | None = None
-) -> Equations:
+) -> RegressionEquations:
     """Return the equations of a recording.
 
     Positions pass a Butterworth filter forwards and backwards, which delays nothing, and give velocities and
@@ -233,7 +245,7 @@ def equations(
         model: The inverse dynamics.
         recording: Positions (n, nq), and the torques at the joints (n, nq) in their directions.
         cutoff: Cutoff frequency for the positions, in Hz; well above the motion, or accelerations come out too small.
-        band: Cutoff frequency for the equations, in Hz; that of the positions by default.
+        band: Cutoff frequency for the equations, in Hz; the positions' cutoff by default.
 
     Raises:
         CalibrationError: The recording has other sizes, or is too slow or too short for these frequencies.
@@ -268,7 +280,7 @@ def equations(
     ends = round(margin / period)
     rows = slice(ends, len(times) - ends, max(int(1.0 / (_PER_CUTOFF * band * period)), 1))
     Y, tau = (_low_pass(values, band, period)[rows] for values in (model.matrix(q, v, a), tau))
-    return Equations(recording.source, times[rows], Y, tau)
+    return RegressionEquations(recording.source, times[rows], Y, tau)
 
 
 def _resampled(times: Array, recorded: Array, values: Array) -> Array:
@@ -369,7 +381,7 @@ class Regression:
     parameters: Array
     remarks: tuple[str, ...]
 
-    def torques(self, equations: Equations) -> Array:
+    def torques(self, equations: RegressionEquations) -> Array:
         """Return the torques (n, nq) that are expected in a recording, in its own units."""
         return np.asarray(equations.Y @ self.parameters / self.gains)
 
@@ -396,7 +408,7 @@ class Regression:
 
 def regress(
     model: TorqueRegressor,
-    recordings: Equations | Sequence[Equations],
+    recordings: RegressionEquations | Sequence[RegressionEquations],
     *,
     gains: Sequence[int] = (),
     consistent: bool = False,
@@ -423,7 +435,52 @@ def regress(
     Raises:
         CalibrationError: The equations are fewer than the parameters, or of another model; no gain is known.
     """
-    recordings = [recordings] if isinstance(recordings, Equations) else list(recordings)
+    recordings = [recordings] if isinstance(recordings, RegressionEquations) else list(recordings)
+    _check_equations(model, recordings, gains)
+    base = base_parameters(model)
+    Y = np.concatenate([each.Y[:, :, list(base.columns)] for each in recordings])
+    tau = np.concatenate([each.tau for each in recordings])
+    fit = _weighted_fit(Y, tau, gains)
+    scores = _scores(recordings, fit.Z / fit.scale[:, np.newaxis], fit.left / fit.scale, block) / fit.norms
+    deviations, condition = _deviations(fit, scores)
+    wide = float(scipy.stats.t.ppf(0.975, max(len(scores) - 1, 1))) * deviations
+    factors = np.ones(model.nq)
+    factors[list(gains)] += fit.values[len(base.columns) :]
+    parameters = np.zeros(len(model.names))
+    parameters[list(base.columns)] = fit.values[: len(base.columns)]
+    names = (*base.names, *(f"gain {joint} - 1" for joint in gains))
+    remarks = []
+    if len(scores) < _BLOCKS_PER_PARAMETER * len(names):
+        remarks.append(f"{len(scores)} blocks are too few for {len(names)} parameters: the intervals are too small")
+    if unknown := [name for name, deviation in zip(names, deviations, strict=True) if not np.isfinite(deviation)]:
+        remarks.append(f"not determined: {'; '.join(unknown)}")
+    if consistent:
+        everything, acting = np.concatenate([each.Y for each in recordings]), tau * factors
+        weight = _NO_PRIOR if prior is None else prior
+        parameters = _consistent(model, everything / fit.scale[:, np.newaxis], acting / fit.scale, weight)
+        ratio = np.linalg.norm((acting - everything @ parameters) / fit.scale) / np.linalg.norm(fit.left / fit.scale)
+        if ratio > _WORSE:
+            remarks.append(
+                f"bodies with positive masses leave {ratio:.2g} times as much of the torques: wrong signs or frames?"
+            )
+    return Regression(
+        model=model,
+        names=names,
+        values=fit.values,
+        deviations=deviations,
+        lower=fit.values - wide,
+        upper=fit.values + wide,
+        residual=fit.scale,
+        condition=condition,
+        blocks=len(scores),
+        gains=factors,
+        parameters=parameters,
+        remarks=tuple(remarks),
+    )
+
+
+def _check_equations(model: TorqueRegressor, recordings: Sequence[RegressionEquations], gains: Sequence[int]) -> None:
+    """Refuse unknown gains of all joints, and equations of another model."""
     if len(set(gains)) >= model.nq:
         raise CalibrationError(
             "all gains are unknown: nothing tells the masses of an arm from the strength of all its motors"
@@ -431,15 +488,46 @@ def regress(
     for each in recordings:
         if each.Y.shape[1:] != (model.nq, len(model.names)):
             raise CalibrationError(f"{each.source} has equations {each.Y.shape} of another model")
-    base = base_parameters(model)
-    Y = np.concatenate([each.Y[:, :, list(base.columns)] for each in recordings])
-    tau = np.concatenate([each.tau for each in recordings])
+
+
+@dataclass(frozen=True)
+class _WeightedFit:
+    """Weighted least squares with instruments, of n samples of nq joints and p parameters.
+
+    Attributes:
+        values: The parameters, (p,).
+        left: What is left of the torques, (n, nq).
+        scale: The root mean square of it, by joint, (nq,).
+        Z: The instruments, (n, nq, p).
+        norms: The norms of the weighted regressor's columns, (p,).
+        white: The weighted regressor with columns of norm 1, (n nq, p).
+        instruments: The instruments of the last solution, weighted like it, (n nq, p).
+        inverse: The inverse of the normal equations, (p, p).
+    """
+
+    values: Array
+    left: Array
+    scale: Array
+    Z: Array
+    norms: Array
+    white: Array
+    instruments: Array
+    inverse: Array
+
+
+def _weighted_fit(Y: Array, tau: Array, gains: Sequence[int]) -> _WeightedFit:
+    """Fit tau = Y b - g tau for the base parameters b and the unknown gains 1 + g of some joints.
+
+    Raises:
+        CalibrationError: The equations are too few.
+    """
+    base = Y.shape[2]
     # (1 + g) tau = Y b, so that tau = Y b - g tau.
     Y = np.concatenate([Y, *(_column(-tau, joint) for joint in gains)], axis=2)
     count = Y.shape[2]
     if tau.size < 2 * count:
         raise CalibrationError(f"{tau.size} equations are too few for {count} parameters")
-    values, scale = np.zeros(count), np.ones(model.nq)
+    values, scale = np.zeros(count), np.ones(tau.shape[1])
     Z = Y
     for _ in range(_ROUNDS):
         white, instruments = ((part / scale[:, np.newaxis]).reshape(-1, count) for part in (Y, Z))
@@ -452,51 +540,26 @@ def regress(
         if gains:
             # Measured torques on the right side have errors, which expected ones have not.
             Z = Y.copy()
-            Z[:, :, len(base.columns) :] = np.concatenate([_column(left - tau, joint) for joint in gains], axis=2)
-    _, sizes, directions = np.linalg.svd(white, full_matrices=False)
+            Z[:, :, base:] = np.concatenate([_column(left - tau, joint) for joint in gains], axis=2)
+    return _WeightedFit(values, left, scale, Z, norms, white, instruments, inverse)
+
+
+def _deviations(fit: _WeightedFit, scores: Array) -> tuple[Array, float]:
+    """Return the deviations of the parameters, inf if undetermined, and the condition number.
+
+    Args:
+        fit: The fit.
+        scores: The sums of its scores over blocks, of shape (blocks, parameters).
+    """
+    _, sizes, directions = np.linalg.svd(fit.white, full_matrices=False)
     undetermined = directions[sizes <= _DETERMINED * sizes[0]]
     condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0.0 else np.inf
-    scores = _scores(recordings, Z / scale[:, np.newaxis], left / scale, block) / norms
-    sandwich = inverse @ (scores.T @ scores) @ inverse.T * len(scores) / max(len(scores) - 1, 1)
+    sandwich = fit.inverse @ (scores.T @ scores) @ fit.inverse.T * len(scores) / max(len(scores) - 1, 1)
     # Never less than what errors leave that are not correlated.
-    alone = inverse @ (instruments.T @ instruments) @ inverse.T
-    deviations = np.sqrt(np.maximum(np.diag(sandwich), np.diag(alone))) / norms
+    alone = fit.inverse @ (fit.instruments.T @ fit.instruments) @ fit.inverse.T
+    deviations = np.sqrt(np.maximum(np.diag(sandwich), np.diag(alone))) / fit.norms
     deviations[np.linalg.norm(undetermined, axis=0) > _UNKNOWN] = np.inf
-    wide = float(scipy.stats.t.ppf(0.975, max(len(scores) - 1, 1))) * deviations
-    factors = np.ones(model.nq)
-    factors[list(gains)] += values[len(base.columns) :]
-    parameters = np.zeros(len(model.names))
-    parameters[list(base.columns)] = values[: len(base.columns)]
-    if consistent:
-        everything, acting = np.concatenate([each.Y for each in recordings]), tau * factors
-        weight = _NO_PRIOR if prior is None else prior
-        parameters = _consistent(model, everything / scale[:, np.newaxis], acting / scale, weight)
-    names = (*base.names, *(f"gain {joint} - 1" for joint in gains))
-    remarks = []
-    if len(scores) < _BLOCKS_PER_PARAMETER * count:
-        remarks.append(f"{len(scores)} blocks are too few for {count} parameters: the intervals are too small")
-    if unknown := [name for name, deviation in zip(names, deviations, strict=True) if not np.isfinite(deviation)]:
-        remarks.append(f"not determined: {'; '.join(unknown)}")
-    if consistent:
-        ratio = np.linalg.norm((acting - everything @ parameters) / scale) / np.linalg.norm(left / scale)
-        if ratio > _WORSE:
-            remarks.append(
-                f"bodies with positive masses leave {ratio:.2g} times as much of the torques: wrong signs or frames?"
-            )
-    return Regression(
-        model=model,
-        names=names,
-        values=values,
-        deviations=deviations,
-        lower=values - wide,
-        upper=values + wide,
-        residual=scale,
-        condition=condition,
-        blocks=len(scores),
-        gains=factors,
-        parameters=parameters,
-        remarks=tuple(remarks),
-    )
+    return deviations, condition
 
 
 def _column(torques: Array, joint: int) -> Array:
@@ -506,7 +569,7 @@ def _column(torques: Array, joint: int) -> Array:
     return column
 
 
-def _scores(recordings: Sequence[Equations], Y: Array, left: Array, block: float) -> Array:
+def _scores(recordings: Sequence[RegressionEquations], Y: Array, left: Array, block: float) -> Array:
     """Return the sums over blocks of the scores, (blocks, parameters)."""
     scores, first = [], 0
     for each in recordings:
@@ -546,7 +609,7 @@ def _consistent(model: TorqueRegressor, Y: Array, tau: Array, prior: float) -> A
 
 
 def _scales_of(model: TorqueRegressor) -> tuple[float, float, float]:
-    """Return how large mass, moments of mass and moments of inertia of a body are in this model."""
+    """Return the typical mass, moment of mass and moment of inertia of a body in this model."""
     numbers = abs(model.nominal[: INERTIA_SIZE * len(model.bodies)].reshape(-1, INERTIA_SIZE))
     mass = max(float(numbers[:, 0].mean()), 1e-9)
     length = float(np.sqrt(max(float(numbers[:, 4:7].mean()), 1e-12) / mass))

@@ -11,11 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.argument_checks import counted
-from vtbdrake.arrays import Array
-from vtbdrake.calibration.calibration import WORSE, Calibrated, Calibration, Verdict, calibrated_scenario, kept_back
+from vtbdrake.calibration.calibration import (
+    WORSE,
+    Calibrated,
+    Calibration,
+    Verdict,
+    calibrated_scenario,
+    kept_back,
+)
 from vtbdrake.calibration.fisher import Information
-from vtbdrake.calibration.model import CalibrationError
+from vtbdrake.calibration.joint_model import CalibrationError
+from vtbdrake.common.argument_checks import counted
+from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Parameter
 from vtbdrake.optimization.solvers import Evaluation, Point, make_solver
 from vtbdrake.recording.log import Log, Series
@@ -31,12 +38,21 @@ Loss = Callable[[Array, Record, Record], float]
 # A recording that is farther from the simulations than they are from each other, in more than this share of the
 # windows beyond what chance explains, is not explained by the model.
 OUTSIDE = 0.3
-_BOOTSTRAPS, _ROUNDS, _CANDIDATES = 400, 4, 1024
+# Number of draws of the bootstrap.
+_BOOTSTRAPS = 400
+# Number of rounds in which the surface is fitted, each in a smaller box.
+_ROUNDS = 4
+# Number of random points from which the next ones are chosen.
+_CANDIDATES = 1024
 # A difference is one if so large a share of the draws agrees about its sign.
 _SURE = 0.975
-# The half width of the box of the last fit, at first, as a share of the range; and its largest and least ratio of the
-# bootstrap's deviation to it: a quadratic fits in a box that is neither much smaller nor much larger than the doubt.
-_RADIUS, _NARROW, _WIDE = 0.15, 0.35, 0.1
+# Half width of the box of the last fit at first, as a share of the range.
+_RADIUS = 0.15
+# A quadratic fits in a box that is neither much smaller nor much larger than the doubt.
+# Largest ratio of the bootstrap's deviation to the half width: beyond it, the box is too narrow.
+_NARROW = 0.35
+# Least ratio: below it, the box is too wide.
+_WIDE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +60,7 @@ class Window:
     """A part of a recording that a rollout predicts from its measured state.
 
     Attributes:
-        times: The times (n,) of the samples in s, equally spaced, the first one that of the start.
+        times: The times (n,) of the samples in s, equally spaced, beginning at the start.
         starts: Values of s0 by address: the measured state, and further states within its uncertainty. Past an impact
             trajectories are chaotic: what the model predicts is the spread of those that begin within the uncertainty.
         record: Address -> measured values (n, ...) at the times.
@@ -181,10 +197,11 @@ def calibrate_by_rollouts(
         )
         at_estimate, at_holdout = (scores.of(estimate, part) for part in (fitted, held_back))
         as_good = _is_as_good(scores, held_back, start, estimate, _bootstrap(held_back, rng))
+        fit = _Fit(scores.parameters, start, estimate, draws, at_estimate, at_holdout, as_good)
     finally:
         if opened is not executor:
             opened.close()
-    return _result(scenario, scores, windows, start, estimate, draws, at_estimate, at_holdout, as_good)
+    return _result(scenario, windows, fit, rollouts=scores.rollouts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,9 +262,9 @@ class _Scores:
         for point in dict.fromkeys(points):
             for window in windows:
                 if (point, id(window)) not in self._scores:
-                    # Few lengths, as an executor keeps runners for a few tasks.
-                    steps = 32 * ceil((len(window.times) - 1) / 32)
-                    missing.setdefault((steps, window.period), []).append((point, window))
+                    missing.setdefault((_horizon_steps(len(window.times) - 1), window.period), []).append(
+                        (point, window)
+                    )
         for (steps, period), pairs in missing.items():
             if (steps, period) not in self._tasks:
                 self._tasks[steps, period] = RolloutTask(
@@ -296,6 +313,12 @@ class _Scores:
         return _WindowScore(mean - 0.5 * float(to_others.mean()), mean, bool(mean > to_others.max()))
 
 
+def _horizon_steps(steps: int) -> int:
+    """Return the number of steps that are simulated for a window: few lengths, as an executor keeps few runners."""
+    grain = min(32, max(1, 2 ** (steps.bit_length() - 2)))  # at most half as many more than are asked for
+    return grain * ceil(steps / grain)
+
+
 def _check_periods(windows: Sequence[Window]) -> None:
     periods = np.array([window.period for window in windows])
     sources = len({window.source for window in windows})
@@ -308,7 +331,7 @@ def _check_periods(windows: Sequence[Window]) -> None:
 
 
 def _split_sources(windows: Sequence[Window], share: float) -> tuple[list[Window], list[Window]]:
-    """Return the windows of the fit, and those of the recordings that are kept back, spread over all."""
+    """Return the windows of the fit, and the windows of recordings that are kept back, spread over all."""
     sources = list(dict.fromkeys(window.source for window in windows))
     held_back = {sources[k] for k in np.flatnonzero(kept_back(len(sources), share))}
     parts: tuple[list[Window], list[Window]] = ([], [])
@@ -336,7 +359,7 @@ def _search(scores: _Scores, windows: Sequence[Window], *, solver: str, points: 
 
 
 def _bootstrap(windows: Sequence[Window], rng: np.random.Generator) -> Array:
-    """Return how often each window is drawn, (_BOOTSTRAPS, windows), if whole recordings are drawn."""
+    """Return the counts of each window's draws, (_BOOTSTRAPS, windows), if whole recordings are drawn."""
     sources = list(dict.fromkeys(window.source for window in windows))
     owner = [sources.index(window.source) for window in windows]
     draws = rng.multinomial(len(sources), np.full(len(sources), 1.0 / len(sources)), size=_BOOTSTRAPS)
@@ -476,79 +499,127 @@ class _Surface:
         return minima
 
 
-def _result(
-    scenario: Scenario,
-    scores: _Scores,
-    windows: Sequence[Window],
-    start: Sequence[float],
-    estimate: Point,
-    draws: Array,
-    at_estimate: Sequence[_WindowScore],
-    at_holdout: Sequence[_WindowScore],
-    start_is_as_good: bool,
-) -> RolloutCalibration:
-    losses = np.array([each.loss for each in at_estimate])
-    fit, holdout = float(losses.mean()), float(np.mean([each.loss for each in at_holdout]))
-    count = len(windows[0].starts)
-    chance = 1.0 / (count + 1)
-    outside = float(np.mean([each.outside for each in at_estimate])) if count > 1 else None
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The result of the search and of its bootstrap.
+
+    Attributes:
+        parameters: The parameters, in the order of a point.
+        start: Their values in the scenario.
+        estimate: Their best values.
+        draws: Estimates by the draws of recordings, on the scale of the search, shape (draws, parameters).
+        at_estimate: The scores of the fitted windows at the estimate.
+        at_holdout: The scores of the windows that were kept back.
+        start_is_as_good: Whether the start explains what was kept back about as well.
+    """
+
+    parameters: tuple[Parameter, ...]
+    start: Sequence[float]
+    estimate: Point
+    draws: Array
+    at_estimate: Sequence[_WindowScore]
+    at_holdout: Sequence[_WindowScore]
+    start_is_as_good: bool
+
+    @property
+    def losses(self) -> Array:
+        """Return the losses of the fitted windows."""
+        return np.array([each.loss for each in self.at_estimate])
+
+    @property
+    def holdout(self) -> float:
+        """Return the mean loss of the windows that were kept back."""
+        return float(np.mean([each.loss for each in self.at_holdout]))
+
+    @property
+    def outside(self) -> float:
+        """Return the share of the fitted windows whose recording is outside of the simulations."""
+        return float(np.mean([each.outside for each in self.at_estimate]))
+
+    def information(self) -> Information:
+        """Return the information of the recordings about the parameters, in units of half their ranges."""
+        names = tuple(parameter.address for parameter in self.parameters)
+        scales = np.array([0.5 * (parameter.upper - parameter.lower) for parameter in self.parameters])
+        # The draws in units of half the ranges, on the scale of the search.
+        spread = np.atleast_2d(np.cov(2.0 * self.draws.T)) + 1e-12 * np.eye(len(names))
+        return Information(names, scales, np.asarray(np.linalg.inv(spread), dtype=float))
+
+    def calibrated(self, k: int, verdict: Verdict, information: Information) -> Calibrated:
+        """Return parameter number ``k`` with its interval; its verdict is ``verdict`` unless it has one of its own."""
+        parameter, value = self.parameters[k], self.estimate[k]
+        samples = np.array([parameter.from_unit(u) for u in self.draws[:, k]])
+        lower, upper = np.quantile(samples, [0.025, 0.975])
+        if not all(1e-3 < parameter.to_unit(x) < 1.0 - 1e-3 for x in (lower, value, upper)):
+            verdict = Verdict.AT_BOUND
+        if parameter.address not in information.identifiable:
+            verdict = Verdict.NOT_IDENTIFIABLE
+        return Calibrated(
+            parameter.address,
+            self.start[k],
+            float(value),
+            float(samples.std()),
+            float(lower),
+            float(upper),
+            verdict,
+        )
+
+    def posterior(self) -> Posterior:
+        """Return the distribution of the parameters by the draws."""
+        values = np.array([[p.from_unit(u) for p, u in zip(self.parameters, draw, strict=True)] for draw in self.draws])
+        return Posterior(
+            addresses=[parameter.address for parameter in self.parameters],
+            mean=[float(value) for value in self.estimate],
+            covariance=np.atleast_2d(np.cov(values.T)).tolist(),
+            lower=[float(parameter.lower) for parameter in self.parameters],
+            upper=[float(parameter.upper) for parameter in self.parameters],
+        )
+
+
+def _judged(fit: _Fit, *, outside: float | None, chance: float) -> tuple[Verdict, list[str]]:
+    """Return the verdict on a fit, and the reasons against it."""
     reasons = []
+    loss = float(fit.losses.mean())
     if outside is not None and outside > chance + OUTSIDE:
         reasons.append(
             f"in {outside:.0%} of the windows the recording is farther from the simulations than these from each "
             f"other ({chance:.0%} by chance): the model lacks something, or the starts are not known as well as given"
         )
-    if not holdout <= WORSE * fit:
-        reasons.append(f"the recordings that were kept back fit {holdout / fit:.2g} times worse")
-    verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
-    if not reasons and start_is_as_good:
-        verdict = Verdict.NO_EVIDENCE
-        reasons.append(
-            "the start explains the recordings that were kept back about as well: little speaks for other values"
-        )
-    names = tuple(parameter.address for parameter in scores.parameters)
-    scales = np.array([0.5 * (parameter.upper - parameter.lower) for parameter in scores.parameters])
-    # The draws in units of half the ranges, on the scale of the search.
-    spread = np.atleast_2d(np.cov(2.0 * draws.T)) + 1e-12 * np.eye(len(names))
-    information = Information(names, scales, np.asarray(np.linalg.inv(spread), dtype=float))
-    results = {}
-    for k, (parameter, value) in enumerate(zip(scores.parameters, estimate, strict=True)):
-        samples = np.array([parameter.from_unit(u) for u in draws[:, k]])
-        lower, upper = np.quantile(samples, [0.025, 0.975])
-        own_verdict = verdict
-        if not all(1e-3 < parameter.to_unit(x) < 1.0 - 1e-3 for x in (lower, value, upper)):
-            own_verdict = Verdict.AT_BOUND
-        if names[k] not in information.identifiable:
-            own_verdict = Verdict.NOT_IDENTIFIABLE
-        results[names[k]] = Calibrated(
-            names[k], start[k], float(value), float(samples.std()), float(lower), float(upper), own_verdict
-        )
-    values = np.array([[p.from_unit(u) for p, u in zip(scores.parameters, draw, strict=True)] for draw in draws])
-    posterior = Posterior(
-        addresses=list(names),
-        mean=[each.value for each in results.values()],
-        covariance=np.atleast_2d(np.cov(values.T)).tolist(),
-        lower=[float(parameter.lower) for parameter in scores.parameters],
-        upper=[float(parameter.upper) for parameter in scores.parameters],
-    )
+    if not fit.holdout <= WORSE * loss:
+        reasons.append(f"the recordings that were kept back fit {fit.holdout / loss:.2g} times worse")
+    if reasons:
+        return Verdict.DISCREPANT, reasons
+    if not fit.start_is_as_good:
+        return Verdict.ACCEPTED, reasons
+    return Verdict.NO_EVIDENCE, [
+        "the start explains the recordings that were kept back about as well: little speaks for other values"
+    ]
+
+
+def _result(scenario: Scenario, windows: Sequence[Window], fit: _Fit, *, rollouts: int) -> RolloutCalibration:
+    count = len(windows[0].starts)
+    chance = 1.0 / (count + 1)
+    outside = fit.outside if count > 1 else None
+    verdict, reasons = _judged(fit, outside=outside, chance=chance)
+    information = fit.information()
+    results = {parameter.address: fit.calibrated(k, verdict, information) for k, parameter in enumerate(fit.parameters)}
     logs = {f"{window.source} from {window.times[0]:g} s": window.digest for window in windows}
     return RolloutCalibration(
-        scenario=calibrated_scenario(scenario, results, posterior, logs=logs, reasons=reasons),
+        scenario=calibrated_scenario(scenario, results, fit.posterior(), logs=logs, reasons=reasons),
         parameters=results,
         combinations=information.combinations,
         noise=None,
-        fit=fit,
-        holdout=holdout,
+        fit=float(fit.losses.mean()),
+        holdout=fit.holdout,
         correlation=nan,
         reasons=tuple(reasons),
         remarks=(),
         information=information,
-        segments=len(at_estimate),
+        segments=len(fit.at_estimate),
         sources=tuple(dict.fromkeys(window.source for window in windows)),
         outside=outside,
         chance=chance,
-        losses=losses,
-        rollouts=scores.rollouts,
+        losses=fit.losses,
+        rollouts=rollouts,
     )
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.arrays import Array
 from vtbdrake.calibration.calibration import Calibration, Verdict, calibrate
-from vtbdrake.calibration.model import CalibrationError, Inertia, body_numbers
-from vtbdrake.calibration.posterior import physical_numbers
+from vtbdrake.calibration.joint_model import CalibrationError, Inertia, body_numbers
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.interrupt import interrupt_taken
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import MachineConfig, MachineError, MachineProcess
@@ -23,17 +23,18 @@ from vtbdrake.optimization import Parameter
 from vtbdrake.recording import Log, read_log
 from vtbdrake.state.variables import text_table
 from vtbdrake.testbed import Scenario
+from vtbdrake.testbed.inertia import physical_numbers
 
 _log = logging.getLogger(__name__)
 
 _PATIENCE = 60.0  # s
-# How far the numbers of a hidden inertia lie from those of the scenario: 0.05 is 10 % of the mass.
+# How far the numbers of a hidden inertia lie from the scenario's numbers: 0.05 is 10 % of the mass.
 _INERTIA_SPREAD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class SelfTestTrial:
-    """One hidden truth, and what the calibration made of its log.
+    """One hidden truth, and the result of calibrating its log.
 
     Attributes:
         truth: The values of the machine, by address.
@@ -71,7 +72,8 @@ class SelfTest:
         """
         results = [(trial.calibration.parameters[address], trial.truth[address]) for trial in self.trials]
         return np.array(
-            [r.lower <= truth <= r.upper for r, truth in results if r.verdict != Verdict.NOT_IDENTIFIABLE], dtype=bool
+            [r.lower <= truth <= r.upper for r, truth in results if r.verdict != Verdict.NOT_IDENTIFIABLE],
+            dtype=bool,
         )
 
     @property
@@ -114,7 +116,7 @@ def self_test(
     """Calibrate simulated machines whose numbers are known, but not to the calibration.
 
     In each trial the numbers are drawn uniformly from their ranges (delays in whole periods, as `JointDrives` has
-    them; a whole inertia near that of the scenario). A machine with these numbers, in a process of its own, is
+    them; a whole inertia near the scenario's). A machine with these numbers, in a process of its own, is
     commanded by the scenario's DPS over LCM, and the log is calibrated.
 
     Args:
@@ -162,6 +164,7 @@ def self_test(
         if not results:
             raise
         _log.warning("%s: %d of %d trials are done", str(error) or "interrupted", len(results), trials)
+        interrupt_taken()
     return SelfTest(tuple(results))
 
 

@@ -14,11 +14,12 @@ import numpy as np
 import scipy.signal
 import scipy.stats
 
-from vtbdrake.argument_checks import suggestion
-from vtbdrake.arrays import Array
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state.archive import whole_file
 from vtbdrake.state.variables import text_table
 
@@ -27,10 +28,12 @@ if TYPE_CHECKING:
 
 # The largest delay that is looked for, as a share of the recording.
 _LARGEST_DELAY = 0.25
-# The number of lags of the test of whiteness, at most, and as a share of the samples.
-_MOST_LAGS, _LAG_SHARE = 40, 0.2
-# The share of the recording that a predicted band is to cover, and below which p-value residuals are called coloured.
-BAND, WHITE = 0.95, 0.01
+# Largest number of lags of the test of whiteness.
+_MOST_LAGS = 40
+# Largest number of lags, as a share of the samples.
+_LAG_SHARE = 0.2
+# Share of the recording that a predicted band is to cover.
+BAND = 0.95
 
 
 COLUMNS = {
@@ -47,7 +50,7 @@ COLUMNS = {
 """The columns of tables: title -> field of a `SignalComparison`, and the factor to the unit of the title."""
 
 
-class Verdict(StrEnum):
+class ComparisonVerdict(StrEnum):
     """The outcome of a comparison."""
 
     WITHIN = "within tolerances"
@@ -103,7 +106,7 @@ class SignalComparison(NamedTuple):
     coverage: float
     whiteness: float
     beyond: tuple[str, ...]
-    verdict: Verdict
+    verdict: ComparisonVerdict
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -127,10 +130,13 @@ class Comparison:
     curves: Mapping[str, tuple[Array, Array, Array, Array, Array]]
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> ComparisonVerdict:
         """Return the verdict about all signals: beyond, if one is; not judged, if no signal has tolerances."""
         verdicts = {result.verdict for result in self.signals.values()}
-        return next((each for each in (Verdict.BEYOND, Verdict.WITHIN) if each in verdicts), Verdict.NOT_JUDGED)
+        return next(
+            (each for each in (ComparisonVerdict.BEYOND, ComparisonVerdict.WITHIN) if each in verdicts),
+            ComparisonVerdict.NOT_JUDGED,
+        )
 
     def __str__(self) -> str:
         rows = [[name, *result.cells, str(result.verdict)] for name, result in self.signals.items()]
@@ -139,15 +145,11 @@ class Comparison:
         return "\n".join([f"{self.source}: {self.verdict}", text_table(head, rows), *reasons])
 
     def _repr_html_(self) -> str:
-        from vtbdrake.visualization.comparisons import comparison_html
-
-        return comparison_html(self)
+        return upper_layers.comparison_html(self)
 
     def plot(self) -> Figure:
         """Return a figure with every signal and its residuals."""
-        from vtbdrake.visualization.comparisons import plot_comparison
-
-        return plot_comparison(self)
+        return upper_layers.plot_comparison(self)
 
     def save_html(self, path: str | os.PathLike[str]) -> None:
         """Write one HTML file with verdict, numbers and plots."""
@@ -165,7 +167,7 @@ def compare(
     """Compare a simulation, or several, with a recording.
 
     Every sensor signal that both have is compared at the times of the recording, between which the simulation is
-    interpolated. Of several simulations (with samples of uncertain parameters, or other seeds) the median is compared,
+    interpolated. With several simulations (samples of uncertain parameters, or other seeds) the median is compared,
     and their quantiles make the predicted band, of 95 %.
 
     Args:
@@ -251,7 +253,13 @@ def _result(
         "whiteness": whiteness(residuals),
     }
     beyond = () if tolerance is None else _beyond(numbers, tolerance)
-    verdict = Verdict.NOT_JUDGED if tolerance is None else Verdict.BEYOND if beyond else Verdict.WITHIN
+    verdict = (
+        ComparisonVerdict.NOT_JUDGED
+        if tolerance is None
+        else ComparisonVerdict.BEYOND
+        if beyond
+        else ComparisonVerdict.WITHIN
+    )
     return SignalComparison(name=name, samples=len(times), **numbers, beyond=beyond, verdict=verdict)
 
 
@@ -272,6 +280,10 @@ def sprague_geers(r: Array, s: Array) -> tuple[float, float]:
 
     Source: M. A. Sprague and T. L. Geers, "A spectral-element method for modelling cavitation in transient
     fluid-structure interaction", Int. J. Numer. Meth. Engng. 60 (2004). (NaN, NaN) if a curve is zero.
+
+    Args:
+        r: The curve that is compared with, such as the measured one.
+        s: The curve that is judged, in the same unit.
     """
     rr, ss, rs = float(r @ r), float(s @ s), float(r @ s)
     if rr == 0.0 or ss == 0.0:
@@ -284,6 +296,11 @@ def delay(times: Array, r: Array, s: Array) -> float:
 
     It is the maximum of the normalized cross-correlation, over at most a quarter of the recording, with a parabola
     through its three highest values. Curves are taken at equal distances for it.
+
+    Args:
+        times: The times of both curves, (n,), in s; increasing.
+        r: The curve that is compared with, such as the measured one.
+        s: The curve that is judged.
     """
     step = float(np.median(np.diff(times)))
     grid = np.arange(times[0], times[-1] + 0.5 * step, step)

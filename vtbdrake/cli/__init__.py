@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module, metadata
 from typing import IO, Any
 
@@ -15,7 +15,10 @@ import click
 from click.shell_completion import add_completion_class
 
 from vtbdrake.cli.completion import ColonBash
-from vtbdrake.failures import one_line
+from vtbdrake.common.failures import one_line
+from vtbdrake.common.interrupt import end_at_interrupt, end_soon_if_interrupted, is_interrupted
+from vtbdrake.common.quick_exit import quick_exit
+from vtbdrake.common.suggestions import did_you_mean
 
 __all__ = ["BAD_INPUT", "FAILED", "BadInputError", "FailedError", "json_requested", "main"]
 
@@ -23,30 +26,40 @@ BAD_INPUT = 2
 FAILED = 1
 
 # Each command is imported when it is used: `run` on a robot does not load the optimizers of `study`.
-_COMMANDS = {
-    "boundary": "problem:boundary",
-    "calibrate": "calibrate:calibrate",
-    "campaign": "campaign:campaign",
-    "completion": "completion:completion",
-    "diagram": "testbed:diagram",
-    "doctor": "doctor:doctor",
-    "export": "log:export",
-    "get": "live:get",
-    "hub": "hub:hub",
-    "machine": "machine:machine",
-    "new": "new:new",
-    "open": "open:open_",
-    "replay": "log:replay",
-    "reset": "live:reset",
-    "rollout": "testbed:rollout",
-    "run": "run:run",
-    "set": "live:set_",
-    "study": "study:study",
-    "sweep": "problem:sweep",
-    "variables": "testbed:variables",
-    "view": "view:view",
-    "watch": "live:watch",
+_GROUPS = {
+    "Look": {
+        "examples": "examples:examples",
+        "view": "view:view",
+        "open": "open:open_",
+        "variables": "testbed:variables",
+        "rollout": "testbed:rollout",
+        "diagram": "testbed:diagram",
+    },
+    "Optimize": {
+        "sweep": "problem:sweep",
+        "boundary": "problem:boundary",
+        "study": "study:study",
+        "campaign": "campaign:campaign",
+        "calibrate": "calibrate:calibrate",
+    },
+    "Machine": {
+        "run": "run:run",
+        "machine": "machine:machine",
+        "hub": "hub:hub",
+        "get": "live:get",
+        "set": "live:set_",
+        "watch": "live:watch",
+        "reset": "live:reset",
+        "replay": "log:replay",
+        "export": "log:export",
+    },
+    "Project": {
+        "new": "new:new",
+        "doctor": "doctor:doctor",
+        "completion": "completion:completion",
+    },
 }
+_COMMANDS = {name: place for group in _GROUPS.values() for name, place in group.items()}
 
 # All errors of vtbdrake about bad input are ValueErrors. A missing extra is a ModuleNotFoundError that names it.
 _EXPECTED = (ValueError, OSError, ModuleNotFoundError)
@@ -95,6 +108,20 @@ class FailedError(_Error):
 class _Commands(click.Group):
     """A group that reports every expected error as one line ``Error: ...``, with exit code 2 or 1."""
 
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Be the program, which one Ctrl-C ends in any state."""
+        with suppress(ImportError):  # `doctor` says that the compiled modules are missing.
+            end_at_interrupt(FAILED)
+        try:
+            return super().__call__(*args, **kwargs)
+        except SystemExit as end:
+            end_soon_if_interrupted()
+            if not args and isinstance(end.code, int):
+                quick_exit(end.code)
+            raise
+        finally:
+            end_soon_if_interrupted()
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(_COMMANDS)
 
@@ -104,6 +131,24 @@ class _Commands(click.Group):
         module, _, function = _COMMANDS[name].partition(":")
         command: click.Command = getattr(import_module(f"vtbdrake.cli.{module}"), function)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in _COMMANDS and not ctx.resilient_parsing:
+            near = did_you_mean(args[0], _COMMANDS) or f"; the commands are {', '.join(sorted(_COMMANDS))}"
+            raise click.UsageError(f"No such command {args[0]!r}{near}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands of each group below its heading, with whole summaries."""
+        widest = max(map(len, _COMMANDS))
+        for heading, names in _GROUPS.items():
+            with formatter.section(heading):
+                summaries = [(name, self.get_command(ctx, name)) for name in names]
+                formatter.write_dl(
+                    [(f"{name:{widest}}", command.get_short_help_str(200)) for name, command in summaries if command]
+                )
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         # Looked for here, because an error in the options comes before their values are known.
@@ -121,7 +166,8 @@ class _Commands(click.Group):
 def _reported(ctx: click.Context) -> Iterator[None]:
     """Turn every expected error into a `BadInputError` or `FailedError`."""
     try:
-        yield
+        with _interruption_first():
+            yield
     except click.exceptions.NoArgsIsHelpError:
         raise
     except (KeyboardInterrupt, click.Abort) as error:
@@ -136,10 +182,26 @@ def _reported(ctx: click.Context) -> Iterator[None]:
             raise
         raise BadInputError(one_line(error)) from error
     except RuntimeError as error:
-        # Of vtbdrake's own classes, it is about what was tried and failed.
+        # An error of vtbdrake's own classes says what was tried and failed.
         if ctx.params.get("traceback") or not type(error).__module__.startswith("vtbdrake."):
             raise
         raise FailedError(one_line(error)) from error
+
+
+@contextmanager
+def _interruption_first() -> Iterator[None]:
+    """Raise Abort where code has turned a KeyboardInterrupt into another error, such as an extension's ImportError.
+
+    What a command itself says at its end is not replaced: that the fallbacks took over, before Ctrl-C.
+    """
+    try:
+        yield
+    except (click.exceptions.Exit, FailedError):
+        raise
+    except Exception as error:
+        if is_interrupted():
+            raise click.Abort from error
+        raise
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, is_requested: bool) -> None:
@@ -159,12 +221,13 @@ def _print_version(ctx: click.Context, _: click.Parameter, is_requested: bool) -
 def main(traceback: bool) -> None:
     """Virtual testbeds on Drake: look at one, simulate it, optimize it, run its controller on a machine.
 
-    A SCENARIO is package.module:Class, or package.module:Class@FILE with its fields in a YAML file. Modules are looked
-    for in the current directory last.
+    A SCENARIO is a name that `vtbdrake examples` lists, package.module:Class or file.py:Class; with @FILE behind it,
+    its fields come from a YAML file. Modules are looked for in the current directory last.
 
     \b
     Example:
-      vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match mass
+      vtbdrake view cart_pole
+      vtbdrake variables space_climber --match mass
     """
     logging.getLogger("drake").setLevel(logging.WARNING)
     # Last, so that a file in the current directory cannot take the place of an installed module.

@@ -45,12 +45,12 @@ if TYPE_CHECKING:
 @option("--torque SIGNAL", "The actuator signal of the joint torques.", required=True)
 @option("--measured-torque", "The torques were measured in the drives, they are no commands.", is_flag=True)
 @option("--period S", "Compare positions only about every S seconds.", type=float)
-@option("--position-columns COLUMNS", "Of a table: the columns of the positions, COLUMN[,COLUMN...].", default="")
-@option("--torque-columns COLUMNS", "Of a table: the columns of the torques.", default="")
-@option("--time COLUMN", "Of a table: the column of the times.", default="time")
+@option("--position-columns COLUMNS", "Columns of the positions in a table, COLUMN[,COLUMN...].", default="")
+@option("--torque-columns COLUMNS", "Columns of the torques in a table.", default="")
+@option("--time COLUMN", "Column of the times in a table.", default="time")
 @option(
     "--unit NAME=UNIT",
-    "Of a table: the unit of a signal or of the times, if it is none of SI. May be repeated.",
+    "Unit of a signal or of the times in a table, if it is none of SI. May be repeated.",
     name="units",
     parse=partial(assignment, form="NAME=UNIT"),
     multiple=True,
@@ -60,20 +60,20 @@ if TYPE_CHECKING:
 @option("--self-test", "Calibrate simulated machines whose numbers are hidden, instead of LOGS.", is_flag=True)
 @option(
     "--set ADDRESS=VALUE",
-    "Of the self-test: set a variable of the DPS at the start, such as its plan. May be repeated.",
+    "Self-test: set a variable of the DPS at the start, such as its plan. May be repeated.",
     name="values",
     parse=parse_setting,
     multiple=True,
 )
-@option("--trials N", "Of the self-test: the number of machines.", type=click.IntRange(min=1), default=10)
-@option("--seconds S", "Of the self-test: the duration of each log.", type=click.FloatRange(0.1), default=10.0)
+@option("--trials N", "Self-test: number of machines.", type=click.IntRange(min=1), default=10)
+@option("--seconds S", "Self-test: duration of each log.", type=click.FloatRange(0.1), default=10.0)
 @option(
     "--disturbance TORQUE",
-    "Of the self-test: standard deviation of a torque that no log contains, in N m.",
+    "Self-test: standard deviation of a torque that no log contains, in N m.",
     type=click.FloatRange(0.0),
     default=0.0,
 )
-@option("--seed N", "Of the self-test: the seed of truths and disturbances.", type=click.IntRange(min=0), default=0)
+@option("--seed N", "Self-test: seed of truths and disturbances.", type=click.IntRange(min=0), default=0)
 def calibrate(
     scenario: Scenario,
     logs: tuple[Path, ...],
@@ -102,10 +102,10 @@ def calibrate(
 
     \b
     Example:
-      vtbdrake calibrate vtbdrake_diagrams.double_pendulum:DoublePendulumScenario swing.csv \\
+      vtbdrake calibrate double_pendulum swing.csv \\
         --position joint_position --position-columns q1,q2 --torque torque --torque-columns tau1,tau2 \\
         --vary sim.sys.pendulum.lower.mass=0.1:2 --vary sim.act.drives.coulomb[0]=0:1 --save pendulum.yaml
-      vtbdrake calibrate vtbdrake_diagrams.manipulator:ManipulatorScenario --self-test --position joint_position \\
+      vtbdrake calibrate manipulator --self-test --position joint_position \\
         --torque joint_torque --vary sim.sys.arm.tool.mass=0.2:2
     """
     if bool(logs) == self_test:

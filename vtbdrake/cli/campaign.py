@@ -15,17 +15,20 @@ from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import grouped, option, schema_option
 from vtbdrake.cli.output import emit, json_option, number, save_recording, say, table, write_whole
 from vtbdrake.cli.problem import executor_options, on_error_option
-from vtbdrake.failures import one_line
+from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-    from vtbdrake.testing.campaign import Campaign, Rerun
-    from vtbdrake.testing.campaign_report import Evidence
-    from vtbdrake.testing.campaign_results import CampaignResult, CampaignRollout, Cell, Comparison
+    from vtbdrake.campaigns.campaign import Campaign, Rerun
+    from vtbdrake.campaigns.report import Evidence
+    from vtbdrake.campaigns.results import CampaignResult, CampaignRollout, Cell, PairedComparison
 
-STUDY, PAGE, JUNIT, RESULTS = "study.db", "index.html", "junit.xml", "results.json"
-"""The files in the folder of a campaign."""
+# The files in the folder of a campaign.
+STUDY = "study.db"
+PAGE = "index.html"
+JUNIT = "junit.xml"
+RESULTS = "results.json"
 _MOST_EVIDENCE = 20
 """The number of failed rollouts that are run again for their logs and animations, at most."""
 
@@ -38,7 +41,7 @@ def _parse_rollout(text: str) -> tuple[str, int]:
 
 
 def _schema() -> dict[str, Any]:
-    from vtbdrake.testing.campaign import Campaign
+    from vtbdrake.campaigns.campaign import Campaign
 
     return Campaign.schema()
 
@@ -87,9 +90,9 @@ def campaign(
     Example:
       vtbdrake campaign walking.yaml --workers 4 --against baseline.yaml
     """
-    from vtbdrake.testing.campaign import Campaign
-    from vtbdrake.testing.campaign_report import html_page, junit_xml
-    from vtbdrake.testing.campaign_results import MET
+    from vtbdrake.campaigns.campaign import Campaign
+    from vtbdrake.campaigns.report import html_page, junit_xml
+    from vtbdrake.campaigns.results import MET
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     stated = Campaign.load(file)
@@ -126,7 +129,7 @@ def _command(file: Path, folder: Path, name: str) -> str:
 
 
 def _baseline(stated: Campaign, against: Path, running: dict[str, Any]) -> CampaignResult:
-    from vtbdrake.testing.campaign import Campaign
+    from vtbdrake.campaigns.campaign import Campaign
 
     if against.suffix not in (".yaml", ".yml"):
         return stated.baseline(against)
@@ -142,9 +145,9 @@ def _gather_evidence(
     result: CampaignResult, folder: Path, *, executor: str, time_limit: float | None, **_: Any
 ) -> dict[str, Evidence]:
     """Run the first failure of each cell again; write log and animation."""
+    from vtbdrake.campaigns.report import failed_cells
+    from vtbdrake.campaigns.results import ERROR, FAIL
     from vtbdrake.optimization.sweep import borrowed
-    from vtbdrake.testing.campaign_report import failed_cells
-    from vtbdrake.testing.campaign_results import ERROR, FAIL
 
     firsts = {cell.having(FAIL, ERROR)[0].name: cell.having(FAIL, ERROR)[0] for cell in failed_cells(result)}
     kept: dict[str, Evidence] = {}
@@ -169,7 +172,7 @@ def _meshcat() -> Meshcat:
 
 def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: Path) -> Evidence:
     """Write log and animation of a rollout that was run again, and return what there is of it."""
-    from vtbdrake.testing.campaign_report import Evidence
+    from vtbdrake.campaigns.report import Evidence
 
     index = stated.rollout_names.index((rollout.condition, rollout.seed))
     stem = f"{index}-{re.sub(r'[^A-Za-z0-9_.-]', '_', rollout.condition)}-{rollout.seed}"
@@ -192,8 +195,8 @@ def _written(stated: Campaign, rollout: CampaignRollout, rerun: Rerun, folder: P
 
 
 def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
-    from vtbdrake.testing.campaign_report import limits_text, reason
-    from vtbdrake.testing.campaign_results import ERROR, FAIL, Cell
+    from vtbdrake.campaigns.report import limits_text, reason
+    from vtbdrake.campaigns.results import ERROR, FAIL, Cell
 
     rerun = stated.run_again(*name)
     folder.mkdir(parents=True, exist_ok=True)
@@ -219,9 +222,9 @@ def _run_alone(stated: Campaign, name: tuple[str, int], folder: Path) -> None:
         raise FailedError(f"{rerun.rollout.name} does not pass {wrong} of {len(stated.criteria)} criteria")
 
 
-def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[Comparison], folder: Path) -> None:
-    from vtbdrake.testing.campaign_report import failed_cells, passed_text, reason, warning
-    from vtbdrake.testing.campaign_results import ALL, COMPARED, ERROR, FAIL
+def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[PairedComparison], folder: Path) -> None:
+    from vtbdrake.campaigns.report import failed_cells, passed_text, reason, warning
+    from vtbdrake.campaigns.results import ALL, COMPARED, ERROR, FAIL
 
     criteria = list(result.campaign.criteria)
     rows = []
@@ -240,8 +243,8 @@ def _print(result: CampaignResult, commands: dict[str, str], comparisons: list[C
 
 
 def _with_verdict(cell: Cell) -> str:
-    from vtbdrake.testing.campaign_report import cell_text
-    from vtbdrake.testing.campaign_results import MET
+    from vtbdrake.campaigns.report import cell_text
+    from vtbdrake.campaigns.results import MET
 
     mark = f" {cell.verdict}" if cell.is_judged and cell.verdict != MET else ""
     return cell_text(cell) + mark

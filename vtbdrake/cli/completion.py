@@ -14,6 +14,8 @@ from pathlib import Path
 import click
 from click.shell_completion import BashComplete, CompletionItem, get_completion_class, split_arg_string
 
+from vtbdrake.common.scenario_names import named_scenarios
+
 _CLASS = re.compile(r"^class (\w+)\(.*Scenario\b.*\):", re.MULTILINE)
 # The largest number of modules that are read for names of scenarios.
 _MOST_MODULES = 500
@@ -21,9 +23,14 @@ _TESTBEDS = "vtbdrake_diagrams"
 
 
 def complete_scenario(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the scenarios ``MODULE:CLASS`` of this folder and of `vtbdrake_diagrams`, and files behind an ``@``.
+    """Return short names, ``MODULE:CLASS`` of this folder and of `vtbdrake_diagrams`, and files behind an ``@``.
 
     Modules are read as text and not imported: a scenario is a class that names a base with "Scenario" in it.
+
+    Args:
+        ctx: The command line so far; not used.
+        parameter: The argument that is completed; not used.
+        incomplete: The text before the cursor.
     """
     name, at, file = incomplete.partition("@")
     if at:
@@ -31,17 +38,30 @@ def complete_scenario(ctx: click.Context, parameter: click.Parameter, incomplete
         paths = [path for path in folder.glob("*") if path.is_dir() or path.suffix in (".yaml", ".yml")]
         names = [f"{name}@{path}{'/' * path.is_dir()}" for path in sorted(paths)]
     else:
-        names = sorted({*_scenarios(Path.cwd(), ""), *_scenarios_of(_TESTBEDS)})
+        short_names = {named.name for named in named_scenarios()}
+        names = sorted(short_names) + sorted({*_scenarios(Path.cwd(), ""), *_scenarios_of(_TESTBEDS)})
     return [CompletionItem(name) for name in names if name.startswith(incomplete)]
 
 
 def complete_file(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Let the shell complete the name of a file."""
+    """Let the shell complete the name of a file.
+
+    Args:
+        ctx: The command line so far; not used.
+        parameter: The argument that is completed; not used.
+        incomplete: The text before the cursor.
+    """
     return [CompletionItem(incomplete, type="file")]
 
 
 def complete_scenario_or_file(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the scenarios, and the YAML files of a folder."""
+    """Return the scenarios, and the YAML files of a folder.
+
+    Args:
+        ctx: The command line so far; not used.
+        parameter: The argument that is completed; not used.
+        incomplete: The text before the cursor.
+    """
     if ":" in incomplete:
         return complete_scenario(ctx, parameter, incomplete)
     folder = Path(incomplete).parent
@@ -51,7 +71,13 @@ def complete_scenario_or_file(ctx: click.Context, parameter: click.Parameter, in
 
 
 def complete_parameter(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the addresses of the parameters of the study in the argument ``file``."""
+    """Return the addresses of the parameters of the study in the argument ``file``.
+
+    Args:
+        ctx: The command line so far, with the file of the study.
+        parameter: The argument that is completed; not used.
+        incomplete: The text before the cursor.
+    """
     file = Path(str(ctx.params.get("file", "")))
     try:
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as study:
@@ -69,7 +95,7 @@ def _scenarios_of(package: str) -> Iterator[str]:
 
 
 def _scenarios(folder: Path, prefix: str) -> Iterator[str]:
-    """Yield the scenarios of the modules and packages in a folder, those of a package by the shortest name."""
+    """Yield the scenarios of the modules and packages in a folder, each by the shortest name of its package."""
     for count, path in enumerate(_modules(folder)):
         if count >= _MOST_MODULES:
             return
@@ -126,7 +152,7 @@ complete -o nosort -F %(complete_func)s %(prog_name)s
         return words, words.pop() if words and not line[-1].isspace() else ""
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return what replaces the part of the word that bash takes for the whole."""
+        """Return the text that replaces the part of the word that bash takes for the whole."""
         _, incomplete = self.get_completion_args()
         begun = max(incomplete.rfind(sign) for sign in ":=@") + 1
         return f"{item.type},{item.value[begun:]}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import shlex
 import shutil
 import socket
 import statistics
@@ -23,10 +24,12 @@ import click
 from vtbdrake.cli import FAILED
 from vtbdrake.cli.options import option
 from vtbdrake.cli.output import json_option, show
-from vtbdrake.drake_version import TESTED_DRAKE
-from vtbdrake.failures import one_line
+from vtbdrake.common.drake_version import TESTED_DRAKE
+from vtbdrake.common.failures import one_line
 
-OK, WARNING, FAILURE = "ok", "warning", "failure"
+OK = "ok"
+WARNING = "warning"
+FAILURE = "failure"
 
 NETWORK_FILE_SYSTEMS = {
     "9p", "afs", "beegfs", "ceph", "cifs", "fuse.glusterfs", "fuse.sshfs", "gpfs", "lustre", "ncpfs", "nfs", "nfs4",
@@ -41,96 +44,106 @@ _TIMEOUT = 0.5  # s
 
 
 @dataclass(frozen=True)
-class Result:
-    """The result of one check."""
+class Diagnosis:
+    """The result of one check.
+
+    Attributes:
+        check: The name of the check.
+        status: OK, WARNING: something is slower or missing; FAILURE: nothing works.
+        message: What was found, in a sentence.
+        remedy: What to do; empty if OK.
+    """
 
     check: str
-    status: str  # OK, WARNING: something is slower or missing; FAILURE: nothing works
+    status: str
     message: str
-    remedy: str = ""  # what to do; empty if OK
+    remedy: str = ""
 
     def __str__(self) -> str:
         line = f"{self.status:8} {self.check:12} {self.message}"
         return f"{line}\n{'':22}-> {self.remedy}" if self.remedy else line
 
 
-def _python() -> Iterator[Result]:
-    yield Result("python", OK, f"{platform.python_version()} with numpy {metadata.version('numpy')}, {sys.executable}")
+def _python() -> Iterator[Diagnosis]:
+    yield Diagnosis(
+        "python", OK, f"{platform.python_version()} with numpy {metadata.version('numpy')}, {sys.executable}"
+    )
 
 
-def _vtbdrake() -> Iterator[Result]:
+def _vtbdrake() -> Iterator[Diagnosis]:
     try:
         version = metadata.version("vtbdrake")
     except metadata.PackageNotFoundError:
         version = "not installed but run from its folder"
     try:
-        import_module("vtbdrake.spline_kernel")
+        import_module("vtbdrake.common.spline_kernel")
     except ImportError as error:
         remedy = "install it again with a C compiler (pip install .), or run make in its folder"
-        yield Result("vtbdrake", FAILURE, f"{version}, without its compiled modules: {one_line(error)}", remedy)
+        yield Diagnosis("vtbdrake", FAILURE, f"{version}, without its compiled modules: {one_line(error)}", remedy)
     else:
-        yield Result("vtbdrake", OK, version)
+        yield Diagnosis("vtbdrake", OK, version)
 
 
-def _drake() -> Iterator[Result]:
+def _drake() -> Iterator[Diagnosis]:
     try:
         import_module("pydrake.systems.framework")
         version = metadata.version("drake")
     except (ImportError, metadata.PackageNotFoundError) as error:
         remedy = "pip install drake; on Debian also apt-get install libglib2.0-0"
-        yield Result("drake", FAILURE, f"it cannot be imported: {one_line(error)}", remedy)
+        yield Diagnosis("drake", FAILURE, f"it cannot be imported: {one_line(error)}", remedy)
         return
     if version in TESTED_DRAKE:
-        yield Result("drake", OK, version)
+        yield Diagnosis("drake", OK, version)
     else:
         remedy = f"if something fails, pip install drake=={TESTED_DRAKE[-1]} ({TESTED_DRAKE[0]} for Python 3.11)"
-        yield Result("drake", WARNING, f"{version} is untested; tested are {' and '.join(TESTED_DRAKE)}", remedy)
+        yield Diagnosis("drake", WARNING, f"{version} is untested; tested are {' and '.join(TESTED_DRAKE)}", remedy)
 
 
-def _compiler() -> Iterator[Result]:
-    from vtbdrake.components.casadi_system.compiler import CompilerError, compile_library
+def _compiler() -> Iterator[Diagnosis]:
+    from vtbdrake.components.casadi_system.compiler import CompilerError, compile_library, compiler_command
 
     begin = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as folder:
             compile_library("int doctor(void) { return 0; }\n", Path(folder) / "doctor.so")
     except CompilerError as error:
-        remedy = "install a C compiler (on Debian: apt-get install gcc libc6-dev), or name yours in CC"
-        yield Result("compiler", WARNING, f"functions in CasADi are interpreted: {one_line(error)}", remedy)
+        remedy = "install a C compiler (on Debian: apt-get install gcc libc6-dev; or pip install ziglang), or set CC"
+        yield Diagnosis("compiler", WARNING, f"functions in CasADi are interpreted: {one_line(error)}", remedy)
     else:
-        yield Result("compiler", OK, f"{os.environ.get('CC') or 'cc'} compiles in {time.perf_counter() - begin:.2f} s")
+        command = shlex.join(compiler_command())
+        yield Diagnosis("compiler", OK, f"{command} compiles in {time.perf_counter() - begin:.2f} s")
 
 
-def _rendering() -> Iterator[Result]:
+def _rendering() -> Iterator[Diagnosis]:
     from vtbdrake.components.rendering import RenderingError, measure_rendering
 
     try:
         speed = measure_rendering()
     except RenderingError as error:
         reason, _, remedy = str(error).partition(": ")
-        yield Result("rendering", WARNING, reason, remedy)
+        yield Diagnosis("rendering", WARNING, reason, remedy)
         return
     place = "on the processor" if speed.in_software else "on the graphics card"
-    yield Result(
+    yield Diagnosis(
         "rendering",
         OK,
         f"EGL by {speed.renderer}, {place}: {speed.images_per_second:.0f} images of 640 x 480 pixels per second",
     )
 
 
-def _real_time() -> Iterator[Result]:
+def _real_time() -> Iterator[Diagnosis]:
     from vtbdrake.control.realtime import RealTime
 
     with RealTime() as real_time:
         grants = real_time.grants
     if granted := [grant.request for grant in grants if grant.granted]:
-        yield Result("real-time", OK, f"granted: {', '.join(granted)}")
+        yield Diagnosis("real-time", OK, f"granted: {', '.join(granted)}")
     for grant in grants:
         if not grant.granted:
-            yield Result("real-time", WARNING, f"{grant.request} is refused ({grant.reason})", grant.remedy)
+            yield Diagnosis("real-time", WARNING, f"{grant.request} is refused ({grant.reason})", grant.remedy)
 
 
-def _hub() -> Iterator[Result]:
+def _hub() -> Iterator[Diagnosis]:
     from vtbdrake.lcm.connections import LcmLink
     from vtbdrake.lcm.hub import Hub
 
@@ -145,17 +158,17 @@ def _hub() -> Iterator[Result]:
                 round_trips.append(time.perf_counter() - begin)
     except (OSError, RuntimeError) as error:
         remedy = "let this user listen and connect on 127.0.0.1 (firewall, sandbox, container)"
-        yield Result("lcm-hub", FAILURE, f"no messages over a hub on loopback: {one_line(error)}", remedy)
+        yield Diagnosis("lcm-hub", FAILURE, f"no messages over a hub on loopback: {one_line(error)}", remedy)
     else:
         microseconds = 1e6 * statistics.median(round_trips)
-        yield Result("lcm-hub", OK, f"round trip over a hub on loopback: {microseconds:.0f} us (median)")
+        yield Diagnosis("lcm-hub", OK, f"round trip over a hub on loopback: {microseconds:.0f} us (median)")
 
 
 def _ignore(channel: str, data: bytes) -> None:
     pass
 
 
-def _multicast() -> Iterator[Result]:
+def _multicast() -> Iterator[Diagnosis]:
     try:
         _send_multicast()
     except OSError as error:
@@ -163,9 +176,9 @@ def _multicast() -> Iterator[Result]:
             "use a hub (vtbdrake hub, tcpq://127.0.0.1:7700); or, for udpm:// on this computer, ip link set lo "
             "multicast on, ip route add 224.0.0.0/4 dev lo"
         )
-        yield Result("multicast", WARNING, f"udpm:// does not work: {one_line(error)}", remedy)
+        yield Diagnosis("multicast", WARNING, f"udpm:// does not work: {one_line(error)}", remedy)
     else:
-        yield Result("multicast", OK, "udpm:// works on this computer; other computers were not tried")
+        yield Diagnosis("multicast", OK, "udpm:// works on this computer; other computers were not tried")
 
 
 def _send_multicast() -> None:
@@ -183,7 +196,7 @@ def _send_multicast() -> None:
         receiver.recv(64)
 
 
-def _cores() -> Iterator[Result]:
+def _cores() -> Iterator[Diagnosis]:
     usable = float(len(os.sched_getaffinity(0)))
     if (quota := _processor_quota()) is not None:
         usable = min(usable, quota)
@@ -191,15 +204,15 @@ def _cores() -> Iterator[Result]:
     message = f"{usable:g} of {os.cpu_count()} usable, load average {load:.1f}"
     if usable < 2:
         remedy = "give the computer or container two or more: loop, hub and machine compete for one"
-        yield Result("cores", WARNING, message, remedy)
+        yield Diagnosis("cores", WARNING, message, remedy)
     elif load > usable:
-        yield Result("cores", WARNING, message, "end other programs before you measure times or control a machine")
+        yield Diagnosis("cores", WARNING, message, "end other programs before you measure times or control a machine")
     else:
-        yield Result("cores", OK, message)
+        yield Diagnosis("cores", OK, message)
 
 
 def _processor_quota() -> float | None:
-    """Return how many processors the control group of this process may use; None without a limit."""
+    """Return the number of processors that the control group of this process may use; None without a limit."""
     try:
         group = Path("/proc/self/cgroup").read_text(encoding="utf-8").rpartition("0::")[2].strip()
         quota, period = Path(f"/sys/fs/cgroup{group}/cpu.max").read_text(encoding="utf-8").split()
@@ -208,7 +221,7 @@ def _processor_quota() -> float | None:
     return None if quota == "max" else int(quota) / int(period)
 
 
-def _file_systems() -> Iterator[Result]:
+def _file_systems() -> Iterator[Diagnosis]:
     from vtbdrake.components.casadi_system.compiler import cache_folder
 
     folders = {"here": Path.cwd(), "temporary": Path(tempfile.gettempdir()), "cache": cache_folder()}
@@ -224,14 +237,14 @@ def _file_systems() -> Iterator[Result]:
                 "temporary": "name a folder of yours in TMPDIR",
                 "cache": "name a folder of yours in XDG_CACHE_HOME",
             }[use]
-            yield Result("files", WARNING, f"{message}, not writable", remedy)
+            yield Diagnosis("files", WARNING, f"{message}, not writable", remedy)
         elif free < _LEAST_SPACE:
-            yield Result("files", WARNING, message, f"free {_LEAST_SPACE} GiB: logs grow by about 1 MB per second")
+            yield Diagnosis("files", WARNING, message, f"free {_LEAST_SPACE} GiB: logs grow by about 1 MB per second")
         elif kind in NETWORK_FILE_SYSTEMS and use == "here":
             remedy = "keep study files on a local disk: the write-ahead log of SQLite needs shared memory"
-            yield Result("files", WARNING, f"{message}, a network file system", remedy)
+            yield Diagnosis("files", WARNING, f"{message}, a network file system", remedy)
         else:
-            yield Result("files", OK, message)
+            yield Diagnosis("files", OK, message)
 
 
 def file_system_type(path: Path, mounts: str | None = None) -> str:
@@ -248,13 +261,13 @@ def file_system_type(path: Path, mounts: str | None = None) -> str:
         mount, _, source = line.partition(" - ")
         # Blanks in names are written in octal.
         point = Path(re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), mount.split()[4]))
-        # Of mounts at one place, the last one counts.
+        # The last one of several mounts at one place counts.
         if path.is_relative_to(point) and len(point.parts) >= best:
             best, kind = len(point.parts), source.split()[0]
     return kind
 
 
-CHECKS: dict[str, Callable[[], Iterator[Result]]] = {
+CHECKS: dict[str, Callable[[], Iterator[Diagnosis]]] = {
     "python": _python,
     "vtbdrake": _vtbdrake,
     "drake": _drake,
@@ -269,16 +282,18 @@ CHECKS: dict[str, Callable[[], Iterator[Result]]] = {
 """The checks by name, in the order of the output."""
 
 
-def _run(name: str) -> list[Result]:
+def _run(name: str) -> list[Diagnosis]:
     try:
         return list(CHECKS[name]())
     except Exception as error:  # Whatever is wrong with this computer: the remaining checks go on.
         return [
-            Result(name, FAILURE, f"{type(error).__name__}: {one_line(error)}", "an unforeseen error: please report it")
+            Diagnosis(
+                name, FAILURE, f"{type(error).__name__}: {one_line(error)}", "an unforeseen error: please report it"
+            )
         ]
 
 
-def diagnose() -> list[Result]:
+def diagnose() -> list[Diagnosis]:
     """Run all checks, which takes a few seconds, and return their results."""
     results = {"real-time": _run("real-time")}  # in the main thread, alone
     with ThreadPoolExecutor(1) as executor:  # The renderer starts in a process of its own.

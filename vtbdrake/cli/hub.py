@@ -10,8 +10,8 @@ import click
 from vtbdrake.cli.completion import complete_scenario
 from vtbdrake.cli.options import config_option, converted, option, parse_scenario
 from vtbdrake.cli.output import json_option, show
+from vtbdrake.common.interrupt import ends_by_itself
 from vtbdrake.lcm.hub import HubConfig, HubServer, serve
-from vtbdrake.monitoring.live.messages import RESET, SET
 
 if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
@@ -62,15 +62,15 @@ _SIZES = ("max_message", "max_queue", "max_memory")  # MiB on the command line
 def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, **fields: Any) -> None:
     """Relay LCM messages over TCP, for networks without multicast.
 
-    It runs until Ctrl-C. Only one client at a time may publish on the channels of the actuator commands of SCENARIO, on
-    VTB_SET and on VTB_RESET. LCM has no authentication: on loopback only this user and root may connect, beyond it
-    every machine that reaches the address.
+    It runs until Ctrl-C. Only one client at a time may publish on the channels of the actuator commands of SCENARIO.
+    LCM has no authentication: on loopback only this user and root may connect, beyond it every machine that reaches the
+    address.
 
     Prints the URL for clients, and publishes statistics as JSON on VTB_HUB.
 
     \b
     Example:
-      vtbdrake hub vtbdrake_diagrams.manipulator:ManipulatorScenario
+      vtbdrake hub manipulator
       vtbdrake hub --protect IIWA_COMMAND
     """
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
@@ -79,7 +79,7 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
         from vtbdrake.lcm.protocol import protocol_of
 
         channels = tuple(map.channel for map in protocol_of(scenario).act)
-    defaults = () if unprotected else (*channels, SET, RESET)
+    defaults = () if unprotected else channels
     sizes = {name: fields.pop(name) * _MEBIBYTE for name in _SIZES}
     config = HubConfig(protect=tuple(dict.fromkeys((*protect, *defaults))), **sizes, **fields)
     server = HubServer(config)
@@ -88,8 +88,8 @@ def hub(scenario: Scenario | None, protect: tuple[str, ...], unprotected: bool, 
             "no channel of actuator commands is protected: give a SCENARIO, --protect CHANNEL, or --unprotected"
         )
     _log.info("protected channels: %s", ", ".join(config.protect) or "none")
-    show(server.url, {"url": server.url})
-    serve(server)
+    ends_by_itself()
+    serve(server, ready=lambda: show(server.url, {"url": server.url}))
     statistics = server.statistics()
     show(
         f"{statistics.messages} messages relayed, {statistics.refused} rejected, "

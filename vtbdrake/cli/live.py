@@ -11,8 +11,9 @@ import click
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import Setting, converted, option, parse_setting, settings, timeout_option, url_option
-from vtbdrake.cli.output import emit, json_option, plain, say, show
-from vtbdrake.failures import one_line
+from vtbdrake.cli.output import emit, json_option, say, show
+from vtbdrake.common.failures import one_line
+from vtbdrake.common.json_data import plain
 
 _addresses = click.argument("addresses", nargs=-1, required=True, metavar="ADDRESS...")
 

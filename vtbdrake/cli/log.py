@@ -9,9 +9,9 @@ import click
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.completion import complete_file, complete_scenario
-from vtbdrake.cli.options import Setting, converted, option, output, set_option, settings
+from vtbdrake.cli.options import Setting, converted, import_option, option, output, set_option, settings
 from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
-from vtbdrake.failures import one_line
+from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
     from vtbdrake.recording import ControlLog
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 def opened_log(log: Path, scenario: str | None) -> ControlLog:
     """Return a log whose scenario the user has named, since importing it runs its code.
+
+    Args:
+        log: The file of the log.
+        scenario: The scenario that the user has named, a short name or ``MODULE:CLASS``; None if none was named.
 
     Raises:
         click.UsageError: The scenario is another one, or was not named.
@@ -52,6 +56,7 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
     "The scenario of the log, whose fields are in the log. Its code runs, so the user has to name it.",
     shell_complete=complete_scenario,
 )
+@import_option
 @option(
     "--on",
     "Replay the recorded system: the DPS alone, or the whole testbed.",
@@ -74,10 +79,11 @@ def replay(
 
     \b
     Example:
-      vtbdrake replay run.lcm --scenario vtbdrake_diagrams.manipulator:ManipulatorScenario
+      vtbdrake replay run.lcm --scenario manipulator
     """
     from vtbdrake.recording.replay import DIFFERENT
     from vtbdrake.recording.replay import replay as replay_log
+    from vtbdrake.state.archive import PRIVATE
     from vtbdrake.testbed import DpsAlone
 
     if bool(record) != bool(out):
@@ -86,7 +92,7 @@ def replay(
     target = None if on == "recorded" else DpsAlone(opened.scenario) if on == "dps" else opened.scenario.build()
     report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:
-        save_recording(out, report.times, report.record)
+        save_recording(out, report.times, report.record, mode=PRIVATE)
     described: dict[str, Any] = {name: getattr(report, name) for name in ("outcome", "cycles", "digests", "ended")}
     described |= {"first_difference": report.first_difference, "max_difference": report.max_difference}
     described |= {"errors": report.errors, "versions": report.versions}

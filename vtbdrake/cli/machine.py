@@ -19,6 +19,7 @@ from vtbdrake.cli.options import (
     url_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show
+from vtbdrake.common.interrupt import ends_by_itself
 from vtbdrake.machine.config import BRAKES, MachineConfig
 
 if TYPE_CHECKING:
@@ -96,11 +97,11 @@ def machine(
 
     \b
     Example:
-      vtbdrake machine vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 \\
+      vtbdrake machine manipulator --url tcpq://127.0.0.1:7700 \\
           --perturb 0.05 --seed 3
     """
     from vtbdrake.machine import Machine, MachineLoop
-    from vtbdrake.machine.loop import epoch, serve
+    from vtbdrake.machine.machine_loop import epoch, serve
 
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     config = MachineConfig(
@@ -116,6 +117,7 @@ def machine(
     for address, value in simulated.perturbed.items():
         say(f"{address} = {value}")
     loop = MachineLoop(simulated, url)
+    ends_by_itself()
     serve(
         loop,
         lock_step=lock_step,

@@ -50,7 +50,7 @@ def open_(snapshot: Snapshot, scenario: Scenario | None, out: Path | None, page:
         from vtbdrake.web import view
 
         with view(scenario, start=snapshot, **page) as running:
-            serve(running.url, browser=browser)
+            serve(running, browser=browser)
     else:
         _write(scenario, snapshot, out)
         show(f"Wrote {out}.", {"output": str(out), "time": snapshot.time, "scenario": scenario.name()})
@@ -58,8 +58,8 @@ def open_(snapshot: Snapshot, scenario: Scenario | None, out: Path | None, page:
 
 def _write(scenario: Scenario, snapshot: Snapshot, out: Path) -> None:
     from vtbdrake.visualization import Scene, make_meshcat
-    from vtbdrake.visualization.camera import camera_of
     from vtbdrake.visualization.drawing import Drawing
+    from vtbdrake.visualization.viewpoint import camera_of
 
     testbed, camera = scenario.build(), camera_of(snapshot)
     context = testbed.default_context()

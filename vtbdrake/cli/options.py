@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +14,7 @@ from urllib.parse import urlsplit
 import click
 
 from vtbdrake.cli.completion import complete_file, complete_scenario
-from vtbdrake.settings import declared_settings
+from vtbdrake.common.settings import declared_settings
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Choice, Parameter
@@ -60,6 +61,10 @@ def grouped(name: str, *options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Return a decorator that gives a command several options, whose values it gets as one dictionary ``name``.
 
     Groups of the same name become one dictionary.
+
+    Args:
+        name: The argument of the command that gets the dictionary.
+        options: Decorators of click that add one option each, in the order of the help.
     """
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -80,13 +85,13 @@ def grouped(name: str, *options: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def config_option(
     config: Any, usage: str, text: str = "", *, field: str = "", per: int = 1, **settings: Any
 ) -> Callable[[Any], Any]:
-    """Return the option that sets a field of a configuration; default, help, unit and range are those of the field.
+    """Return the option that sets a field of a configuration; default, help, unit and range come from the field.
 
     Args:
         config: The configuration with the default values.
         usage: As in `option`.
         text: Replaces the help of the field.
-        field: The field; by default that of the option's name.
+        field: The field; by default the field with the option's name.
         per: A whole multiple of the field's unit, in which the option counts instead.
         settings: Further arguments of `option`.
     """
@@ -102,7 +107,12 @@ def config_option(
 
 
 def assignment(text: str, form: str) -> tuple[str, str]:
-    """Parse ``NAME=VALUE``; ``form`` names the two parts."""
+    """Parse ``NAME=VALUE``; ``form`` names the two parts.
+
+    Args:
+        text: The text that the user wrote.
+        form: The expected form for the error message, such as ``ADDRESS=VALUE``.
+    """
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
         raise click.BadParameter(f"expected {form}, not {text!r}")
@@ -134,6 +144,8 @@ def parse_setting(text: str) -> Setting:
     """Parse ``ADDRESS=VALUE``, where the value is a number or a JSON list of numbers."""
     address, value = assignment(text, "ADDRESS=VALUE")
     number = _json_or_text(value)
+    if isinstance(number, str) and isinstance(_json_or_text(f"[{value}]"), list):
+        raise click.BadParameter(f"a list is written in brackets, and in quotes for the shell: '{address}=[{value}]'")
     if isinstance(number, bool) or not isinstance(number, int | float | list):
         raise click.BadParameter(f"the value of {address} is a number or a JSON list of numbers, not {value!r}")
     return address, number
@@ -159,7 +171,7 @@ def parse_choice(text: str) -> Choice:
 
 
 def parse_limits(text: str) -> tuple[str, dict[str, Any]]:
-    """Parse ``ADDRESS=LOWER:UPPER``, of which an end may be missing, or ``ADDRESS=OPTION,...``.
+    """Parse ``ADDRESS=LOWER:UPPER``, where an end may be missing, or ``ADDRESS=OPTION,...``.
 
     Returns:
         The address, and ``lower`` and ``upper`` (None if missing), or ``options``.
@@ -319,9 +331,42 @@ def scenario_argument(
         return command(scenario=scenario, **others)
 
     argument = click.argument("scenario", callback=converted(parse), shell_complete=complete, metavar=metavar)
-    return argument(_field_option(with_scenario))
+    decorated = argument(_field_option(with_scenario))
+    return decorated if parse is not parse_scenario else import_option(decorated)
 
 
+def _parse_package(text: str) -> tuple[str, Path]:
+    name, folder = assignment(text, "NAME=FOLDER")
+    if not Path(folder).is_dir():
+        raise click.BadParameter(f"there is no folder {folder}: expected NAME=FOLDER, the folder of a package")
+    return name, Path(folder).resolve()
+
+
+package_option = option(
+    "--package NAME=FOLDER",
+    "Where a model file finds package://NAME/..., if not around it or on the ROS_PACKAGE_PATH. May be repeated.",
+    name="packages",
+    parse=_parse_package,
+    multiple=True,
+)
+
+
+def _import_module(name: str) -> None:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        raise click.BadParameter(f"cannot import {name}: {error}") from error
+
+
+import_option = option(
+    "--trust MODULE",
+    "Import this module, which runs its code, because a file or a log names a function of it: the DPS of a station. "
+    "May be repeated.",
+    parse=_import_module,
+    multiple=True,
+    is_eager=True,  # Before the scenario is read.
+    expose_value=False,
+)
 set_option = option(
     "--set ADDRESS=VALUE",
     "Set a variable in s0 to a number or a JSON list. May be repeated.",
@@ -353,10 +398,18 @@ def schema_option(load: Callable[[], dict[str, Any]]) -> Callable[[Any], Any]:
     return option("--schema", "Print the JSON Schema of the YAML file.", **settings)
 
 
+trust_option = option(
+    "--trust MODULE",
+    "A module, or a package of modules, that may be imported because a file names it, which runs its code. Those of "
+    "vtbdrake need not be named. May be repeated.",
+    name="trusted",
+    multiple=True,
+    is_eager=True,  # Known when the file is read.
+)
 url_option = option(
     "--url URL", "The LCM bus, for example tcpq://127.0.0.1:7700 for a hub.", parse=parse_url, required=True
 )
-timeout_option = option("--timeout S", "Give up after so many seconds without an answer.", parse=positive, default=5.0)
+timeout_option = option("--timeout S", "Give up after S seconds without an answer.", parse=positive, default=5.0)
 horizon_option = option("--horizon S", "The horizon t_m, in seconds.", type=float, required=True)
 sample_period_option = option("--sample-period S", "The time between two samples, in seconds.", default=0.05)
 start_option = option("--start SNAPSHOT", "Take s0 from this file instead of the defaults.", parse=parse_snapshot)

@@ -32,7 +32,7 @@ from vtbdrake.cli.options import (
     start_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show, table, write_csv
-from vtbdrake.failures import one_line
+from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Boundary, Parameter, Problem, ProblemFile, Sweep
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def _executors() -> tuple[str, ...]:
-    from vtbdrake.rollout.executor import NAMES
+    from vtbdrake.rollout.executor_choice import NAMES
 
     return NAMES
 
@@ -58,13 +58,18 @@ def problem_or_file_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return scenario_argument(stated, parse=parse_problem, complete=complete_scenario_or_file, metavar=metavar)
 
 
-def parse_problem(text: str) -> Scenario | ProblemFile:
-    """Load a scenario, or the file of a problem."""
+def parse_problem(text: str, *, trusted: Sequence[str] | None = None) -> Scenario | ProblemFile:
+    """Load a scenario, or the file of a problem; see `ProblemFile.load` for ``trusted``.
+
+    Args:
+        text: Short name, ``MODULE:CLASS`` (with an ``@file``, too), or a YAML file of a problem.
+        trusted: The only modules, or packages of them, that the file may import; None for all.
+    """
     if ":" in text or not text.endswith((".yaml", ".yml")):
         return parse_scenario(text)
     from vtbdrake.optimization import ProblemFile
 
-    return ProblemFile.load(text)
+    return ProblemFile.load(text, trusted=trusted)
 
 
 def _statement(*, required: bool) -> Callable[[Any], Any]:
@@ -165,6 +170,10 @@ def _quality(text: str, of: Sequence[str]) -> Quality:
 def make_constraint(text: str, *, limit: str) -> Constraint:
     """Return the constraint ``ADDRESS=NUMBER`` or ``module:function(ADDRESS,...)=NUMBER``.
 
+    Args:
+        text: The constraint as the user wrote it.
+        limit: Which bound the number is, ``at_most`` or ``at_least``.
+
     Raises:
         click.BadParameter: The text has another form.
         click.UsageError: The function does not exist.
@@ -215,7 +224,7 @@ def sweep(
 
     \b
     Example:
-      vtbdrake sweep vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake sweep space_climber --horizon 15 \\
           --vary sim.sys.payload.mass=0:60:13 --quality sim.sys.climber.base.pitch --threshold 0.785
     """
     parameters, points = zip(*vary, strict=True)
@@ -270,7 +279,7 @@ def boundary(
 
     \b
     Example:
-      vtbdrake boundary vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake boundary space_climber --horizon 15 \\
           --vary sim.sys.payload.mass=0:60 --resolution 1 --coarse 5 \\
           --quality sim.sys.climber.base.pitch --threshold 0.785
     """
@@ -286,8 +295,7 @@ def _described(sweep: Sweep) -> dict[str, Any]:
     from vtbdrake.optimization.boundary import why_no_boundary
 
     try:
-        point, h = sweep.best()
-        best: dict[str, Any] | None = {"point": point, "h": h}
+        best: dict[str, Any] | None = {"point": sweep.best.parameters, "h": sweep.best.value}
     except ValueError:
         best = None
     points = [
@@ -327,11 +335,11 @@ def _conclusion(sweep: Sweep) -> str:
 
     lines = [_condition(i, c) for i, c in enumerate(sweep.conditions)] if len(sweep.conditions) > 1 else []
     try:
-        point, h = sweep.best()
+        best = sweep.best
     except ValueError as error:
         raise FailedError(one_line(error)) from error
-    at = point_text(sweep.parameters, list(point.values()), sweep.units)
-    lines.append(f"best: h = {number(h)} at {at}")
+    at = point_text(sweep.parameters, best.point, sweep.units)
+    lines.append(f"best: h = {number(best.value)} at {at}")
     if not why_no_boundary(sweep):
         lines.append(f"boundary: {sweep.boundary()}")
     return "\n".join(lines)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from vtbdrake.child_process import logging_in_thread
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.options import (
     Setting,
@@ -23,9 +22,11 @@ from vtbdrake.cli.options import (
     url_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, show, write_whole
+from vtbdrake.common.child_process import logging_in_thread
+from vtbdrake.common.failures import one_line
+from vtbdrake.common.interrupt import ends_by_itself
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.realtime import RealTime, RunawayError
-from vtbdrake.failures import one_line
 
 if TYPE_CHECKING:
     from vtbdrake.control.guards import Guards
@@ -49,7 +50,7 @@ MOST_FAULTS = 20  # that are printed at the end
     parse=parse_snapshot,
 )
 @set_option
-@option("--period S", "The period of a cycle, in seconds, instead of that of the scenario.", type=float)
+@option("--period S", "The period of a cycle in seconds, instead of the scenario's.", type=float)
 @option("--pace SIGNAL", "Begin a cycle with each message of this sensor signal, not by the clock.")
 @option("--seconds S", "End after S seconds.  [default: endless]", parse=positive, type=float)
 @option("--wait S", "Give up if the machine is not ready after S seconds.", parse=positive, default=60.0)
@@ -97,13 +98,13 @@ def run(
 
     \b
     Example:
-      vtbdrake run vtbdrake_diagrams.manipulator:ManipulatorScenario --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
+      vtbdrake run manipulator --url tcpq://127.0.0.1:7700 --snapshot arm.vtb
     """
     from vtbdrake.deployment import Deployment
     from vtbdrake.recording.recorder import RecordingError
 
     logging.basicConfig(format="%(asctime)s %(message)s")
-    for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment", "vtbdrake.control.runtime"))):
+    for logger in (_log, *map(logging.getLogger, ("vtbdrake.deployment.deployment", "vtbdrake.control.runtime"))):
         logger.setLevel(logging.INFO)
     changes = {"period": period, "pace": pace}
     deployment = Deployment.of(scenario, **{name: value for name, value in changes.items() if value is not None})
@@ -111,6 +112,7 @@ def run(
         url, start=snapshot, values=settings(values), deployment=deployment, claim=claim, live=live, record=record
     )
     incomplete: RecordingError | None = None
+    ends_by_itself()  # The fallbacks bring the robot to rest.
     try:
         with logging_in_thread(), loop as runtime:
             begin = runtime.clock.now()

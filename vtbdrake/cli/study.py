@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -26,6 +26,7 @@ from vtbdrake.cli.options import (
     parse_scaled_range,
     schema_option,
     settings,
+    trust_option,
 )
 from vtbdrake.cli.output import emit, json_option, number, say, table, write_csv
 from vtbdrake.cli.page import browser_option, page_options, serve
@@ -44,13 +45,6 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
 
 _file = click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-_trust_option = option(
-    "--trust MODULE",
-    "A module, or a package of modules, that may be imported because FILE names it, which runs its code. Those of "
-    "vtbdrake need not be named. May be repeated.",
-    name="trusted",
-    multiple=True,
-)
 _solver_options = option(
     "--option NAME=VALUE", "An option of the solver. May be repeated.", name="options", parse=parse_field, multiple=True
 )
@@ -79,7 +73,7 @@ def study() -> None:
 
     \b
     Example:
-      vtbdrake study run gait.db vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+      vtbdrake study run gait.db space_climber --horizon 5 --rollouts 40 \\
           --vary dps.impl.gait.period=1:4 --vary dps.impl.gait.stroke=0.05:0.3 --quality sim.sys.climber.base.x
       vtbdrake study show gait.db
     """
@@ -103,7 +97,7 @@ def _schema() -> dict[str, Any]:
 @option(
     "--choose ADDRESS=OPTION,OPTION[,...]",
     "A parameter that takes one of several values without an order: numbers, words, true or false; a variable "
-    "or scenario.<field>. May be repeated; in a point, those of --choose follow those of --vary.",
+    "or scenario.<field>. May be repeated; in a point, the values of --choose follow the values of --vary.",
     parse=parse_choice,
     multiple=True,
 )
@@ -132,12 +126,12 @@ def _schema() -> dict[str, Any]:
 )
 @grouped(
     "solving",
-    option("--solver NAME", "The solver.  [default: auto, or that of FILE]"),
+    option("--solver NAME", "The solver.  [default: auto, or FILE's]"),
     _solver_options,
-    option("--seed N", "The seed of the solver.  [default: 0, or that of FILE]", type=int),
+    option("--seed N", "The seed of the solver.  [default: 0, or FILE's]", type=int),
     option(
         "--parallel N",
-        "Ask for enough points at a time for N rollouts side by side.  [default: the solver's own, or that of FILE]",
+        "Ask for enough points at a time for N rollouts side by side.  [default: the solver's own, or FILE's]",
         type=click.IntRange(min=1),
     ),
 )
@@ -183,7 +177,7 @@ def run(
     \b
     Example:
       vtbdrake study run gait.db gait.yaml --workers 4
-      vtbdrake study run gait.db vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 5 --rollouts 40 \\
+      vtbdrake study run gait.db space_climber --horizon 5 --rollouts 40 \\
           --vary dps.impl.gait.period=1:4:log --choose scenario.gravity=1.62,9.81 \\
           --quality sim.sys.climber.base.x --at-most sim.sys.climber.base.pitch=0.2
     """
@@ -258,158 +252,114 @@ def show(file: Path, csv: Path | None) -> None:
 
 
 def _described(study: Study) -> dict[str, Any]:
-    """Return what is in a study, with the points as columns."""
+    """Return the contents of a study by name, with the points as columns."""
     best = [{"point": trial.parameters, "values": trial.values} for trial in study.pareto()]
     record = {name: study.record[name] for name in ("solver", "seed")}
     return {**record, "rollouts": len(study), "best": best, "points": study.to_dict()}
 
 
-def _intervention(
-    kind: str, *arguments: Callable[[Any], Any], **options: Any
-) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
-    """Return a decorator that makes a command of a function from its arguments to the payload of an intervention."""
-
-    def decorate(payload_of: Callable[..., dict[str, Any]]) -> click.Command:
-        @wraps(payload_of)
-        def intervene(file: Path, by: str | None, **values: Any) -> None:
-            from vtbdrake.optimization import Study
-
-            with Study.open(file) as opened:
-                intervention = opened.intervene(kind, by=by, **payload_of(**values))
-                running = "" if opened.is_running else ", as soon as the study runs"
-                say(f"intervention {intervention.number} waits for the next batch{running}: {intervention.text}")
-                emit(intervention.to_dict())
-
-        by_option = option("--by NAME", "Who makes the change.  [default: your login name]")
-        command: Any = intervene
-        for add in reversed((_file, *arguments, by_option, json_option)):
-            command = add(command)
-        return study.command(kind, **options)(command)
-
-    return decorate
-
-
-@_intervention("try", _point)
-def _try(point: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
-    """Try a point with the next batch."""
-    return {"point": settings(point)}
-
-
-@_intervention("pause")
-def _pause() -> dict[str, Any]:
-    """Let the run finish its batch, and wait."""
-    return {}
-
-
-@_intervention("resume")
-def _resume() -> dict[str, Any]:
-    """Let a paused run go on."""
-    return {}
-
-
-@_intervention("stop")
-def _stop() -> dict[str, Any]:
-    """End the run after its batch."""
-    return {}
-
-
-@_intervention(
-    "range",
-    click.argument(
-        "limits",
-        callback=converted(parse_limits),
-        metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]",
-        shell_complete=complete_parameter,
+# The arguments of each kind of intervention, and what it does.
+_INTERVENTIONS = {
+    "try": ("ADDRESS=VALUE [...]", "try a point with the next batch"),
+    "pause": ("", "let the run finish its batch, and wait"),
+    "resume": ("", "let a paused run go on"),
+    "stop": ("", "end the run after its batch"),
+    "range": (
+        "ADDRESS=LOWER:UPPER|ADDRESS=OPTION,OPTION[,...]",
+        "narrow or widen the range of a parameter; an end that is left out stays: ADDRESS=:2",
     ),
-)
-def _range(limits: tuple[str, dict[str, Any]]) -> dict[str, Any]:
-    """Narrow or widen the range of a parameter.
-
-    An end that is left out stays: ADDRESS=:2.
-    """
-    address, ends = limits
-    return {"address": address, **ends}
-
-
-@_intervention("freeze", click.argument("parameter", metavar="ADDRESS[=VALUE]", shell_complete=complete_parameter))
-def _freeze(parameter: str) -> dict[str, Any]:
-    """Hold a parameter at a value.
-
-    By default it is that of the best point.
-    """
-    address, value = parse_field(parameter) if "=" in parameter else (parameter, None)
-    return {"address": address} | ({} if value is None else {"value": value})
-
-
-@_intervention("unfreeze", click.argument("address", shell_complete=complete_parameter))
-def _unfreeze(address: str) -> dict[str, Any]:
-    """Vary a frozen parameter again."""
-    return {"address": address}
-
-
-@_intervention(
-    "forbid",
-    click.argument(
-        "region",
-        nargs=-1,
-        required=True,
-        callback=converted(parse_limits),
-        metavar="ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
-        shell_complete=complete_parameter,
+    "freeze": ("ADDRESS[=VALUE]", "hold a parameter at a value, by default at the best point's"),
+    "unfreeze": ("ADDRESS", "vary a frozen parameter again"),
+    "forbid": (
+        "ADDRESS=LOWER:UPPER|ADDRESS=OPTION[,...] [...]",
+        "forbid the box of all sides that are given; an end that is left out is open: ADDRESS=2:",
     ),
-)
-def _forbid(region: tuple[tuple[str, dict[str, Any]], ...]) -> dict[str, Any]:
-    """Forbid a region.
+    "allow": ("NUMBER", "allow the region that intervention NUMBER forbids"),
+    "budget": ("ROLLOUTS|none", "set the number of rollouts in the end, for this run and later ones; none: no limit"),
+    "solver": ("SOLVER [--option NAME=VALUE]", "go on with another solver"),
+    "aspiration": ("VALUE ...|none", "aim at values of several qualities, one each; none: at the whole Pareto front"),
+}
 
-    It is the box of all sides that are given. An end that is left out is open: ADDRESS=2:.
+
+def _payload(kind: str, arguments: tuple[str, ...], options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """Return the arguments of `Study.intervene` for the arguments of a command."""
+    if options and kind != "solver":
+        raise click.UsageError(f"--option is for another solver, not for {kind}")
+    match kind, arguments:
+        case (("pause" | "resume" | "stop"), ()):
+            return {}
+        case "try", (_, *_):
+            return {"point": settings(map(parse_field, arguments))}
+        case "range", (text,):
+            address, ends = parse_limits(text)
+            return {"address": address, **ends}
+        case "freeze", (text,):
+            address, value = parse_field(text) if "=" in text else (text, None)
+            return {"address": address} | ({} if value is None else {"value": value})
+        case "unfreeze", (address,):
+            return {"address": address}
+        case "forbid", (_, *_):
+            sides = dict(map(parse_limits, arguments))
+            return {"region": {a: side.get("options") or [side["lower"], side["upper"]] for a, side in sides.items()}}
+        case "allow", (text,) if text.isdecimal():
+            return {"number": int(text)}
+        case "budget", (text,):
+            return {"rollouts": parse_optional(text)}
+        case "solver", (solver,):
+            return {"solver": solver, "options": settings(options)}
+        case "aspiration", ("none",):
+            return {"targets": None}
+        case "aspiration", (_, *_):
+            return {"targets": [parse_optional(text) for text in arguments]}
+    received = f"not {' '.join(arguments)!r}" if arguments else "and none is given"
+    raise click.UsageError(f"{kind} takes {_INTERVENTIONS[kind][0] or 'no argument'}, {received}")
+
+
+_KINDS_HELP = "\n".join(
+    f"  {kind} {usage}".rstrip() + f"\n      {text}" for kind, (usage, text) in _INTERVENTIONS.items()
+)
+
+
+@study.command(
+    context_settings={"ignore_unknown_options": True},  # A value may be negative.
+    help=f"""Change a study with its next batch.
+
+    Another process may run it meanwhile.
+
+    \b
+    KIND is one of these, followed by its arguments:
+{indent(_KINDS_HELP, "    ")}
 
     \b
     Example:
-      vtbdrake study forbid gait.db dps.impl.gait.period=:1.5 dps.impl.gait.stroke=0.2:
-    """
-    sides = {address: limits.get("options") or [limits["lower"], limits["upper"]] for address, limits in region}
-    return {"region": sides}
-
-
-@_intervention("allow", click.argument("number", type=int))
-def _allow(number: int) -> dict[str, Any]:
-    """Allow the region that intervention NUMBER forbids."""
-    return {"number": number}
-
-
-@_intervention("budget", click.argument("rollouts", metavar="ROLLOUTS|none"))
-def _budget(rollouts: str) -> dict[str, Any]:
-    """Set the number of rollouts in the end.
-
-    It holds for the present run and for later ones, whatever they are given. ``none`` is no limit.
-    """
-    return {"rollouts": parse_optional(rollouts)}
-
-
-@_intervention("solver", click.argument("solver"), _solver_options)
-def _solver(solver: str, options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
-    """Go on with another solver."""
-    return {"solver": solver, "options": settings(options)}
-
-
-@_intervention(
-    "aspiration",
-    click.argument("targets", nargs=-1, required=True, metavar="VALUE ...|none"),
-    context_settings={"ignore_unknown_options": True},  # A value may be negative.
+      vtbdrake study intervene gait.db forbid dps.impl.gait.period=:1.5 dps.impl.gait.stroke=0.2:
+    """,
 )
-def _aspiration(targets: tuple[str, ...]) -> dict[str, Any]:
-    """Aim at values of several qualities, one each.
+@_file
+@click.argument("kind", type=click.Choice(list(_INTERVENTIONS)), metavar="KIND")
+@click.argument("arguments", nargs=-1, shell_complete=complete_parameter)
+@_solver_options
+@option("--by NAME", "Who makes the change.  [default: your login name]")
+@json_option
+def intervene(
+    file: Path, kind: str, arguments: tuple[str, ...], options: tuple[tuple[str, Any], ...], by: str | None
+) -> None:
+    """Change a study with its next batch."""
+    from vtbdrake.optimization import Study
 
-    ``none`` is the whole Pareto front again.
-    """
-    return {"targets": None if targets == ("none",) else [parse_optional(target) for target in targets]}
+    payload = _payload(kind, arguments, options)
+    with Study.open(file) as opened:
+        intervention = opened.intervene(kind, by=by, **payload)
+        running = "" if opened.is_running else ", as soon as the study runs"
+        say(f"intervention {intervention.number} waits for the next batch{running}: {intervention.text}")
+        emit(intervention.to_dict())
 
 
 @study.command()
 @_file
 @click.argument("new_file", callback=converted(output()), shell_complete=complete_file)
 @option("--without NUMBER", "Leave out this intervention. May be repeated.", type=int, multiple=True)
-@_trust_option
+@trust_option
 @executor_options
 @json_option
 def replay(
@@ -497,15 +447,15 @@ def set_attribute(file: Path, attribute: tuple[str, Any], trial: int | None) -> 
 
 @study.command("open")
 @_file
-@_trust_option
+@trust_option
 @page_options
 @browser_option
 @json_option
 def open_page(file: Path, trusted: tuple[str, ...], page: dict[str, Any], browser: bool) -> None:
     """Watch and steer a study in a web browser, until Ctrl-C.
 
-    The study in FILE may be run by another process meanwhile, or by none. The page is served on this machine alone, and
-    its address has a token.
+    The study in FILE may be run by another process meanwhile, or by none. The page is served on this machine alone. An
+    address is good for one browser.
 
     \b
     Example:
@@ -514,12 +464,12 @@ def open_page(file: Path, trusted: tuple[str, ...], page: dict[str, Any], browse
     from vtbdrake.web import view_study
 
     with view_study(file, trusted=trusted, **page) as opened:
-        serve(opened.url, browser=browser)
+        serve(opened, browser=browser)
 
 
 @study.command("continue")
 @_file
-@_trust_option
+@trust_option
 @grouped(
     "running",
     option("--rollouts N", "End when the study has N rollouts.  [default: its budget]", type=click.IntRange(min=1)),

@@ -34,8 +34,8 @@ from vtbdrake.cli.output import (
     table,
     write_whole,
 )
-from vtbdrake.failures import one_line
-from vtbdrake.settings import schema
+from vtbdrake.common.failures import one_line
+from vtbdrake.common.settings import schema
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,9 +68,9 @@ def variables(scenario: Scenario, match: str, as_schema: bool, by_source: bool) 
 
     \b
     Example:
-      vtbdrake variables vtbdrake_diagrams.space_climber:SpaceClimberScenario --match payload
+      vtbdrake variables space_climber --match payload
     """
-    from vtbdrake.argument_checks import suggestion
+    from vtbdrake.common.argument_checks import suggestion
 
     if as_schema:
         described = schema(type(scenario))
@@ -150,7 +150,7 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 
     \b
     Example:
-      vtbdrake diagram vtbdrake_diagrams.space_climber:SpaceClimberScenario -o climber.svg
+      vtbdrake diagram space_climber -o climber.svg
     """
     from vtbdrake.visualization import svg
 
@@ -190,7 +190,7 @@ def rollout(
 
     \b
     Example:
-      vtbdrake rollout vtbdrake_diagrams.space_climber:SpaceClimberScenario --horizon 15 \\
+      vtbdrake rollout space_climber --horizon 15 \\
           --set sim.sys.payload.mass=40 --record sim.sys.climber.base.pitch --save pitch.csv
     """
     from vtbdrake.optimization.problem import PLANT_STATE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vtbdrake.cli.log import opened_log
-from vtbdrake.cli.options import Setting, option, parse_url, scenario_argument, set_option, settings, start_option
+from vtbdrake.cli.options import (
+    Setting,
+    option,
+    package_option,
+    parse_url,
+    scenario_argument,
+    set_option,
+    settings,
+    start_option,
+    trust_option,
+)
 from vtbdrake.cli.output import json_option
 from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.cli.problem import parse_problem
@@ -21,6 +32,8 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
 
+# The suffixes of model files: URDF, SDF, MJCF, and model directives of Drake.
+_MODEL_SUFFIXES = (".urdf", ".sdf", ".xml", ".dmd.yaml", ".dmd.yml")
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
@@ -42,11 +55,18 @@ def _named_problem(text: str) -> Problem:
 
 
 def _parse_viewed(text: str) -> Scenario | ProblemFile:
-    """Load a scenario or the file of a problem; the error about a problem in Python tells how it is shown."""
+    """Load a scenario, a model, a station or the file of a problem.
+
+    The error about a problem in Python tells how it is shown.
+    """
     from vtbdrake.testbed import ScenarioError
 
+    if text.lower().endswith(_MODEL_SUFFIXES) or _is_station(text):
+        from vtbdrake.project import ModelFileScenario
+
+        return ModelFileScenario.of(text)
     try:
-        return parse_problem(text)
+        return parse_problem(text, trusted=click.get_current_context().params.get("trusted", ()))
     except ScenarioError as error:
         if text.endswith(".py"):
             example = f"SCENARIO --problem {Path(text).stem}:NAME"
@@ -57,6 +77,13 @@ def _parse_viewed(text: str) -> Scenario | ProblemFile:
         raise click.BadParameter(f"{error}. A problem in Python is shown with its scenario: {example}") from error
 
 
+def _is_station(text: str) -> bool:
+    """Return whether ``FILE.yaml`` or ``FILE.yaml#KEY`` is a file of Drake's hardware_sim."""
+    path = Path(text if Path(text).exists() else text.rpartition("#")[0])
+    is_yaml = path.suffix in (".yaml", ".yml") and path.is_file()
+    return is_yaml and re.search(r"^\s+directives:", path.read_text("utf-8", "replace"), re.MULTILINE) is not None
+
+
 def _is_problem(text: str) -> bool:
     from vtbdrake.optimization import Problem
 
@@ -65,7 +92,7 @@ def _is_problem(text: str) -> bool:
 
 
 @click.command()
-@partial(scenario_argument, parse=_parse_viewed, metavar="SCENARIO|PROBLEM.yaml")
+@partial(scenario_argument, parse=_parse_viewed, metavar="SCENARIO|MODEL|STATION.yaml|PROBLEM.yaml")
 @set_option
 @start_option
 @option(
@@ -75,7 +102,7 @@ def _is_problem(text: str) -> bool:
 )
 @option(
     "--study FILE",
-    "The study in which the page stores drives, marked as driven. Without --problem, the problem is that of the study.",
+    "The study in which the page stores drives, marked as driven. Without --problem, the page has the study's problem.",
     type=click.Path(dir_okay=False, path_type=Path),
 )
 @option("--log FILE", "Replay this log of the scenario; what is changed goes on in simulation.", type=_FILE)
@@ -86,6 +113,7 @@ def _is_problem(text: str) -> bool:
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     default=".",
 )
+@trust_option
 @page_options
 @option("--vr", "Let headsets that open the page lead the robot by a hand.", is_flag=True)
 @option(
@@ -96,6 +124,7 @@ def _is_problem(text: str) -> bool:
 @option("--tls NAME", "Serve the page by https, at this name or address of this machine, to its network.")
 @option("--certificate FILE", "With --tls, a certificate (PEM); one is made if it is left out.", type=_FILE)
 @option("--key FILE", "With --certificate, its private key (PEM).", type=_FILE)
+@package_option
 @option("--play", "Let time run at once.", is_flag=True)
 @browser_option
 @json_option
@@ -107,33 +136,44 @@ def view(
     study: Path | None,
     log: Path | None,
     folder: Path,
+    trusted: tuple[str, ...],
     page: dict[str, Any],
     vr: bool,
     url: str | None,
     tls: str | None,
     certificate: Path | None,
     key: Path | None,
+    packages: tuple[tuple[str, Path], ...],
     play: bool,
     browser: bool,
 ) -> None:
     """Watch and steer a testbed in a web browser, until Ctrl-C.
 
-    The page is served on this machine alone, unless --tls is given, and its address has a token: who has both can steer
-    the testbed.
+    The page is served on this machine alone, unless --tls is given. An address is good for one browser, which can steer
+    the testbed. The module of a scenario that is named here is imported, which runs its code; modules that PROBLEM.yaml
+    or the study names are not, unless --trust names them.
+
+    A model file (URDF, SDF, MJCF, model directives) or a station is shown as it is, with a command for each joint.
 
     \b
     Example:
-      vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario
-      vtbdrake view vtbdrake_diagrams.cart_pole:CartPoleScenario --url tcpq://127.0.0.1:7700
-      vtbdrake view vtbdrake_diagrams.manipulator:ManipulatorScenario --log arm.lcm
+      vtbdrake view cart_pole
+      vtbdrake view arm.urdf
+      vtbdrake view station.yaml#Demo
+      vtbdrake view cart_pole --url tcpq://127.0.0.1:7700
+      vtbdrake view manipulator --log arm.lcm
     """
     from vtbdrake.testbed import Scenario
     from vtbdrake.web import view as open_view
     from vtbdrake.web import view_loop
-    from vtbdrake.web.tls import Tls
+    from vtbdrake.web.serving.tls import Tls
 
     if (certificate or key) and not tls:
         raise click.UsageError("--certificate and --key go with --tls")
+    if packages:
+        if not isinstance(scenario, Scenario) or not hasattr(scenario, "packages"):
+            raise click.UsageError("--package goes with a model file or a station")
+        scenario.packages = {**scenario.packages, **{name: str(folder) for name, folder in packages}}
     if not isinstance(scenario, Scenario):
         if problem is not None:
             raise click.UsageError(f"{scenario.path} is a problem already: leave --problem out")
@@ -145,7 +185,7 @@ def view(
                 "a loop is shown as it is: leave --set, --start, --play, --problem, --study and --log out, or --url"
             )
         with view_loop(scenario, url, **page) as watched:
-            serve(watched.url, browser=browser)
+            serve(watched, browser=browser)
         return
     viewed: Scenario | None = scenario
     if log is not None:
@@ -154,8 +194,8 @@ def view(
         page |= {"log": opened_log(log, scenario.name())}
         # The log describes its scenario; fields that were set have to be the recorded ones.
         viewed = None if scenario.record() == type(scenario)().record() else scenario
-    page |= {"problem": problem, "study": study, "folder": folder}
+    page |= {"problem": problem, "study": study, "trusted": trusted, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
         if play:
             running.session.play()
-        serve(running.url, browser=browser)
+        serve(running, browser=browser)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from math import inf, sqrt
 from typing import Any
 
@@ -11,11 +10,11 @@ import casadi
 import numpy as np
 from pydrake.systems.framework import Context, System
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import At, Draw, Equations, Expression, Fixed, Timing, refusal
-from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, Model, Result
+from vtbdrake.components.casadi_system.function_ports import INPUT, PARAMETER, STATE, FunctionResult, Model
 from vtbdrake.components.sensors import errors as sensor_errors
-from vtbdrake.components.sensors.noise import normal_noise, uniform_noise
+from vtbdrake.components.sensors.noise import noise_of_seeds
 
 # As a SplineCommand rounds.
 _ROUNDING = 1e-9
@@ -31,14 +30,14 @@ class CasadiEquations(Equations):
     def output(self, port: str, at: At) -> Expression:
         return self._value(self._model.outputs[port], at)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         model = self._model
         if model.update is None:
             return {}
         ends = np.cumsum([0, *(model.size(name) for name in model.state)]).tolist()
         return dict(enumerate(casadi.vertsplit(self._value(model.update, at), ends)))
 
-    def _value(self, result: Result, at: At) -> Expression:
+    def _value(self, result: FunctionResult, at: At) -> Expression:
         arguments = []
         for block in result.blocks:
             if block.source == PARAMETER:
@@ -62,7 +61,7 @@ class SplineEquations(Equations):
     def output(self, port: str, at: At) -> Expression:
         return at.state(0)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         system: Any = self.system
         spline, plan, before = system.spline, at.input("plan"), at.state(0)
         late = at.time - plan[0]
@@ -98,6 +97,9 @@ class SensorEquations(Equations):
 
     A sensor's memory for the next measurement is not covered, and its standard deviations, drift, quantization,
     drop-out and outliers are left out where they are 0.
+
+    Args:
+        measure: Returns the measurement without errors, as an expression.
     """
 
     def __init__(self, system: Any, context: Context, varied: frozenset[str], measure: Callable[[At], Expression]):
@@ -117,14 +119,14 @@ class SensorEquations(Equations):
             self._present["outlier_probability"] = True
         n = context.get_discrete_state(0).size()
         if any(self._present[name] for name in self._errors.noise):
-            self.draws["noise"] = self._draw(n, partial(normal_noise, n, channel=0))
+            self.draws["noise"] = self._draw(n, channel=0)
         if self._present.get("drift"):
-            self.draws["drift"] = self._draw(n, partial(normal_noise, n, channel=1))
+            self.draws["drift"] = self._draw(n, channel=1)
         if self._present.get("dropout"):
-            self.draws["dropout"] = self._draw(1, partial(_uniform, channel=2))
+            self.draws["dropout"] = self._draw(1, channel=2, normal=False)
         if self._present.get("outlier_probability"):
-            self.draws["outlier"] = self._draw(1, partial(_uniform, channel=3))
-            self.draws["outlier_size"] = self._draw(n, partial(normal_noise, n, channel=4))
+            self.draws["outlier"] = self._draw(1, channel=3, normal=False)
+            self.draws["outlier_size"] = self._draw(n, channel=4)
 
     def fixed(self) -> Iterator[Fixed]:
         if self._errors is None:
@@ -139,7 +141,7 @@ class SensorEquations(Equations):
     def output(self, port: str, at: At) -> Expression:
         return at.state(0)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         y, errors = self._measure(at), self._errors
         if errors is None:
             return {0: y}
@@ -154,7 +156,7 @@ class SensorEquations(Equations):
             y = y + deviations * at.draw("noise")
         return self._shown(at, y, value) if errors.has_model else {0: y}
 
-    def _shown(self, at: At, y: Expression, value: Callable[[str], Expression]) -> dict[int | str, Expression]:
+    def _shown(self, at: At, y: Expression, value: Callable[[str], Expression]) -> dict[int, Expression]:
         errors, present, n = self._errors, self._present, y.numel()
         assert errors is not None and self.timing is not None
         group = int(errors.memory.index)
@@ -179,19 +181,22 @@ class SensorEquations(Equations):
             y = casadi.if_else(at.draw("dropout") < value("dropout"), at.state(0), y)
         return {0: y, group: casadi.vertcat(*remembered)}
 
-    def _draw(self, size: int, noise: Callable[..., Array]) -> Draw:
+    def _draw(self, size: int, *, channel: int, normal: bool = True) -> Draw:
         errors, timing = self._errors, self.timing
         assert errors is not None and timing is not None
         place = int(errors.parameters.index), errors.parameters.vector.slice_of("seed").start
 
-        def numbers(seed: int, time: float) -> Array:
-            return noise(seed=seed, stream=errors.stream(), tick=round(time / timing.period))
+        def numbers(seeds: Array, times: Array) -> Array:
+            return noise_of_seeds(
+                size,
+                seeds=seeds.astype(np.uint64),
+                stream=errors.stream(),
+                ticks=np.rint(times / timing.period).astype(np.int64),
+                channel=channel,
+                normal=normal,
+            )
 
         return Draw(size, place, numbers)
-
-
-def _uniform(*, channel: int, **key: int) -> Array:
-    return np.array([uniform_noise(channel=channel, **key)])
 
 
 def _rounded(x: Expression) -> Expression:
@@ -243,7 +248,7 @@ class DriveEquations(Equations):
     def output(self, port: str, at: At) -> Expression:
         return at.state(0)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         system: Any = self.system
         delayed = u = at.input("command")
         n, memory = u.numel(), at.state(1)
@@ -270,28 +275,28 @@ class CandidateEquations(Equations):
         system: Any = self.system
         return at.state(system.groups[port])
 
-    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int | str, Expression]]]]:
+    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int, Expression]]]]:
         system: Any = self.system
         if system.on_request:
             yield Timing(system.period, system.sampled(0), unrestricted=True), self._take_request
         yield from super().updates()
 
-    def _take_request(self, at: At) -> dict[int | str, Expression]:
+    def _take_request(self, at: At) -> dict[int, Expression]:
         return self._of_candidate(at, 0.0, {"taken": at.input("request")})
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         system: Any = self.system
         candidate = at.parameter(system.candidate_groups[0])
         sampled_at = self._sampled_at(at, system.latency)
         return self._of_candidate(at, system.latency, {"decision": candidate, "sampled_at": sampled_at, "valid": 1.0})
 
     def _sampled_at(self, at: At, delay: float) -> Expression:
-        """Return when the sample was due that was taken ``delay`` seconds ago."""
+        """Return the time when the sample was due that was taken ``delay`` seconds ago."""
         system: Any = self.system
         return system.offset + casadi.floor((at.time - system.offset - delay) / system.period + 0.5) * system.period
 
-    def _of_candidate(self, at: At, delay: float, shown: dict[str, Expression]) -> dict[int | str, Expression]:
-        """Return new values of ports if the sample taken ``delay`` seconds ago is that of the candidate."""
+    def _of_candidate(self, at: At, delay: float, shown: dict[str, Expression]) -> dict[int, Expression]:
+        """Return new values of ports if the sample taken ``delay`` seconds ago is the candidate's."""
         system: Any = self.system
         candidate_at = at.parameter(system.candidate_groups[1])
         is_shown = casadi.fabs(candidate_at - self._sampled_at(at, delay)) < 0.5 * system.period

@@ -14,7 +14,7 @@ from pydrake.symbolic import Expression as DrakeExpression
 from pydrake.symbolic import ExpressionKind, Formula, FormulaKind, Variable
 from pydrake.systems.framework import Context, PortDataType, System
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import (
     REMEDY,
     At,
@@ -43,7 +43,7 @@ class SymbolicEquations(Equations):
         self._symbolic, self._context = symbolic, symbolic.CreateDefaultContext()
         sizes = [context.get_discrete_state(i).size() for i in range(context.num_discrete_state_groups())]
         if (self.timing is None and any(sizes)) or context.num_abstract_states():
-            raise refusal(system, f"has other state than that of one periodic discrete update: {REMEDY}")
+            raise refusal(system, f"has state beside one periodic discrete update: {REMEDY}")
         if system.GetWitnessFunctions(context):
             raise refusal(system, f"has witness functions: {REMEDY}")
         self._variables: dict[str, list[Variable]] = {}
@@ -69,7 +69,7 @@ class SymbolicEquations(Equations):
             raise self._unwritten(error) from None
         return self._translated(value, at)
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         try:
             following = self._symbolic.EvalUniquePeriodicDiscreteUpdate(self._context)
         except RuntimeError as error:
@@ -103,7 +103,12 @@ def _expressions(variables: Sequence[Variable]) -> np.ndarray:
 
 
 def from_drake(expression: DrakeExpression, symbols: Mapping[int, Expression]) -> Expression:
-    """Return a symbolic expression of Drake as one of CasADi; ``symbols`` are its variables, by their ids."""
+    """Return a symbolic expression of Drake as one of CasADi; ``symbols`` are its variables, by their ids.
+
+    Args:
+        expression: The expression of Drake.
+        symbols: The expression that stands for each variable, by the id that Drake gives the variable.
+    """
     kind = expression.get_kind()
     if kind == ExpressionKind.Var:
         (variable,) = expression.GetVariables()
@@ -140,7 +145,8 @@ def _folded(operation: Callable[[Any, Any], Any]) -> Callable[..., Any]:
     return lambda *arguments: reduce(operation, arguments)
 
 
-_K, _F = ExpressionKind, FormulaKind
+_K = ExpressionKind
+_F = FormulaKind
 _OPERATIONS: dict[Any, Callable[..., Any]] = {
     _K.Add: _folded(operator.add),
     _K.Mul: _folded(operator.mul),
@@ -200,10 +206,13 @@ class TrajectoryEquations(Equations):
         super().__init__(system, context, varied)
         port, clock, lock = system.get_output_port(), system.CreateDefaultContext(), threading.Lock()
 
-        def values(_: int, time: float) -> Array:
+        def values(_: Array, times: Array) -> Array:
+            looked_up = np.empty((1, len(times), port.size()))
             with lock:
-                clock.SetTime(time)
-                return np.array(port.Eval(clock))
+                for row, time in zip(looked_up[0], times.tolist(), strict=True):
+                    clock.SetTime(time)
+                    row[:] = port.Eval(clock)
+            return looked_up
 
         self.draws["value"] = Draw(port.size(), None, values)
 

@@ -10,6 +10,7 @@ from typing import Any
 import casadi
 from pydrake.systems.framework import Context, System
 
+from vtbdrake.common.arrays import Array
 from vtbdrake.state.systems import class_name
 
 # casadi.SX; for abstract ports, an object that holds expressions.
@@ -32,6 +33,11 @@ class Timing:
 
     Drake makes the unrestricted updates of an instant before the discrete ones; all of one kind begin with the same
     state.
+
+    Attributes:
+        period: The time between two updates, in seconds.
+        offset: The time of the first update, in seconds.
+        unrestricted: Whether the updates are unrestricted ones.
     """
 
     period: float
@@ -49,12 +55,13 @@ class Draw:
         size: How many numbers an update takes.
         seed: Where the seed lies in the system's parameters: (number of the group, entry); None: the numbers depend on
             the time alone.
-        numbers: Function (seed, time of the update in s) that returns them, shape (size,); without a seed, it is 0.
+        numbers: Function (seeds of shape (n,), times of m updates in s) that returns them, shape (n, m, size); without
+            a seed, n is 1.
     """
 
     size: int
     seed: tuple[int, int] | None
-    numbers: Callable[[int, float], Any]
+    numbers: Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)
@@ -94,16 +101,21 @@ class At(ABC):
         """Return a numeric parameter group, shape (n, 1)."""
 
     @abstractmethod
-    def memory(self, name: str) -> Expression:
-        """Return a number that the equations keep beside the system's own state; see `Equations.memory`."""
-
-    @abstractmethod
     def extra(self, name: str) -> Expression:
         """Return a parameter that is none of a numeric group; see `Equations.extras`."""
 
     @abstractmethod
     def shared(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return what ``make`` returns, made once for all outputs and the update of this instant."""
+        """Return the result of ``make``, made once for all outputs and the update of this instant.
+
+        Args:
+            name: The key of the result within the system.
+            make: The function without arguments that computes it.
+        """
+
+    @abstractmethod
+    def is_shared(self, name: str) -> bool:
+        """Return whether `shared` has made this result."""
 
     @abstractmethod
     def draw(self, name: str) -> Expression:
@@ -116,7 +128,6 @@ class Equations(ABC):
     Attributes:
         system: The system.
         timing: When `update` is made; None: never.
-        memory: Numbers that the equations keep beside the system's own state, with their values at the begin.
         extras: Variables that lie in no numeric group, such as masses, by the name under which `At.extra` returns them,
             with their sizes; they are among those that vary.
         draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
@@ -124,7 +135,6 @@ class Equations(ABC):
     """
 
     may_be_infinite = False
-    memory: dict[str, float]
     extras: dict[str, int]
     draws: dict[str, Draw]
 
@@ -134,29 +144,47 @@ class Equations(ABC):
         Args:
             system: The system.
             context: Its own Context, with what is compiled in.
-            varied: Names of its variables that will be varied, so that they must not be compiled in; those of a plant
+            varied: Names of its variables that will be varied, so that they must not be compiled in; a plant's names
                 are addresses within it.
 
         Raises:
             UnsupportedTestbedError: The system has no equations.
         """
         self.system = system
-        self.memory, self.extras, self.draws = {}, {}, {}
+        self.extras, self.draws = {}, {}
         self.timing = unique_timing(system)
 
     @abstractmethod
     def output(self, port: str, at: At) -> Expression:
-        """Return the value of an output port, shape (n, 1)."""
+        """Return the value of an output port, shape (n, 1).
+
+        Args:
+            port: Name of the output port.
+            at: Inputs, state and parameters at this instant.
+        """
 
     def derived(self, name: str, at: At) -> Expression | None:
-        """Return the value of a variable that is computed from the state, if it has an expression."""
+        """Return the value of a variable that is computed from the state, if it has an expression.
+
+        Args:
+            name: Name of the variable within the system.
+            at: Inputs, state and parameters at this instant.
+        """
         return None
 
-    def update(self, at: At) -> dict[int | str, Expression]:
-        """Return the next values of the discrete groups, by number, and of the memory, by name."""
+    def update(self, at: At) -> dict[int, Expression]:
+        """Return the next values of the discrete groups, by number."""
         return {}
 
-    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int | str, Expression]]]]:
+    def doubt(self, at: At) -> Expression | None:
+        """Return a number that is positive where the equations differ from the system, or None if they never do.
+
+        Args:
+            at: Inputs, state and parameters at this instant, after all its outputs and updates have been written.
+        """
+        return None
+
+    def updates(self) -> Iterator[tuple[Timing, Callable[[At], dict[int, Expression]]]]:
         """Yield when the system is updated, and how; a system with updates at several timings has several."""
         if self.timing is not None:
             yield self.timing, self.update
@@ -166,22 +194,27 @@ class Equations(ABC):
         return iter(())
 
     def compiled_in(self, context: Context) -> Any:
-        """Return what is compiled in beside `fixed`, in a form that can be compared, of the system's own context."""
+        """Return the values compiled in beside `fixed`, of the system's own context, in a comparable form."""
         return None
 
     def refused(self, name: str) -> str:
-        """Return why a variable of the system, which lies in no group that is compiled, cannot be varied."""
+        """Return the reason why a variable of the system, outside all compiled groups, cannot be varied."""
         return f"it is no number in the compiled state of {self.system.get_name()}"
 
 
 def unique_timing(system: System) -> Timing | None:
-    """Return when a system with at most one kind of discrete update makes it."""
+    """Return the timing of a system with at most one kind of discrete update."""
     attribute = system.GetUniquePeriodicDiscreteUpdateAttribute()
     return None if attribute is None else Timing(attribute.period_sec(), attribute.offset_sec())
 
 
 def refusal(system: System, why: str) -> RefusedSystemError:
-    """Return the error that a system cannot be compiled."""
+    """Return the error that a system cannot be compiled.
+
+    Args:
+        system: The system, whose class the message names.
+        why: The rest of the sentence, which tells the reason and the remedy.
+    """
     return RefusedSystemError(f"{class_name(system)} {why}")
 
 

@@ -21,8 +21,8 @@ from vtbdrake.state.variables import A, Variable
 _ACTING = ("applied_generalized_force", "applied_spatial_force")
 _NOT_ACTING = ("geometry_query",)
 
-OVERRUN = "overrun"
-"""The largest overrun of the joints' stops since the begin, which are left out; see `PlantDynamics.overrun`."""
+# The name of the acceleration of the present step, which several outputs share with the update.
+_VDOT = "vdot"
 
 
 class PlantEquations(Equations):
@@ -47,7 +47,6 @@ class PlantEquations(Equations):
         except (UnsupportedPlantError, ValueError) as error:
             raise refusal(system, f"is refused: {error}") from None
         self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
-        self.memory = {OVERRUN: -np.inf}
         self.extras = {address: self._inputs[address] for address in self._model.inputs}
 
     def output(self, port: str, at: At) -> Expression:
@@ -75,7 +74,7 @@ class PlantEquations(Equations):
         return value
 
     def _reactions(self, at: At) -> Callable[[int], Expression]:
-        """Return the reaction forces of the present step, by the place of the joint among those of the plant."""
+        """Return the reaction forces of the present step, by the place of the joint among the plant's joints."""
         plant = self._plant
         q, v, vdot = self._motion(at)
         reaction = self._model.reactions(q, v, vdot, self._applied(at))
@@ -92,17 +91,25 @@ class PlantEquations(Equations):
         # Columns, also of a plant without positions.
         q, v = casadi.vertsplit(at.state(0), [0, model.nq, model.nq + model.nv])
         period = self._plant.time_step()
-        vdot = at.shared("vdot", lambda: model.acceleration(q, v, self._torque(at), period=period))
+        vdot = at.shared(_VDOT, lambda: model.acceleration(q, v, self._torque(at), period=period))
         return q, v, vdot
 
-    def update(self, at: At) -> dict[int | str, Expression]:
+    def update(self, at: At) -> dict[int, Expression]:
         model, period = self._model, self._plant.time_step()
         q, v, vdot = self._motion(at)
         v_next = v + period * vdot
         q_next = q + period * model.qdot(q, v_next)
-        beyond = model.overrun(q, v_next, period)
-        x_next, beyond = self._substituted([casadi.densify(casadi.vertcat(q_next, v_next)), beyond], at)
-        return {0: x_next, OVERRUN: casadi.fmax(at.memory(OVERRUN), beyond)}
+        (x_next,) = self._substituted([casadi.densify(casadi.vertcat(q_next, v_next))], at)
+        return {0: x_next}
+
+    def doubt(self, at: At) -> Expression | None:
+        """Return the overrun of the joints' stops in the present step, if its motion counts; they are not compiled."""
+        if not at.is_shared(_VDOT):
+            return None
+        q, v, vdot = self._motion(at)
+        period = self._plant.time_step()
+        (beyond,) = self._substituted([casadi.SX(self._model.overrun(q, v + period * vdot, period))], at)
+        return beyond
 
     def compiled_in(self, context: Context) -> bytes:
         groups = (context.get_numeric_parameter(i).value() for i in range(context.num_numeric_parameter_groups()))
@@ -135,15 +142,14 @@ class PlantEquations(Equations):
         return tau
 
     def _actuation(self, at: At) -> Expression:
-        if at.is_connected("actuation"):
-            return at.input("actuation")
-        u = zeros(self._model.nu)
+        """Return the actuation: the ports of the plant and of its model instances add up."""
+        u = casadi.SX(at.input("actuation")) if at.is_connected("actuation") else zeros(self._model.nu)
         for instance in _instances(self._plant):
             port = f"{self._plant.GetModelInstanceName(instance)}_actuation"
             indices = self._plant.GetJointActuatorIndices(instance)
             if len(indices) and at.is_connected(port):
                 starts = [self._plant.get_joint_actuator(index).input_start() for index in indices]
-                u[starts] = at.input(port)
+                u[starts] += at.input(port)
         return u
 
 

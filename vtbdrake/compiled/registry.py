@@ -54,6 +54,11 @@ not here is compiled if Drake converts it to symbolic expressions.
 def equations_of(system: System, context: Context, varied: frozenset[str]) -> Equations:
     """Return the equations of a leaf system.
 
+    Args:
+        system: The leaf system.
+        context: Its own context, with the values that are compiled in.
+        varied: Names within the system of the variables that will be varied, and so stay arguments.
+
     Raises:
         UnsupportedTestbedError: There are none.
     """

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import Timing
 
 
@@ -27,7 +27,7 @@ class Instant(NamedTuple):
 
 
 def schedule(timings: Sequence[Timing], samples: Array) -> list[Instant]:
-    """Return what a Simulator does that begins at the first sample, and is advanced from each sample to the next.
+    """Return the instants of a Simulator that begins at the first sample and is advanced from sample to sample.
 
     A sample precedes the updates of its instant. Those of the last one do not happen any more.
 
@@ -41,7 +41,7 @@ def schedule(timings: Sequence[Timing], samples: Array) -> list[Instant]:
         due = ()
     instants: list[Instant] = []
     for sample in samples.tolist():
-        is_begin = bool(instants)  # Of a call of AdvanceTo, whose first instant is the last sample.
+        is_begin = bool(instants)  # A call of AdvanceTo begins, whose first instant is the last sample.
         while now < sample:
             if not is_begin:
                 instants.append(Instant(now, False, due))

@@ -17,18 +17,20 @@ from pydrake.systems.framework import (
     System,
 )
 
-from vtbdrake.argument_checks import suggestion
-from vtbdrake.arrays import Array
+from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.equations import (
     At,
     Draw,
     Equations,
     Expression,
     RefusedSystemError,
+    Timing,
     UnsupportedTestbedError,
     zeros,
 )
 from vtbdrake.compiled.registry import equations_of
+from vtbdrake.compiled.schedule import Instant
 from vtbdrake.state import AddressError, Variables
 from vtbdrake.state.declarations import DISCRETE, PARAMETER
 from vtbdrake.state.layout import StateLayout
@@ -44,8 +46,9 @@ from vtbdrake.state.systems import (
 )
 from vtbdrake.state.variables import A, Place
 from vtbdrake.testbed.dependencies import connections, writer_of
+from vtbdrake.testbed.switch import T_ACT
 
-MEMORY, EXTRA = "memory", "extra"
+EXTRA = "extra"
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Block:
 
     Attributes:
         path: Path of the system.
-        kind: ``discrete`` or ``parameter`` for a group of its context, ``memory`` or ``extra``, see `Equations`.
+        kind: ``discrete`` or ``parameter`` for a group of its context, or ``extra``, see `Equations`.
         name: Number of the group, or the name.
         entries: Where it lies in z.
     """
@@ -67,6 +70,9 @@ class Block:
 
 class Walker:
     """A Diagram as expressions of z, the vector of all its discrete state and parameters, and of the time.
+
+    The last entry of z is the doubt: it becomes positive when the rollout departs from the Diagram's, because a state
+    is not finite, or by `Equations.doubt`, and stays so.
 
     Attributes:
         diagram: The Diagram.
@@ -99,37 +105,19 @@ class Walker:
         self._sources = {reader: writer for writer, reader in connections(diagram)}
         self._paths = {system: path for path, system in leaves(diagram)}
         self._systems = {path: system for system, path in self._paths.items()}
-        self.equations: dict[str, Equations] = {}
+        self._ports = output_ports(diagram)
         self._fixed_inputs: dict[tuple[str, int], Array] = {}
-        self.uncovered: dict[str, str] = {}
-        whole = [variables[address].address.partition("[")[0] for address in varied]
-        refused = [
-            f"{path}: {class_name(system)} has continuous state: give it a time step, or write its update as a "
-            "casadi.Function"
-            for path, system in self._systems.items()
-            if system.GetMyContextFromRoot(context).num_continuous_states()
-        ]
-        if refused:  # Quickly, before equations are written.
-            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
-        for path, system in self._systems.items():
-            try:
-                names = frozenset(filter(None, (self._within(path, address) for address in whole)))
-                self.equations[path] = self._equations_of(path, system, names)
-            except UnsupportedTestbedError as error:
-                self.uncovered[path] = str(error)
-                if _matters(system):
-                    refused.append(f"{path}: {error}")
-        if refused:
-            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
+        self._places: dict[str, slice] = {}
+        bases = [variables[address].address.partition("[")[0] for address in varied]
+        self._refuse_continuous_systems()  # Quickly, before equations are written.
+        self.equations, self.uncovered = self._written_equations(bases)
         self.timings = tuple(dict.fromkeys(when for each in self.equations.values() for when, _ in each.updates()))
         self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
         self._extras = {self._address(b): b.entries for b in self.blocks.values() if b.kind == EXTRA}
-        self.size = max((block.entries.stop for block in self.blocks.values()), default=0)
+        self.size = max((block.entries.stop for block in self.blocks.values()), default=0) + 1
         self.draws = tuple(self._reserved())
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
-        self._places: dict[str, slice] = {}
-        self._ports = output_ports(diagram)
         self._state = _indices(
             block.entries
             for block in self.blocks.values()
@@ -141,12 +129,10 @@ class Walker:
     # -- z
 
     def read(self, context: Context) -> Array:
-        """Return z of a root context, shape (size,); the memory is as at the begin."""
-        z = np.empty(self.size)
+        """Return z of a root context, shape (size,), without doubt."""
+        z = np.zeros(self.size)
         for block in self.blocks.values():
-            if block.kind == MEMORY:
-                z[block.entries] = self.equations[block.path].memory[str(block.name)]
-            elif block.kind == EXTRA:
+            if block.kind == EXTRA:
                 z[block.entries] = np.ravel(self.variables[self._address(block)].get(context))
             else:
                 leaf_context = self._systems[block.path].GetMyContextFromRoot(context)
@@ -154,10 +140,15 @@ class Walker:
         return z
 
     def write(self, z: Array, context: Context) -> None:
-        """Set a root context to z."""
+        """Set a root context to z.
+
+        Args:
+            z: The vector z, shape (size,).
+            context: The root context, whose state and parameters are set; its time is left as it is.
+        """
         self._write_extras(z, context)
         for block in self.blocks.values():
-            if block.kind not in (MEMORY, EXTRA):
+            if block.kind != EXTRA:
                 leaf_context = self._systems[block.path].GetMyMutableContextFromRoot(context)
                 write_group(leaf_context, block.kind, int(block.name), z[block.entries])
 
@@ -170,7 +161,7 @@ class Walker:
             values: Address -> values, of shape (1 or n, size of the variable).
 
         Raises:
-            ValueError: A value is impossible: an inertia is not that of a rigid body.
+            ValueError: A value is impossible: no rigid body has this inertia.
         """
         extras = self._extras
         values = {address: value for address, value in values.items() if address.partition("[")[0] in extras}
@@ -226,7 +217,7 @@ class Walker:
         return f" ({', '.join([*differing[:3], *(['...'] if differing[3:] else [])])})" if differing else ""
 
     def place(self, address: str) -> slice:
-        """Return where the value of a variable lies in z, to be varied.
+        """Return the slice of z that holds the value of a variable, to be varied.
 
         Raises:
             ValueError: It does not lie there, or is compiled in; the reason is named.
@@ -242,7 +233,7 @@ class Walker:
         return self._places[address]
 
     def _lies(self, address: str) -> slice | None:
-        """Return where a variable lies in z, if it does."""
+        """Return the slice of z that holds a variable, if it is there."""
         variable = self.variables[address]
         size = int(np.prod(variable.shape, dtype=int))
         if variable.place is not None:
@@ -266,6 +257,10 @@ class Walker:
     def check_fixed(self, z: Array, compiled: Array) -> None:
         """Check that vectors z, shape (n, size), have the values of the compiled one in what is compiled in.
 
+        Args:
+            z: The vectors to check, a row each.
+            compiled: The vector z with what was compiled in, shape (size,).
+
         Raises:
             UnsupportedTestbedError: They differ.
         """
@@ -275,12 +270,8 @@ class Walker:
             )
             raise UnsupportedTestbedError(f"{path} differs from what was compiled: {why}")
 
-    def is_finite(self, z: Array) -> Any:
-        """Return whether all state of each z is finite, shape (n,)."""
-        return np.isfinite(z[:, self._state]).all(axis=1)
-
     def shared_with(self, layout: StateLayout) -> tuple[Array, Array]:
-        """Return where numbers of a layout lie in z, and where they lie among its numbers: two arrays of indices."""
+        """Return two arrays of indices: of a layout's numbers in z, and among the numbers of the layout."""
         pairs = [
             (block.entries, place)
             for block in self.blocks.values()
@@ -292,30 +283,50 @@ class Walker:
 
     # -- expressions
 
-    def update(self, z: Expression, time: Expression, due: Sequence[int], w: Expression) -> Expression:
-        """Return z after the updates of an instant: the unrestricted ones, then the discrete ones."""
-        for unrestricted in (True, False):
-            at = Evaluation(self, z, time, w)
-            following = casadi.SX(z)
-            for path, equations in self.equations.items():
-                for timing, update in equations.updates():
-                    if timing.unrestricted != unrestricted or self.timings.index(timing) not in due:
-                        continue
-                    with _addressed(path):
-                        values = update(at.of(path))
-                    for name, value in values.items():
-                        kind = DISCRETE if isinstance(name, int) else MEMORY
-                        following[self.blocks[path, kind, name].entries] = value
-            z = following
-        return z
+    def update(self, timing: Timing, at: InstantOutputs, z: Expression) -> Expression:
+        """Return z after the updates of a timing.
 
-    def output(self, address: str, z: Expression, time: Expression, w: Expression) -> Expression:
-        """Return the value of a variable or of a vector output port, as an expression, shape (n, 1)."""
+        Args:
+            timing: One of ``timings``.
+            at: The outputs before all updates of its kind.
+            z: The vector z after the updates of other timings of its kind, if they are due.
+        """
+        following = casadi.SX(z)
+        places: list[slice] = []
+        for path, equations in self.equations.items():
+            for update in [update for when, update in equations.updates() if when == timing]:
+                with _addressed(path):
+                    values = update(at.of(path))
+                for number, value in values.items():
+                    entries = self.blocks[path, DISCRETE, number].entries
+                    if entries.start < entries.stop:
+                        places.append(entries)
+                        following[entries] = value
+        changed = following[np.intersect1d(_indices(places), self._state).tolist()]
+        following[-1] = casadi.fmax(z[-1], casadi.fmax(self._doubt(at), _doubt_about(changed)))
+        return casadi.densify(following)
+
+    def record(self, addresses: Sequence[str], at: InstantOutputs) -> tuple[dict[str, Expression], Expression]:
+        """Return the values of variables and of vector output ports, each of shape (n, 1), and the doubt about them.
+
+        Args:
+            addresses: Addresses of the variables or of the output ports, or ``time``.
+            at: The outputs at the instant.
+        """
+        values = {address: self._value(address, at) for address in addresses}
+        return values, casadi.fmax(self._doubt(at), _doubt_about(at.z[self._state.tolist()]))
+
+    def _doubt(self, at: InstantOutputs) -> Expression:
+        """Return the doubt at an instant; all that counts there has been written."""
+        doubts = [equations.doubt(at.of(path)) for path, equations in self.equations.items()]
+        return casadi.mmax(casadi.vertcat(at.z[-1], *(doubt for doubt in doubts if doubt is not None)))
+
+    def _value(self, address: str, at: InstantOutputs) -> Expression:
         if address == "time":
-            return time
+            return at.time
         if address in self.variables:
             entries = self._lies(address)
-            value = self._derived(address, Evaluation(self, z, time, w)) if entries is None else z[entries]
+            value = self._derived(address, at) if entries is None else at.z[entries]
             if value is None:
                 raise ValueError(f"{address} cannot be recorded in the compiled testbed: {self._reason(address)}")
             return value
@@ -323,10 +334,9 @@ class Walker:
         if port.get_data_type() != PortDataType.kVectorValued:
             raise ValueError(f"{address} is an abstract port, whose value cannot be recorded in a compiled testbed")
         leaf, number = writer_of(system, port.get_index())
-        evaluation = Evaluation(self, z, time, w)
-        return casadi.densify(evaluation.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
+        return casadi.densify(at.output(self._paths[leaf], leaf.get_output_port(number).get_name()))
 
-    def _derived(self, address: str, evaluation: Evaluation) -> Expression | None:
+    def _derived(self, address: str, evaluation: InstantOutputs) -> Expression | None:
         """Return the value of a variable that its system computes from the state, if it has an expression."""
         if self.variables[address].derived:
             for path, equations in self.equations.items():
@@ -350,7 +360,12 @@ class Walker:
         return self._ports[address]
 
     def source(self, path: str, number: int) -> tuple[str, str] | None:
-        """Return (path, name) of the output port that is connected to an input port of a leaf system, if any."""
+        """Return (path, name) of the output port that is connected to an input port of a leaf system, if any.
+
+        Args:
+            path: Path of the leaf system.
+            number: Index of the input port.
+        """
         source = self._sources.get((self._systems[path], number))
         if source is None:
             return None
@@ -358,7 +373,12 @@ class Walker:
         return self._paths[system], system.get_output_port(port).get_name()
 
     def fixed_input(self, path: str, number: int) -> Expression | None:
-        """Return the value that is fixed at an input port to which nothing is connected, if any."""
+        """Return the value that is fixed at an input port to which nothing is connected, if any.
+
+        Args:
+            path: Path of the leaf system.
+            number: Index of the input port.
+        """
         value = self._fixed_value(self.context, path, number)
         if value is None:
             return None
@@ -379,6 +399,52 @@ class Walker:
         return np.array(port.Eval(leaf_context))
 
     # -- how it is done
+
+    def _refuse_continuous_systems(self) -> None:
+        """Refuse systems with continuous state, but for the ones that the testbed has for them, and name the remedies.
+
+        Raises:
+            UnsupportedTestbedError: There are some.
+        """
+        continuous = [
+            (path, system)
+            for path, system in self._systems.items()
+            if system.GetMyContextFromRoot(self.context).num_continuous_states()
+        ]
+        # Where the world is continuous, the actuators' switches have states that notice what is not finite.
+        users = [(path, system) for path, system in continuous if not path.startswith(T_ACT)] or continuous
+        remedies = [
+            f"{path}: {class_name(system)} has continuous state, and a compiled rollout has steps: "
+            + (
+                "give it a time step (MultibodyPlantConfig(time_step=0.001)), or take another executor"
+                if is_plant(system)
+                else "give it a time step, write its update as a casadi.Function, or take another executor"
+            )
+            for path, system in users
+        ]
+        if remedies:
+            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(remedies)}")
+
+    def _written_equations(self, varied: Sequence[str]) -> tuple[dict[str, Equations], dict[str, str]]:
+        """Return the equations of systems by path, and why the other systems have none.
+
+        Args:
+            varied: Addresses of whole variables that will be varied.
+
+        Raises:
+            UnsupportedTestbedError: One of the others computes something.
+        """
+        equations: dict[str, Equations] = {}
+        uncovered: dict[str, str] = {}
+        for path, system in self._systems.items():
+            names = frozenset(filter(None, (self._within(path, address) for address in varied)))
+            try:
+                equations[path] = self._equations_of(path, system, names)
+            except UnsupportedTestbedError as error:
+                uncovered[path] = str(error)
+        if refused := [f"{path}: {why}" for path, why in uncovered.items() if _matters(self._systems[path])]:
+            raise UnsupportedTestbedError(f"the testbed cannot be compiled: {'; '.join(refused)}")
+        return equations, uncovered
 
     def _equations_of(self, path: str, system: System, names: frozenset[str]) -> Equations:
         leaf_context = system.GetMyContextFromRoot(self.context)
@@ -428,7 +494,6 @@ class Walker:
             if not is_plant(equations.system):
                 count = leaf_context.num_numeric_parameter_groups()
                 sizes += [(PARAMETER, i, leaf_context.get_numeric_parameter(i).size()) for i in range(count)]
-            sizes += [(MEMORY, name, 1) for name in equations.memory]
             sizes += [(EXTRA, name, size) for name, size in equations.extras.items()]
             for kind, name, size in sizes:
                 yield Block(path, kind, name, slice(start, start + size))
@@ -467,22 +532,26 @@ class Walker:
                 seeds[:, k] = z[:, self.blocks[path, PARAMETER, group].entries.start + entry]
         return seeds
 
-    def draw_numbers(self, seeds: Array, time: float, due: Sequence[int], w: Array) -> None:
-        """Write the random numbers and other data of an instant into w, shape (noise,).
+    def draw_numbers(self, seeds: Array, instants: Sequence[Instant], count: int) -> Array:
+        """Return the random numbers and other data of instants, shape (n, count, noise), 0 where none are used.
 
         Args:
-            seeds: The seeds of the draws, shape (draws,).
-            time: The time (s).
-            due: The timings of the updates.
-            w: Where the numbers go.
+            seeds: The seeds of the draws, shape (n, draws).
+            instants: The instants.
+            count: The number of rows, at least one for each instant.
         """
-        for seed, (path, _, draw, entries) in zip(seeds.tolist(), self.draws, strict=True):
+        numbers = np.zeros((len(seeds), count, max(1, self.noise)))
+        for column, (path, _, draw, entries) in zip(seeds.T, self.draws, strict=True):
             timing = self.equations[path].timing
-            if timing is None or self.timings.index(timing) in due:
-                w[entries] = draw.numbers(int(seed), time)
+            number = None if timing is None else self.timings.index(timing)
+            due = [k for k, instant in enumerate(instants) if number is None or number in instant.updates]
+            times = np.array([instants[k].time for k in due])
+            is_same = bool((column == column[0]).all())
+            numbers[:, due, entries] = draw.numbers(column[:1] if is_same else column, times)
+        return numbers
 
 
-class Evaluation:
+class InstantOutputs:
     """The outputs of all systems at one instant, each computed once.
 
     Args:
@@ -499,11 +568,15 @@ class Evaluation:
         self.shared: dict[tuple[str, str], Any] = {}
 
     def of(self, path: str) -> At:
-        """Return what the system at a path reads."""
+        """Return the inputs, state and parameters that the system at a path reads."""
         return _Reading(self, path)
 
     def output(self, path: str, port: str) -> Expression:
         """Return the value of an output port of a leaf system.
+
+        Args:
+            path: Path of the leaf system.
+            port: Name of its output port.
 
         Raises:
             UnsupportedTestbedError: The system cannot be compiled, or is part of an algebraic loop.
@@ -534,7 +607,7 @@ def _addressed(path: str) -> Iterator[None]:
 class _Reading(At):
     """What the system at a path reads in an evaluation."""
 
-    def __init__(self, evaluation: Evaluation, path: str) -> None:
+    def __init__(self, evaluation: InstantOutputs, path: str) -> None:
         self._evaluation, self._path = evaluation, path
         self.time = evaluation.time
 
@@ -559,9 +632,6 @@ class _Reading(At):
     def parameter(self, group: int) -> Expression:
         return self._entries(PARAMETER, group)
 
-    def memory(self, name: str) -> Expression:
-        return self._entries(MEMORY, name)
-
     def extra(self, name: str) -> Expression:
         return self._entries(EXTRA, name)
 
@@ -570,6 +640,9 @@ class _Reading(At):
         if key not in shared:
             shared[key] = make()
         return shared[key]
+
+    def is_shared(self, name: str) -> bool:
+        return (self._path, name) in self._evaluation.shared
 
     def draw(self, name: str) -> Expression:
         draws = self._evaluation.walker.draws
@@ -583,6 +656,11 @@ class _Reading(At):
         if isinstance(port, int):
             return port
         return int(self._evaluation.walker.equations[self._path].system.GetInputPort(port).get_index())
+
+
+def _doubt_about(state: Expression) -> Expression:
+    """Return infinity if an entry of the state is not finite, else 0."""
+    return casadi.if_else(casadi.fabs(casadi.sum1(casadi.vec(state))) < np.inf, 0.0, np.inf)
 
 
 def _indices(places: Iterable[slice]) -> Array:

@@ -13,18 +13,28 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
 
 Numbers = TypeVar("Numbers", float, Array)
 
 
 def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Return the value below which a chi-square variable of ``degrees`` of freedom lies with ``probability``."""
+    """Return the value below which a chi-square variable of ``degrees`` of freedom lies with ``probability``.
+
+    Args:
+        probability: The probability, in [0, 1].
+        degrees: The number of degrees of freedom, at least 1.
+    """
     return 2.0 * float(gammaincinv(0.5 * degrees, probability))
 
 
 def squared_distances(nu: Array, S: Array) -> Array:
-    """Return d² = νᵀ S⁻¹ ν, (...), of innovations (..., n) with covariances (..., n, n)."""
+    """Return d² = νᵀ S⁻¹ ν, (...), of innovations (..., n) with covariances (..., n, n).
+
+    Args:
+        nu: The innovations ν.
+        S: Their covariances, in the squared unit of ν; the leading axes are broadcast.
+    """
     if nu.shape[-1] != 2:
         weighted = np.linalg.solve(S, nu[..., np.newaxis])[..., 0]
         return np.asarray((nu * weighted).sum(axis=-1))
@@ -84,6 +94,13 @@ def kalman_update(P: Array, nu: Array, *, H: Array, R: Array) -> KalmanUpdate:
 
 
 def weighted_mean(x: Numbers, deviation_x: Numbers, y: Numbers, deviation_y: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the mean of two measurements of a number by their inverse variances, and its deviation; also of arrays."""
+    """Return the mean of two measurements of a number by their inverse variances, and its deviation; also of arrays.
+
+    Args:
+        x: The first measurement.
+        deviation_x: Its standard deviation, in the same unit.
+        y: The second measurement, in the same unit.
+        deviation_y: Its standard deviation; at most one of the two is 0.
+    """
     K = deviation_x**2 / (deviation_x**2 + deviation_y**2)
     return x + K * (y - x), K**0.5 * deviation_y

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 if TYPE_CHECKING:
     from pydrake.geometry import InMemoryMesh
@@ -45,12 +45,22 @@ def obj_mesh(
 
 
 def obj_lines(form: str, rows: NDArray[Any]) -> str:
-    """Return a line of text for each row of numbers, (n, k), formatted at once, which is faster."""
+    """Return a line of text for each row of numbers, (n, k), formatted at once, which is faster.
+
+    Args:
+        form: The line, with a %-format for each of the k numbers.
+        rows: The numbers of the lines.
+    """
     return (form + "\n") * len(rows) % tuple(rows.ravel().tolist())
 
 
 def surface_mesh(surface: Surface, *, name: str = "mesh") -> InMemoryMesh:
-    """Return a surface as a mesh that cameras, scanners and Meshcat show, smoothly shaded."""
+    """Return a surface as a mesh that cameras, scanners and Meshcat show, smoothly shaded.
+
+    Args:
+        surface: Vertices in m, (n, 3), and the vertices of each triangle, (m, 3), counterclockwise from outside.
+        name: A hint that appears in Drake's messages.
+    """
     vertices, triangles = surface
     return obj_mesh(vertices, triangles, normals=vertex_normals(surface), name=name)
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.extras import extra_module
 from vtbdrake.components.ray_kernel import keep_nearest, to_body, to_world
-from vtbdrake.lazy import extra_module
 
 if TYPE_CHECKING:
     from pydrake.geometry import Role, SceneGraph, Shape
@@ -48,7 +48,7 @@ class Hits:
 
 
 @dataclass(frozen=True)
-class _Group:
+class _WeldedBodies:
     """Bodies that are welded together, as one scene in the frame of one of them."""
 
     body: int
@@ -58,9 +58,9 @@ class _Group:
 
 
 class RayCaster:
-    """Casts rays at the bodies of a plant, each of which moves while the rays are fired.
+    """Casts rays at the bodies of a plant, which move while the rays are fired.
 
-    The geometry is that of the SceneGraph's model: boxes, spheres, ellipsoids, cylinders, capsules, half spaces, Convex
+    The geometry is the SceneGraph model's: boxes, spheres, ellipsoids, cylinders, capsules, half spaces, Convex
     shapes and meshes (OBJ), of the bodies of the plant and of the world. Embree casts rays at triangles, with 32 bits.
     So curved surfaces become facets, at most `TOLERANCE` below the surface, and a half space a square of the side
     `HALF_SPACE`. Bodies that are welded together share a scene; rays are transformed into its frame.
@@ -188,7 +188,7 @@ def body_surfaces(
     return surfaces
 
 
-def _group(body: int, surfaces: Sequence[Surface], device: Any) -> _Group:
+def _group(body: int, surfaces: Sequence[Surface], device: Any) -> _WeldedBodies:
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -203,7 +203,7 @@ def _group(body: int, surfaces: Sequence[Surface], device: Any) -> _Group:
     radius = margin + float(np.linalg.norm(corners - center, axis=1).max())
     # The first run builds the scene: afterwards nothing changes it, and threads can share it.
     scene.run(np.zeros((1, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32))
-    return _Group(body, scene, np.concatenate([center, [radius], lower, upper]))
+    return _WeldedBodies(body, scene, np.concatenate([center, [radius], lower, upper]))
 
 
 def _surface(shape: Shape, name: str) -> Surface:

@@ -1,7 +1,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
 
 Singles = NDArray[np.float32]
 

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 _CHECKED = "VTBDRAKE_RENDERING"
 _PROBE_TIMEOUT = 60.0  # s
 # The renderers in the scene of a camera.
-SUN, FILL = "sun", "fill"
+SUN = "sun"
+FILL = "fill"
 FULL_SCALE = 255.0
 """The counts of a saturated pixel."""
 # Shapes with an inside, in which a camera sees nothing.
@@ -74,7 +75,7 @@ print(json.dumps({"renderer": (name or b"unknown").decode(), "images_per_second"
 
 
 class RenderingError(RuntimeError):
-    """This machine cannot render images, or not those of a scene."""
+    """This machine cannot render images, or not the images of a scene."""
 
 
 def check_rendering() -> None:
@@ -94,9 +95,14 @@ def check_rendering() -> None:
 
 @dataclass(frozen=True)
 class RenderingSpeed:
-    """How fast this machine renders colour images of 640 x 480 pixels, of 20 balls without shadows."""
+    """How fast this machine renders colour images of 640 x 480 pixels, of 20 balls without shadows.
 
-    renderer: str  # what OpenGL calls its back end: a graphics card, or llvmpipe, which computes on the processor
+    Attributes:
+        renderer: What OpenGL calls its back end: a graphics card, or llvmpipe, which computes on the processor.
+        images_per_second: The number of images per second.
+    """
+
+    renderer: str
     images_per_second: float
 
     @property
@@ -115,7 +121,7 @@ def measure_rendering() -> RenderingSpeed:
 
 
 def _run_probe(program: str) -> str:
-    """Return what a program prints that renders in another process."""
+    """Return the output of a program that renders in another process."""
     command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}{program}"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False)
@@ -133,13 +139,16 @@ def _run_probe(program: str) -> str:
 
 @dataclass(frozen=True)
 class Illumination:
-    """The light in which a camera renders its scene."""
+    """The light in which a camera renders its scene.
 
-    # The value of the port ``light`` of a `Light`; empty: a white light from the camera, before Drake's sky.
+    Attributes:
+        light: The value of the port ``light`` of a `Light`; empty: a white light from the camera, before Drake's sky.
+        exposure: Factor of all brightness.
+        lamp: Brightness of a white surface in front of the camera's own lamp, at a distance of 1 m.
+    """
+
     light: tuple[float, ...] = ()
-    # Factor of all brightness.
     exposure: float = 1.0
-    # Brightness of a white surface in front of the camera's own lamp, at a distance of 1 m.
     lamp: float = 0.0
 
     @property
@@ -168,50 +177,77 @@ class Illumination:
         return MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL", lights=lights, default_clear_color=shown))
 
 
-class RenderedScene:
-    """A copy of the perception geometry of a scene, with renderers of its own.
+class _CopiedScene:
+    """A copy of all geometry of a scene with a perception role, with renderers of its own.
 
-    It is a cache: what it shows depends on the arguments of `view` only.
+    Args:
+        inspector: The geometry; its ids are kept as plain numbers, which keep nothing alive.
+
+    Raises:
+        RenderingError: This machine cannot render, or a deformable geometry is to be rendered.
     """
 
-    def __init__(self) -> None:
-        self._version: GeometryVersion | None = None
+    def __init__(self, inspector: SceneGraphInspector) -> None:
+        from pydrake.geometry import GeometryFrame, GeometryInstance, ProximityProperties, Role, SceneGraph
+
+        check_rendering()
+        self._scene_graph = SceneGraph()
+        self._source = self._scene_graph.RegisterSource("copy")
+        world = inspector.world_frame_id()
+        frames = {world: self._scene_graph.world_frame_id()}
+        for geometry in inspector.GetAllGeometryIds(Role.kPerception):
+            name = inspector.GetName(geometry)
+            if inspector.IsDeformableGeometry(geometry):
+                raise RenderingError(f"{name} is deformable, which cameras cannot show: remove its perception role")
+            frame = inspector.GetFrameId(geometry)
+            if frame not in frames:
+                made = GeometryFrame(f"{frame.get_value()}")
+                frames[frame] = self._scene_graph.RegisterFrame(self._source, made)
+            shape = inspector.GetShape(geometry)
+            copied = GeometryInstance(inspector.GetPoseInFrame(geometry), shape, f"{geometry.get_value()} {name}")
+            copied.set_perception_properties(inspector.GetPerceptionProperties(geometry))
+            if type(shape).__name__ in _WITH_INSIDE:
+                copied.set_proximity_properties(ProximityProperties())
+            self._scene_graph.RegisterGeometry(self._source, frames[frame], copied)
+        del frames[world]
+        self._frames = tuple(frames.items())
+        self._context = self._scene_graph.CreateDefaultContext()
+        self._version: GeometryVersion = copy.copy(inspector.geometry_version())
         self._illumination: Illumination | None = None
         self._renderers: list[str] = []
 
-    def __deepcopy__(self, memo: object) -> RenderedScene:
-        # Each Context has its own, made at its first image: a renderer belongs to one thread at a time.
-        return RenderedScene()
+    def is_of(self, inspector: SceneGraphInspector) -> bool:
+        """Return whether the geometry is still the same."""
+        from pydrake.geometry import Role
 
-    def view(self, query: QueryObject, illumination: Illumination) -> QueryObject:
-        """Return the scene of ``query`` for rendering with `SUN`, `FILL` and `darker`, in its present poses.
+        return bool(self._version.IsSameAs(inspector.geometry_version(), Role.kPerception))
 
-        The inside of primitive shapes can be found by ``ComputeSignedDistanceToPoint``.
+    def light(self, illumination: Illumination) -> None:
+        """Make the renderers anew if the light differs from the last one."""
+        if illumination == self._illumination:
+            return
+        for name in self._renderers:
+            self._scene_graph.RemoveRenderer(self._context, name)
+        self._illumination, self._renderers = illumination, []
+        for name in (SUN, FILL):
+            self._add(name, illumination.renderer(name))
 
-        Raises:
-            RenderingError: This machine cannot render, or a deformable geometry is to be rendered.
-        """
-        from pydrake.geometry import FramePoseVector, Role
+    def at_poses(self, query: QueryObject) -> QueryObject:
+        """Return the copy in the present poses of a scene."""
+        from pydrake.geometry import FramePoseVector
 
-        inspector = query.inspector()
-        if self._version is None or not self._version.IsSameAs(inspector.geometry_version(), Role.kPerception):
-            self._build(inspector)
-        if illumination != self._illumination:
-            for name in self._renderers:
-                self._scene_graph.RemoveRenderer(self._context, name)
-            self._illumination, self._renderers = illumination, []
-            for name in (SUN, FILL):
-                self._add(name, illumination.renderer(name))
         poses = FramePoseVector()
         for theirs, ours in self._frames:
             poses.set_value(ours, query.GetPoseInWorld(theirs))
         self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
         return self._scene_graph.get_query_output_port().Eval(self._context)
 
-    def darker(self, name: str, factor: float) -> str:
-        """Return the name of a renderer like `SUN` or `FILL` in the last view, with an exposure divided by ``factor``.
+    def darken(self, name: str, factor: float) -> str:
+        """Return the name of a renderer with an exposure divided by ``factor``, which is made if it is not there yet.
 
-        It is made when it is first asked for.
+        Args:
+            name: `SUN` or `FILL`.
+            factor: The divisor of the exposure.
         """
         darker = f"{name}/{factor:g}"
         if darker not in self._renderers:
@@ -224,37 +260,62 @@ class RenderedScene:
         self._scene_graph.AddRenderer(self._context, name, renderer)
         self._renderers.append(name)
 
-    def _build(self, inspector: SceneGraphInspector) -> None:
-        """Copy all geometry with a perception role; the ids are plain numbers, which keep nothing alive."""
-        from pydrake.geometry import GeometryFrame, GeometryInstance, ProximityProperties, Role, SceneGraph
 
-        check_rendering()
-        scene_graph = SceneGraph()
-        source = scene_graph.RegisterSource("copy")
-        world = inspector.world_frame_id()
-        frames = {world: scene_graph.world_frame_id()}
-        for geometry in inspector.GetAllGeometryIds(Role.kPerception):
-            name = inspector.GetName(geometry)
-            if inspector.IsDeformableGeometry(geometry):
-                raise RenderingError(f"{name} is deformable, which cameras cannot show: remove its perception role")
-            frame = inspector.GetFrameId(geometry)
-            if frame not in frames:
-                frames[frame] = scene_graph.RegisterFrame(source, GeometryFrame(f"{frame.get_value()}"))
-            shape = inspector.GetShape(geometry)
-            copied = GeometryInstance(inspector.GetPoseInFrame(geometry), shape, f"{geometry.get_value()} {name}")
-            copied.set_perception_properties(inspector.GetPerceptionProperties(geometry))
-            if type(shape).__name__ in _WITH_INSIDE:
-                copied.set_proximity_properties(ProximityProperties())
-            scene_graph.RegisterGeometry(source, frames[frame], copied)
-        del frames[world]
-        self._scene_graph, self._source, self._frames = scene_graph, source, tuple(frames.items())
-        self._context = scene_graph.CreateDefaultContext()
-        self._version, self._illumination = copy.copy(inspector.geometry_version()), None
-        self._renderers = []
+class RenderedScene:
+    """A copy of the perception geometry of a scene, with renderers of its own.
+
+    It is a cache: what it shows depends on the arguments of `view` only.
+    """
+
+    def __init__(self) -> None:
+        self._copy: _CopiedScene | None = None
+
+    def __deepcopy__(self, memo: object) -> RenderedScene:
+        # Each Context has its own, made at its first image: a renderer belongs to one thread at a time.
+        return RenderedScene()
+
+    def view(self, query: QueryObject, illumination: Illumination) -> QueryObject:
+        """Return the scene of ``query`` for rendering with `SUN`, `FILL` and `darker`, in its present poses.
+
+        The inside of primitive shapes can be found by ``ComputeSignedDistanceToPoint``.
+
+        Args:
+            query: The scene with its poses, as the query port of its SceneGraph gives it.
+            illumination: Light, exposure and lamp; the renderers are made anew if it differs from the last one's.
+
+        Raises:
+            RenderingError: This machine cannot render, or a deformable geometry is to be rendered.
+        """
+        inspector = query.inspector()
+        if self._copy is None or not self._copy.is_of(inspector):
+            self._copy = _CopiedScene(inspector)
+        self._copy.light(illumination)
+        return self._copy.at_poses(query)
+
+    def darker(self, name: str, factor: float) -> str:
+        """Return the name of a renderer like `SUN` or `FILL` in the last view, with an exposure divided by ``factor``.
+
+        It is made when it is first asked for.
+
+        Args:
+            name: `SUN` or `FILL`.
+            factor: The divisor of the exposure, above 1 for a darker image.
+        """
+        assert self._copy is not None, "there has been no view"
+        return self._copy.darken(name, factor)
 
 
 class RenderedView:
-    """Colour and depth of a scene as one camera sees it, in counts and metres."""
+    """Colour and depth of a scene as one camera sees it, in counts and metres.
+
+    Args:
+        scene: The scene with its renderer.
+        view: The poses of its geometry.
+        info: Size and intrinsics of the camera.
+        limits: The smallest and the largest depth that is rendered, in m.
+        X_WC: The pose of the camera in the world.
+        points: The number of rendered points per pixel, in rows and in columns.
+    """
 
     def __init__(
         self,
@@ -331,7 +392,15 @@ def shade(
     direction: Sequence[float],
     reach: float,
 ) -> None:
-    """Darken the pixels of ``color`` that are in shadow, in place."""
+    """Darken the pixels of ``color`` that are in shadow, in place.
+
+    Args:
+        color: The counts in the light that throws the shadows, linear in light, shape (h, w, 3).
+        camera: The view that it was taken from.
+        depth: The depth z_C of each pixel in m, shape (h, w); inf where nothing is, 0 where it is too close.
+        direction: Direction in which the light travels, in W, of any length.
+        reach: How far away a body may be that throws a shadow, in m.
+    """
     # A smoothed pixel at an edge shows a part of the body, although its centre, where depth is measured, is beside it.
     depth = np.where(np.isinf(depth), minimum_filter(depth, 3), depth)
     visible = (color[..., 0] > 0.0) | (color[..., 1] > 0.0) | (color[..., 2] > 0.0)

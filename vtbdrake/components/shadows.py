@@ -15,21 +15,23 @@ from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, Query
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-# Pixels per side of the sun's depth images, at least and at most.
-_SMALLEST, _LARGEST = 64, 1024
+# Least number of pixels per side of the sun's depth images.
+_SMALLEST = 64
+# Largest number of them.
+_LARGEST = 1024
 # The largest size of their pixels, in distances between neighbouring points.
 _PIXEL = 2.0
 # How often points of different spacings are parted into two halves.
 _PARTINGS = 5
-# How far the sun's camera is away, in radii of what it looks at: its rays diverge by 1/100 (as those of the sun).
+# How far the sun's camera is away, in radii of what it looks at: its rays diverge by 1/100 (as the sun's).
 _FAR = 100.0
-# A point in shadow is farther from the sun than what the sun sees by at least so many of the image's pixels.
+# A point in shadow is farther from the sun than what the sun sees by at least this number of the image's pixels.
 _BIAS = 0.75
 
 
@@ -99,7 +101,7 @@ def _share(query: QueryObject, renderer: str, p_S: Array, spacing: float, R_WS: 
     visible_depth = (1.0 - b) * above + b * below
     pixel = 2.0 * float(radii[:2].max()) / (0.98 * size)
     hidden = z - _BIAS * pixel
-    # Of pixels that are partly in front of the point, the share follows from how far the interpolation lies between
+    # If pixels are partly in front of the point, the share follows from how far the interpolation lies between
     # them and the point. If all of them are in front of it, the point is in shadow.
     nearest, farthest = (f(f(*corners[:2]), f(*corners[2:])) for f in (np.minimum, np.maximum))
     dark = np.clip((hidden - visible_depth) / np.maximum(hidden - nearest, pixel), 0.0, 1.0)

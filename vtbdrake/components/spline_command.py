@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.spline import Spline
+from vtbdrake.common.spline import Spline
 from vtbdrake.state import AddressedSystem, Quantity
 
 # In seconds: a plan that begins at k * period begins at the sample of that number, however both are rounded.

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from pydrake.geometry import Mesh
 
 
-# Of a grained image: the highest frequency of its grain in waves per pixel, and the deviation of the brightness as a
-# share of its mean.
-_FINEST, _CONTRAST = 0.2, 0.22
+# Highest frequency of the grain of an image, in waves per pixel.
+_FINEST = 0.2
+# Standard deviation of the brightness, as a share of its mean.
+_CONTRAST = 0.22
 
 
 def textured_mesh(

@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from vtbdrake.child_process import ChildProcess
-from vtbdrake.frames import CHUNK, LENGTH, FrameConnection, pack, unpack
+from vtbdrake.common.child_process import ChildProcess
+from vtbdrake.common.frames import CHUNK, LENGTH, FrameConnection, pack, unpack
 
 _log = logging.getLogger(__name__)
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.control.robot_mode import ReportedMode, RobotMode
 
 if TYPE_CHECKING:
     # So that a process that only listens on a bus need not load Drake.
@@ -32,6 +37,7 @@ class Bridge(ABC):
         commands: The received commands u that come from outside, by name.
         channels: Channel of the messages of each sensor signal, for a bridge that has channels.
         reported: For the actuator signals that the machine reports: the received command that acts there, by name.
+        robot_mode: The mode that the machine reports, if it does.
         tap: Called with channel and bytes of every message that was received or sent, by a bridge that has channels. It
             must not raise, and costs the loop's time.
         real_time: Whether `poll` waits in real time; False for a bridge of tests that advances a `SimulatedClock`.
@@ -41,6 +47,7 @@ class Bridge(ABC):
     sensed: dict[str, ReceivedSignal]
     commands: dict[str, ReceivedSignal]
     reported: Mapping[str, ReceivedSignal] = MappingProxyType({})
+    robot_mode: ReportedMode | None = None
     channels: Mapping[str, str] = MappingProxyType({})
     tap: Callable[[str, bytes], None] | None = None
     real_time: bool = True
@@ -103,7 +110,7 @@ class Bridge(ABC):
 
     @property
     def blocked_reason(self) -> str | None:
-        """Return why commands that leave do not reach the machine, as far as is known; None if they do."""
+        """Return the reason why commands that leave do not reach the machine, as far as is known; None if they do."""
         return None
 
     @property
@@ -113,7 +120,7 @@ class Bridge(ABC):
 
     @property
     def competing_publisher(self) -> str | None:
-        """Return which other publisher commands the machine at present, as a sentence; None if none is heard."""
+        """Return a sentence about another publisher that commands the machine at present; None if none is heard."""
         return None
 
     @abstractmethod
@@ -121,20 +128,67 @@ class Bridge(ABC):
         """Disconnect; the bridge may be opened again."""
 
 
-def reported_signals(interface: Interface, reported: Mapping[str, str]) -> dict[str, Signal]:
-    """Return the signals that carry the commands that the machine reports as acting, by actuator signal.
+def acts_idle(idle: Mapping[str, ArrayLike]) -> Callable[[Bridge], bool]:
+    """Return a function for `Deployment.released_by`: whether a machine reports that idle commands act.
 
-    They have no limits: they are only observed.
+    A machine that brakes reports them, for example a torque of zero, whatever it is sent.
 
     Args:
-        interface: Signals of the DPS.
-        reported: Actuator signal -> name, in a message, of the signal that reports what acts there.
-
-    Raises:
-        ValueError: There is no such actuator signal, or the name is that of another signal.
+        idle: The idle command by actuator signal, a scalar or one per entry; all of them have to act. Without any, the
+            machine never confirms.
     """
+    return partial(_acts_idle, {name: np.asarray(value, dtype=float) for name, value in idle.items()})
+
+
+def _acts_idle(idle: Mapping[str, NDArray[np.float64]], bridge: Bridge) -> bool:
+    acting = {name: bridge.reported[name].value for name in idle}
+    return bool(idle) and all(
+        v is not None and np.array_equal(v, np.broadcast_to(idle[name], v.shape)) for name, v in acting.items()
+    )
+
+
+class Reports:
+    """The values that a machine reports beside the sensor signals of its DPS: the commands that act, and its mode.
+
+    Attributes:
+        carriers: By actuator signal, the signal in the messages that reports what acts there. It has no limits.
+        signals: All signals of reports.
+        acting: By actuator signal, the received command that acts there.
+        robot_mode: The received mode; None if the machine does not report it.
+    """
+
+    def __init__(self, interface: Interface, reported: Mapping[str, str], robot_mode: RobotMode | None) -> None:
+        """Check the names.
+
+        Args:
+            interface: Signals of the DPS.
+            reported: Actuator signal -> name, in a message, of the signal that reports what acts there.
+            robot_mode: The mode that the machine reports; None if it does not.
+
+        Raises:
+            ValueError: There is no such actuator signal, or another signal has the name of a report.
+        """
+        taken = {signal.name for signal in interface.sense}
+        self.carriers = _carriers(interface, reported, taken)
+        self.signals = list(self.carriers.values())
+        self.acting = {name: ReceivedSignal() for name in self.carriers}
+        self.robot_mode: ReportedMode | None = None
+        if robot_mode is not None:
+            self.signals.append(robot_mode.signal(taken))
+            self.robot_mode = ReportedMode(robot_mode)
+
+    @property
+    def received(self) -> dict[str, ReceivedSignal]:
+        """Return the received reports, by the names of their signals."""
+        received = {carrier.name: self.acting[name] for name, carrier in self.carriers.items()}
+        if self.robot_mode is not None:
+            received[self.robot_mode.mode.carrier] = self.robot_mode.received
+        return received
+
+
+def _carriers(interface: Interface, reported: Mapping[str, str], taken: set[str]) -> dict[str, Signal]:
+    """Return the signals that carry what acts, by actuator signal; add their names to those that are taken."""
     actuators = {signal.name: signal for signal in interface.act}
-    taken = {signal.name for signal in interface.sense}
     carriers = {}
     for name, carrier in reported.items():
         if name not in actuators:

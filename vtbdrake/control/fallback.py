@@ -16,10 +16,15 @@ if TYPE_CHECKING:
 
 
 class Sample(NamedTuple):
-    """The newest plausible sample of a sensor signal."""
+    """The newest plausible sample of a sensor signal.
 
-    value: Any  # an array of shape (size,), or an abstract value
-    age: float  # time since it arrived, in seconds
+    Attributes:
+        value: An array of shape (size,), or an abstract value.
+        age: Time since it arrived, in seconds.
+    """
+
+    value: Any
+    age: float
 
 
 class NoCommand:
@@ -46,6 +51,10 @@ class Fallback(ABC):
     def check_signal(self, signal: Signal, *, interface: Interface) -> None:  # noqa: B027 - most can command anything
         """Check that this fallback can command a signal.
 
+        Args:
+            signal: The actuator signal.
+            interface: All signals of the DPS, such as the sensor signals that the fallback reads.
+
         Raises:
             ValueError: It cannot.
         """
@@ -61,8 +70,8 @@ class Fallback(ABC):
             last_sent: The last sent command, shape (size,).
             sensed: Values of the sensor signals that are fresh and plausible at present. Usually the signal that caused
                 the fault is missing.
-            samples: The newest accepted sample of every sensor signal, however old. Signals of which no sample was ever
-                accepted are missing.
+            samples: The newest accepted sample of every sensor signal, however old. Signals without any accepted sample
+                are missing.
             dt: Time since the cycle before, in seconds.
         """
 
@@ -241,10 +250,16 @@ class FallbackController(Fallback):
         return self.function(last_sent, sensed, samples, dt)
 
 
+_POSITIONS = ("rad", "m")
 _BY_UNIT: dict[str, type[Fallback]] = {
-    **dict.fromkeys(("rad", "m"), Hold),
+    **dict.fromkeys(_POSITIONS, Hold),
     **dict.fromkeys(("rad/s", "m/s", "N", "N m", "A", "V"), Zero),
 }
+
+
+def is_position(signal: Signal) -> bool:
+    """Return whether the unit of a signal is a unit of positions (rad, m, or both)."""
+    return all(unit in _POSITIONS for unit in signal.unit.split(", "))
 
 
 def default_fallback(signal: Signal) -> Fallback:
@@ -264,6 +279,11 @@ def default_fallback(signal: Signal) -> Fallback:
 
 def chain(fallback: Fallback, signal: Signal, *, interface: Interface) -> list[Fallback]:
     """Return a fallback, the one that replaces it if it fails, and so on.
+
+    Args:
+        fallback: The first fallback.
+        signal: The actuator signal that it commands.
+        interface: All signals of the DPS, such as the sensor signals that a fallback reads.
 
     Raises:
         ValueError: One of them is no fallback, or cannot command ``signal``.

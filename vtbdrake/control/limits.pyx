@@ -9,7 +9,7 @@ from libc.stdint cimport int64_t
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport entries_of
+from vtbdrake.common.array_memory cimport entries_of
 from vtbdrake.control.fault import FaultKind
 
 cnp.import_array()
@@ -30,12 +30,12 @@ cdef class Bounds:
     """The values that a signal can have: finite arrays of its size within its limits, or objects of its type.
 
     Args:
-        signal: A vector or an abstract `Signal`; its ``lower`` and ``upper`` limits count.
+        signal: A vector or an abstract `Signal`; its ``lower`` and ``upper`` limits count, and its ``values``.
     """
 
     cdef Py_ssize_t size
     cdef object type
-    cdef double[::1] lower, upper
+    cdef double[::1] lower, upper, values  # the last is empty if all within the limits are allowed
 
     def __init__(self, signal):
         self.size = -1 if signal.size is None else signal.size
@@ -45,6 +45,7 @@ cdef class Bounds:
             # Finite bounds exclude infinite values.
             self.lower = np.maximum(signal.vector(signal.lower), -LARGEST)
             self.upper = np.minimum(signal.vector(signal.upper), LARGEST)
+            self.values = np.array([] if signal.values is None else list(signal.values), dtype=float)
 
     def __eq__(self, other):
         return isinstance(other, Bounds) and (<Bounds>self)._key() == (<Bounds>other)._key()
@@ -53,12 +54,16 @@ cdef class Bounds:
         return hash((self.size, self.type))
 
     cdef tuple _key(self):
-        return (self.type,) if self.size < 0 else (list(self.lower), list(self.upper))
+        return (self.type,) if self.size < 0 else (list(self.lower), list(self.upper), list(self.values))
 
     def violation(self, value):
-        """Return why ``value`` is not one of this signal: ``type``, ``size``, ``limits``, ``not finite`` or ``""``."""
+        """Return why ``value`` is not one of this signal; empty if it is.
+
+        The reason is ``type``, ``size``, ``not finite``, ``limits``, or ``values``: not one of an enumeration.
+        """
         cdef double* entries
-        cdef Py_ssize_t i
+        cdef Py_ssize_t i, k
+        cdef bint listed = True
         cdef bint inside = True
         if self.size < 0:
             return "" if isinstance(value, self.type) else "type"
@@ -75,7 +80,15 @@ cdef class Bounds:
             if not isfinite(entries[i]):
                 return "not finite"
             inside &= self.lower[i] <= entries[i] <= self.upper[i]
-        return "" if inside else "limits"
+            if self.values.shape[0]:
+                for k in range(self.values.shape[0]):
+                    if entries[i] == self.values[k]:
+                        break
+                else:
+                    listed = False
+        if not inside:
+            return "limits"
+        return "" if listed else "values"
 
 
 cdef class JumpBounds:

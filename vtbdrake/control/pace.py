@@ -25,14 +25,14 @@ LOST = 2.0
 class PaceMonitor:
     """Compares the times between the messages that begin a loop's cycles with the period of the DPS.
 
-    Every cycle advances the DPS by one period. If the messages come at another pace, its time is not that of the
-    machine, and its controllers and filters compute with a wrong period.
+    Every cycle advances the DPS by one period. If the messages come at another pace, its time is not the machine's, and
+    its controllers and filters compute with a wrong period.
 
-    Of the last `WINDOW` times, none of which counts for more than `PAUSE` periods, the pace is too quick if half are
-    too short by more than the tolerance, and so is their sum, by `JITTER` periods more. The sum alone would be changed
-    by a late message, the half by messages in pairs. The pace is too slow if nine of ten are too long, and so is
+    Among the last `WINDOW` times (each counts for at most `PAUSE` periods), the pace is too quick if half are too short
+    by more than the tolerance, and so is their sum, by `JITTER` periods more. The sum alone would be changed by a late
+    message, the half by messages in pairs. The pace is too slow if nine of ten are too long, and so is
     their sum: on a busy computer, where a machine loses time, its times vary. It is too slow, too, if the mean is more
-    than `LOST` periods: so many messages are lost that the DPS lives through less than half of the time.
+    than `LOST` periods: then the DPS lives through less than half of the time, because messages are lost.
 
     Args:
         signal: Name of the sensor signal whose messages begin the cycles.
@@ -68,14 +68,14 @@ class PaceMonitor:
 
     @property
     def unknown(self) -> str | None:
-        """Return why the pace is not known yet, as a sentence; None if it is."""
+        """Return the reason why the pace is not known yet, as a sentence; None if it is known."""
         if self.tolerance == inf or len(self._times) >= SETTLED:
             return None
         return f"the pace of {self.signal} is not known yet: {len(self._times)} of {SETTLED} times between messages"
 
     @property
     def problem(self) -> str | None:
-        """Return how the pace differs from the period, as a sentence; None if it does not, or is not known yet."""
+        """Return a sentence about a pace that differs from the period; None if it does not, or is not known yet."""
         count = len(self._times)
         excess, allowed = self._total - count * self.period, (count * self.tolerance + JITTER) * self.period
         quick = self._short > 0.5 * count and excess < -allowed

@@ -37,12 +37,19 @@ class RunawayError(BaseException):
 
 @dataclass(frozen=True)
 class Grant:
-    """The operating system's answer to one request."""
+    """The operating system's answer to one request.
 
-    request: str  # the requested setting
-    granted: bool  # whether it was granted
-    reason: str = ""  # why it was refused; empty if granted
-    remedy: str = ""  # what to do about a refusal; empty if granted
+    Attributes:
+        request: The requested setting.
+        granted: Whether it was granted.
+        reason: Why it was refused; empty if granted.
+        remedy: What to do about a refusal; empty if granted.
+    """
+
+    request: str
+    granted: bool
+    reason: str = ""
+    remedy: str = ""
 
     def __str__(self) -> str:
         return f"{self.request}: " + ("granted" if self.granted else f"refused ({self.reason}): {self.remedy}")
@@ -304,5 +311,7 @@ def _fifo(priority: int) -> Iterator[None]:
             os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
 
 
-_MCL_CURRENT, _MCL_FUTURE = 1, 2  # <sys/mman.h>
-_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # <linux/prctl.h>
+_MCL_CURRENT = 1  # <sys/mman.h>
+_MCL_FUTURE = 2
+_PR_SET_TIMERSLACK = 29  # <linux/prctl.h>
+_PR_GET_TIMERSLACK = 30

@@ -8,6 +8,10 @@ class ReceivedSignal:
     sent: float
     count: int
     rejected: dict[str, int]
+    refused: int
+    refusals: int
+    refused_reason: str
+    refused_value: Any
     bounds: Bounds | None
     def __init__(
         self,
@@ -19,5 +23,5 @@ class ReceivedSignal:
         bounds: Bounds | None = None,
     ) -> None: ...
     def age(self, now: float) -> float: ...
-    def reject(self, reason: str) -> None: ...
+    def reject(self, reason: str, value: Any = None) -> None: ...
     def accept(self, value: Any, arrived: float, sent: float) -> None: ...

@@ -7,18 +7,23 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from functools import partial
-from math import floor, inf, isnan, nan
+from math import inf, isnan
 from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.closing import Closing
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import FAILURES
+from vtbdrake.common.interrupt import interrupts_postponed
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import Clock, SimulatedClock, Throttle, WallClock
-from vtbdrake.control.guards import MOST_UNSENT, Guards
-from vtbdrake.control.pace import PaceMonitor
+from vtbdrake.control.cycle_pace import ClockPace, CyclePace, LockStepPace, MessagePace
+from vtbdrake.control.fault import Fault, FaultKind
+from vtbdrake.control.guards import SOUND, Guards, LoopCondition
+from vtbdrake.control.reception import Reception
 from vtbdrake.control.slow_parts import SlowParts
 from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.control.stepping import ChangeKind, Cycle, Stepped
@@ -32,18 +37,17 @@ from vtbdrake.control.switching import (
     perform,
     prepare,
 )
-from vtbdrake.failures import FAILURES
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed, slow_parts
-from vtbdrake.testbed.interrupt import Interruptible, interrupts_postponed
 from vtbdrake.testbed.testbed import Positions
 
 _log = logging.getLogger(__name__)
 
-_MOST_POLLS = 100  # of what has waited while the loop was held up
-_KEEP_PERIOD = 0.1  # s, for keeping command channels while a paced loop waits
-_WAIT = 0.1  # s, for newer samples after a pause
-_POSTPONED = 2.0  # s, for which Ctrl-C waits at most while the fallbacks bring the machine to rest
-_ENDING = 2.0  # s, to wait at most for the last cycle of another thread
+_POSTPONED = 2.0
+"""Time for which Ctrl-C waits at most while the fallbacks bring the machine to rest, in seconds."""
+
+_ENDING = 2.0
+"""Time to wait at most for the last cycle of another thread, in seconds."""
 
 
 class Runtime(Closing, Stepped):
@@ -86,12 +90,13 @@ class Runtime(Closing, Stepped):
             The first command is compared again, and if it differs by more, the guards latch and nothing is sent.
             With the sensor signal alone, the largest difference is what the rate of the actuator signal allows in a
             period. None, as for a signal that is left out: its commands may jump.
-        blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None.
+        blocked_by: Returns the blocked reason of the machine (why it must not be commanded yet), or None. The mode that
+            the machine reports blocks without it (`Bridge.robot_mode`).
         hint: What an operator does where a switch or a reset is refused because a command would not continue what is
             measured. It is a part of the reason.
         released_by: Returns whether the machine confirms that it does without commands, because its brakes have engaged
             for example: the fallbacks end, which otherwise go on for the guards' ``leave_time`` after a signal has left
-            real, and after the end of a loop.
+            real, and after the end of a loop. The mode that the machine reports may confirm it, too.
         statistics: Statistics of the loop's timing, made for the same period.
         watchers: Called with every `Cycle`. One that raises is removed, and the loop goes on.
 
@@ -123,17 +128,7 @@ class Runtime(Closing, Stepped):
         statistics: LoopStatistics | None = None,
         watchers: tuple[Callable[[Cycle], None], ...] = (),
     ) -> None:
-        if not (0.0 < period < inf):
-            raise ValueError(f"the period of a loop is positive and finite, not {period} s")
-        if pace is not None and pace not in bridge.sensed:
-            raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
-        if not (0.0 < patience < inf):
-            raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {patience}")
-        if pace is not None and bridge.real_time and isinstance(clock, SimulatedClock):
-            raise ValueError(
-                f"a loop paced by {pace!r} waits in real time, while a SimulatedClock stands still: "
-                'let the clock begin the cycles (Deployment(pace="") or Runtime(pace=None)), or use a WallClock'
-            )
+        _check_pace(bridge, clock, period=period, pace=pace, patience=patience)
         self.continuity = checked_continuity(target.interface, continuity or {}, period=period)
         super().__init__(target, bridge, period=period, context=context)
         self.clock = clock or WallClock(spin=1e-4)
@@ -141,26 +136,19 @@ class Runtime(Closing, Stepped):
         self.statistics = statistics or LoopStatistics(period)
         _check_fit(self.guards, self.statistics, target.interface, period)
         self.guards.measured_by = {name: sensor for name, (sensor, _) in self.continuity.items()}
+        self.guards.reported = bridge.reported
         self.blocked_by = blocked_by
         self.hint = hint or "let the DPS command what is measured, by a command u for example, or move the machine"
         self.released_by = released_by
         self.cycles = 0
         self.pace = pace
-        self._pace_monitor = None
-        if pace is not None:
-            self._pace_monitor = PaceMonitor(pace, period, tolerance=self.guards.pace_tolerance)
+        self._reception = Reception(bridge, self.clock, self.guards.monitors, period)
+        self._pace = self._make_pace(patience * period)
         self._left = -1  # The number of cycles after which the loop left.
-        self._paced = 0  # The count of the newest message that has begun a cycle.
-        self._patience = patience * period
         self._watchers = list(watchers)
-        self._read_at = self.clock.now()  # when all that had arrived was read
-        # Between two cycles; after a longer one, what has waited may be too old.
-        ages = [monitor.max_age for monitor in self.guards.monitors.values()]
-        # The machine's time may stand still then, so the stamps of the messages that pace tell it.
-        self._in_lock_step = pace is not None and all(age == inf for age in ages)
-        self._longest_gap = max(min(ages, default=inf), (MOST_UNSENT + 1) * period)
         self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stop = threading.Event()
+        self._interruptible = Interruptible()
         self._runner: threading.Thread | None = None  # that is in `run`
         self._ended = threading.Event()
         self._log_release = Throttle(self.clock)
@@ -169,6 +157,23 @@ class Runtime(Closing, Stepped):
         self._log_foreign = Throttle(self.clock)
         self.slow_parts = SlowParts(
             slow_parts(target.diagram), self._context, period=period, clock=self.clock, changed=self.note_change
+        )
+
+    def _make_pace(self, patience: float) -> CyclePace:
+        """Return the pace of the cycles; ``patience`` is in seconds."""
+        if self.pace is None:
+            return ClockPace(self.period, self.clock, self.statistics, receive=self._receive_early)
+        # The machine's time may stand still then, so the stamps of the messages tell it.
+        in_lock_step = all(monitor.max_age == inf for monitor in self.guards.monitors.values())
+        return (LockStepPace if in_lock_step else MessagePace)(
+            self.period,
+            self.clock,
+            self.statistics,
+            signal=self.pace,
+            bridge=self.bridge,
+            reception=self._reception,
+            guards=self.guards,
+            patience=patience,
         )
 
     def close(self) -> None:
@@ -203,19 +208,18 @@ class Runtime(Closing, Stepped):
             begins = self._read_waiting()
             begin = self.clock.now()
             deadline, done = begin, 0
-            with Interruptible() as interruptible:
+            with self._interruptible:
                 while not self._stop.is_set():
                     if (cycles is not None and done >= cycles) or (seconds is not None and deadline - begin >= seconds):
                         return
-                    due, lateness = (deadline, 0.0) if begins else self._await(deadline)
+                    due, lateness = (deadline, 0.0) if begins else self._pace.wait(deadline, self.active)
                     begins = False
-                    # A loop that is paced by messages has just received them.
-                    self.cycle(due=due, lateness=lateness, poll=self.pace is None)
-                    interruptible.raise_interrupt()
+                    self.cycle(due=due, lateness=lateness, poll=not self._pace.receives)
+                    self._interruptible.raise_interrupt()
                     done += 1
                     if until():
                         return
-                    deadline = self._next(due, lateness)
+                    deadline = self._pace.next_deadline(due, lateness)
         except BaseException:
             self.leave("the loop ended")
             raise
@@ -236,40 +240,17 @@ class Runtime(Closing, Stepped):
         """End `run` after the present cycle. May be called from any thread."""
         self._stop.set()
 
-    def _await(self, deadline: float) -> tuple[float, float]:
-        """Wait for the next cycle; return when it was due and how late it is, in seconds."""
-        if self.pace is None:
-            # Shortly before the deadline, messages that have arrived are received and fed already.
-            return deadline, self.clock.wait_until(deadline, self._receive_early) - deadline
-        paced = self.bridge.sensed[self.pace]
-        count, begin = paced.count, self.clock.now()
-        limit, keep_at = begin + self._patience, begin + _KEEP_PERIOD
-        while paced.count == count:
-            self._read_at = now = self.clock.now()
-            if now >= keep_at:
-                self.bridge.keep(self.active)
-                keep_at = now + _KEEP_PERIOD
-            left = limit - now
-            if left <= 0.0:
-                break
-            self.bridge.poll(min(left, _KEEP_PERIOD))
-        woke = self.clock.now()
-        return woke, max(woke - limit, 0.0)
+    @property
+    def uninterrupted(self) -> AbstractContextManager[None]:
+        """Return a context manager within which Ctrl-C waits, for a watcher whose quick steps belong together.
+
+        So what has been sent is also recorded. Within `run` only; it must not last longer than a few milliseconds.
+        """
+        return self._interruptible.uninterrupted
 
     def _receive_early(self) -> None:
         self.bridge.poll()
         self.feed()
-
-    def _next(self, due: float, lateness: float) -> float:
-        """Return the next deadline; deadlines that have passed already are left out and counted."""
-        now = self.clock.now()
-        if self.pace is not None:
-            self.statistics.miss(self._overrun(lateness, now - due))
-            return now
-        # A deadline that is due just now can still be kept.
-        behind = max(floor((now - due) / self.period), 0)
-        self.statistics.miss(behind)
-        return due + (behind + 1) * self.period
 
     def cycle(self, *, due: float | None = None, lateness: float = 0.0, poll: bool = True) -> Cycle:
         """Run one cycle now and return its record.
@@ -283,12 +264,11 @@ class Runtime(Closing, Stepped):
         due = begin if due is None else due
         if poll:
             self.bridge.poll()
-        if begin - self._read_at > self._longest_gap:
-            self._catch_up(_WAIT)
-        elif lateness > self.period or self.statistics.run:
-            self._read_backlog()
-        now = self._read_at = self.clock.now()
-        pace = self._note_pace()
+        behind = lateness > self.period or self.statistics.run > 0
+        now = self._reception.receive(self.watched, since=begin, behind=behind)
+        off_pace = self._pace.note_cycle()
+        if self.bridge.robot_mode is not None:
+            self.bridge.robot_mode.note_cycle()
         self._serve()
         self.apply_commands(now)
         self.feed()
@@ -303,16 +283,18 @@ class Runtime(Closing, Stepped):
             self.watched,
             actuation,
             active,
-            error=error,
-            missed=self.statistics.run + self._overrun(lateness, stepped - begin),
-            blocked=discontinuous or (self.blocked_reason() if active else None),
-            pace=pace,
-            at=self._time_of_commands(due, stepped),
-            released=bool(self.guards.leaving) and self._released,
+            condition=self._condition(
+                error,
+                missed=self.statistics.run + self._pace.overrun(lateness, stepped - begin),
+                blocked=discontinuous or (self.blocked_reason() if active else None),
+                off_pace=off_pace,
+            ),
+            at=self._pace.time_of_commands(due, stepped),
             all_sensed=self.bridge.sensed,
         )
-        unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
-        self.guards.note_unsent(unsent)
+        with self.uninterrupted:
+            unsent = self.bridge.publish(verdict.actuation) if verdict.actuation else ()
+            self.guards.note_unsent(unsent)
         if unsent or len(verdict.actuation) < len(active):
             self.bridge.keep([name for name in active if name in unsent or name not in verdict.actuation])
         self.slow_parts.send()
@@ -329,6 +311,15 @@ class Runtime(Closing, Stepped):
                 _log.exception("a watcher of the loop raised, and is removed")
                 self._watchers.remove(watcher)
         return done
+
+    def _condition(
+        self, error: BaseException | None, *, missed: int, blocked: str | None, off_pace: str | None
+    ) -> LoopCondition:
+        """Return the condition of a cycle; made only if it is not the usual one."""
+        released = bool(self.guards.leaving) and self._released
+        if error is None and blocked is None and off_pace is None and not missed and not released:
+            return SOUND
+        return LoopCondition(error, missed, blocked, off_pace, released)
 
     def _compare_first(self, actuation: Mapping[str, Any]) -> str | None:
         """Withhold the first commands of a DPS that do not continue what is measured, and return why."""
@@ -347,66 +338,13 @@ class Runtime(Closing, Stepped):
 
     def _read_waiting(self) -> bool:
         """Receive all that has waited since the last run, and return whether it begins a cycle of a paced loop."""
-        count = 0 if self.pace is None else self.bridge.sensed[self.pace].count
-        self._catch_up(inf)
-        self._read_at = self.clock.now()
-        return self.pace is not None and self.bridge.sensed[self.pace].count != count
+        messages = self._pace.messages
+        self._reception.catch_up(self.watched, patience=inf)
+        return self._pace.messages != messages
 
-    def _catch_up(self, patience: float) -> None:
-        """Receive all that has waited in a pause; where that may be too old, wait for newer values.
-
-        Args:
-            patience: The longest wait, in seconds; nothing is waited for longer than its ``max_age`` or `_WAIT`.
-        """
-        begin, ages = self.clock.now(), {name: monitor.max_age for name, monitor in self.guards.monitors.items()}
-        gap = begin - self._read_at
-        old = [name for name, age in ages.items() if gap > max(age, self._longest_gap)]
-        dated_back = bool(old) and self.bridge.note_pause(self._read_at, old)
-        self._read_backlog()
-        limits = {name: begin + min(max(ages[name], _WAIT), patience) for name in old if name in self.watched}
-        while dated_back and any(
-            now < limit and self.bridge.sensed[name].age(now) > ages[name]
-            for now in [self.clock.now()]
-            for name, limit in limits.items()
-        ):
-            self.clock.wait_until(self.clock.now() + self.period)
-            self.bridge.poll()
-
-    def _read_backlog(self) -> None:
-        """Receive all that has waited while the loop did not run: what has just arrived is taken for new."""
-        for _ in range(_MOST_POLLS):
-            if not self.bridge.poll():
-                return
-
-    def _overrun(self, lateness: float, worked: float) -> int:
-        """Return how many deadlines have passed before anything is sent: after an overrun the inputs are stale.
-
-        A paced loop may work for as long as its patience.
-        """
-        if self.pace is not None and worked <= self._patience:
-            worked = 0.0
-        return int((lateness + worked) / self.period)
-
-    def _note_pace(self) -> str | None:
-        """Note the message that has begun this cycle; return how the pace differs from the period, or None."""
-        if self.pace is None or self._pace_monitor is None:
-            return None
-        received = self.bridge.sensed[self.pace]
-        if received.count != self._paced:
-            self._paced = received.count
-            self._pace_monitor.note(received.sent if self._in_lock_step else received.arrived)
-        problem = self._pace_monitor.problem
-        self.statistics.off_pace += problem is not None
-        return problem
-
-    def _time_of_commands(self, due: float, now: float) -> float:
-        """Return the time by which the rates of this cycle's commands are limited.
-
-        Cycles of the clock are due at least a period apart, however late they are.
-        """
-        if self.pace is None:
-            return due
-        return self.bridge.sensed[self.pace].sent if self._in_lock_step else now
+    def note_rejected(self, now: float, name: str, alarm: str) -> None:
+        super().note_rejected(now, name, alarm)
+        self.guards.log.append(Fault(now, None, FaultKind.COMMAND, alarm))
 
     def _note_foreign(self) -> None:
         """Count other publishers' commands while this loop commands, and log them at most once per second."""
@@ -424,8 +362,8 @@ class Runtime(Closing, Stepped):
         machine in lock-step gets one command: it stands still afterwards. Without a cycle since the last call, nothing
         is done. A `run` in another thread is stopped first.
 
-        Ctrl-C, and SIGTERM if it has a handler, are postponed until they have ended, for 2 s at most: a press too many,
-        or one that arrives twice, does not leave a machine with half a command.
+        Ctrl-C, SIGTERM and SIGHUP, if they have a handler, are postponed until they have ended, for 2 s at most: a
+        press too many, or one that arrives twice, does not leave a machine with half a command.
         """
         if self._runner not in (None, threading.current_thread()):
             self.stop()
@@ -436,9 +374,9 @@ class Runtime(Closing, Stepped):
             self._left = self.cycles
             begin = now = self.clock.now()
             # In cycles: on a busy computer they take longer, and each changes a limited command by a period's worth.
-            left = 0.0 if self._in_lock_step else self.guards.leave_time / self.period
+            left = self._pace.cycles_in(self.guards.leave_time)
             verdict = self.guards.latch(
-                reason, now, self.bridge.sensed, at=nan if self._in_lock_step else now, level=logging.INFO
+                reason, now, self.bridge.sensed, at=self._pace.time_of_last_commands(now), level=logging.INFO
             )
             commands = verdict.actuation
             while commands:
@@ -458,28 +396,33 @@ class Runtime(Closing, Stepped):
         except FAILURES:
             released = False  # It does not confirm anything; the fallbacks go on.
             self._log_release(_log.exception, "released_by raised, so the machine is not taken for released")
-        return released or self.bridge.competing_publisher is not None
+        mode = self.bridge.robot_mode
+        return released or (mode is not None and mode.is_released) or self.bridge.competing_publisher is not None
 
     @property
     def pace_problem(self) -> str | None:
-        """Return why the pace of the messages that begin cycles prevents a switch to real, or None.
+        """Return the reason why the pace of the messages that begin cycles prevents a switch to real, or None.
 
         In lock-step it is known only after the switch, because the machine waits for commands.
         """
-        if self._pace_monitor is None:
-            return None
-        return self._pace_monitor.problem or (None if self._in_lock_step else self._pace_monitor.unknown)
+        return self._pace.problem
 
     def blocked_reason(self) -> str | None:
-        """Return why the machine must not be commanded (it is not ready, or commands do not reach it), or None."""
-        return self.bridge.blocked_reason or self.blocked_by()
+        """Return the reason why the machine must not be commanded (not ready, or out of reach), or None."""
+        mode = self.bridge.robot_mode
+        return self.bridge.blocked_reason or (mode and mode.blocked_reason) or self.blocked_by()
 
     # -- switches
 
     def prepare(self, mode: str | None = None, *, sense: Positions = None, act: Positions = None) -> Preparation:
         """Check whether switches can be thrown (first phase), without changing anything.
 
-        The arguments are those of `VirtualTestbed.switch`.
+        See `VirtualTestbed.switch` for the arguments.
+
+        Args:
+            mode: Mode for all switches: ``sim``, ``shadow``, ``real`` or ``twin``; None to name them one by one.
+            sense: Position of the sensor switches, or positions by signal.
+            act: Position of the actuator switches, or positions by signal.
         """
         return prepare(self, mode, sense=sense, act=act)
 
@@ -498,6 +441,11 @@ class Runtime(Closing, Stepped):
 
     def switch(self, mode: str | None = None, *, sense: Positions = None, act: Positions = None) -> None:
         """Prepare and perform a switch, see `prepare`. Call it in the thread that runs the cycles, or between cycles.
+
+        Args:
+            mode: Mode for all switches: ``sim``, ``shadow``, ``real`` or ``twin``; None to name them one by one.
+            sense: Position of the sensor switches, or positions by signal.
+            act: Position of the actuator switches, or positions by signal.
 
         Raises:
             SwitchRefusedError: There are reasons against the switch; nothing has changed.
@@ -535,7 +483,8 @@ class Runtime(Closing, Stepped):
         self.run(until=is_on_real)
         if self.pace is not None:
             # At once: a machine in lock-step sends nothing new before it gets an actuator command.
-            self.cycle()
+            with self._interruptible:
+                self.cycle()
 
     def request(self, action: Callable[[], Any]) -> Future[Any]:
         """Call ``action`` (a `switch`, a `write`) at the beginning of the next cycle. May be called from any thread.
@@ -570,6 +519,20 @@ class Runtime(Closing, Stepped):
         if reasons:
             raise SwitchRefusedError("; ".join(reasons))
         self.note_change(ChangeKind.RESET, {})
+
+
+def _check_pace(bridge: Bridge, clock: Clock | None, *, period: float, pace: str | None, patience: float) -> None:
+    if not (0.0 < period < inf):
+        raise ValueError(f"the period of a loop is positive and finite, not {period} s")
+    if pace is not None and pace not in bridge.sensed:
+        raise ValueError(f"a loop is paced by a sensor signal ({', '.join(bridge.sensed)}), not by {pace!r}")
+    if not (0.0 < patience < inf):
+        raise ValueError(f"the patience of a loop is a positive and finite number of periods, not {patience}")
+    if pace is not None and bridge.real_time and isinstance(clock, SimulatedClock):
+        raise ValueError(
+            f"a loop paced by {pace!r} waits in real time, while a SimulatedClock stands still: "
+            'let the clock begin the cycles (Deployment(pace="") or Runtime(pace=None)), or use a WallClock'
+        )
 
 
 def _check_fit(guards: Guards, statistics: LoopStatistics, interface: Interface, period: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf, isfinite, isnan, nan
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,7 +52,9 @@ class SensorMonitor(StalenessMonitor):
 
     A signal that has never arrived is stale, for any maximum age. A vector is plausible if it has the right size
     and all entries are finite and within lower and upper. An implausible sample is a fault until the next one arrives.
-    Values that the bridge has checked against the same bounds are not checked again.
+    Values that the bridge has checked against the same bounds are not checked again. The bridge keeps the last value
+    while it refuses newer ones; a signal that it refuses more than ten times in a row, or whose every third value it
+    refuses for a while, is implausible until it accepts some again.
 
     A sample that differs from the last accepted one by more than the signal can have changed is a *jump*. The signal
     stays implausible until a sample is close enough to the last accepted one again. While samples are rejected, the
@@ -65,7 +68,7 @@ class SensorMonitor(StalenessMonitor):
             sample to the next by rate * dt + jump_tolerance, with dt between their arrivals: the tolerance covers
             noise and the jitter of the arrival.
         max_delay: Largest excess latency of a sample, in seconds (see `LatencyMonitor`); a later one is stale. Only for
-            a sender whose clock runs as ours does; that of a simulation may stand still.
+            a sender whose clock runs as ours does; a simulation's clock may stand still.
 
     Raises:
         ValueError: ``max_delay`` is not positive, or the signal does not allow ``jump_tolerance``.
@@ -88,7 +91,12 @@ class SensorMonitor(StalenessMonitor):
         self._examines_all = jump_tolerance is not None or max_delay is not None
 
     def stale(self, now: float, received: ReceivedSignal) -> Fault:
-        """Return the fault of a signal that is too old or has never arrived."""
+        """Return the fault of a signal that is too old or has never arrived.
+
+        Args:
+            now: The time on the loop's clock, in seconds.
+            received: What the bridge has received of the signal.
+        """
         name = self.signal.name
         if received.count:
             age = f"{1e3 * received.age(now):.1f} ms old, {1e3 * self.max_age:g} allowed"
@@ -98,10 +106,29 @@ class SensorMonitor(StalenessMonitor):
         if received.rejected:
             rejected = ", ".join(f"{count} {why}" for why, count in received.rejected.items())
             reason += f"; messages rejected so far: {rejected}"
+            if received.refused_value is not None:
+                reason += f" ({self._violation(received.refused_value)})"
         return Fault(now, name, FaultKind.STALE, reason)
 
+    def refusing(self, now: float, received: ReceivedSignal) -> Fault:
+        """Return the fault of a signal whose messages are refused again and again, so that its value is an old one.
+
+        Args:
+            now: The time on the loop's clock, in seconds.
+            received: What the bridge has received, and refused, of the signal.
+        """
+        name, value = self.signal.name, received.refused_value
+        problem = received.refused_reason if value is None else self._violation(value)
+        reason = f"sensor signal {name} is refused again and again, {received.refused} times so far: {problem}"
+        return Fault(now, name, FaultKind.IMPLAUSIBLE, reason)
+
     def examine(self, now: float, received: ReceivedSignal) -> Fault | None:
-        """Return the fault of a new sample, or None."""
+        """Return the fault of a new sample, or None.
+
+        Args:
+            now: The time on the loop's clock, in seconds.
+            received: What the bridge has received of the signal, with the new sample.
+        """
         fault = None
         if self._bounds is not received.bounds:
             if self._bounds == received.bounds:
@@ -136,6 +163,18 @@ class SensorMonitor(StalenessMonitor):
         else:
             reason = f"sensor signal {name} leaves its limits: {np.asarray(value).tolist()}"
         return Fault(now, name, FaultKind.IMPLAUSIBLE, reason)
+
+    def _violation(self, value: Any) -> str:
+        """Return a text with the entry of a value and the limit that it leaves; the type of an abstract value."""
+        if self.signal.size is None:
+            return f"its value is a {type(value).__name__}"
+        entries, lower, upper = map(self.signal.vector, (value, self.signal.lower, self.signal.upper))
+        k = int(np.argmax(np.nan_to_num(np.maximum(entries - upper, lower - entries), nan=inf)))
+        entry = f"{self.signal.name}[{k}]" if self.signal.size > 1 else self.signal.name
+        if not isfinite(entries[k]):
+            return f"{entry} is {entries[k]}"
+        side, limit = ("above", upper[k]) if entries[k] > upper[k] else ("below", lower[k])
+        return f"{entry} is {entries[k]:.5g}, {side} its limit {limit:.5g}"
 
     def _late(self, now: float, received: ReceivedSignal) -> Fault | None:
         if self._latency is None or not (excess := self._latency.excess(received)) > self._latency.limit:

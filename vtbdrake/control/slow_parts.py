@@ -10,14 +10,14 @@ from typing import Any
 
 from pydrake.systems.framework import Context
 
-from vtbdrake.child_process import ProcessStartError
+from vtbdrake.common.child_process import ProcessStartError
+from vtbdrake.common.failures import error_text
+from vtbdrake.common.pickling import dumps
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.clock import Clock, Throttle
 from vtbdrake.control.statistics import Histogram
 from vtbdrake.control.stepping import ChangeKind
-from vtbdrake.control.supervisor import Report, supervise
-from vtbdrake.failures import error_text
-from vtbdrake.pickling import dumps
+from vtbdrake.control.supervisor import SupervisorMessage, supervise
 from vtbdrake.testbed.slow_part import Arrays, SlowPart, split_memory
 
 _log = logging.getLogger(__name__)
@@ -28,14 +28,22 @@ _ROUNDING = 1e-6
 
 @dataclass
 class SlowStatistics:
-    """Statistics of a slow part beside the loop."""
+    """Statistics of a slow part beside the loop.
 
-    results: int = 0  # the number of results that arrived in time
-    missed: int = 0  # the number of results that were declared missing or that the function did not have (None)
-    late: int = 0  # the number of results that arrived after that, and were not used
-    errors: int = 0  # the number of calls of its function that raised an exception
-    restarts: int = 0  # the number of times its worker was replaced, because it died or did not answer
-    # the times from a request to its answer, in seconds on the loop's clock
+    Attributes:
+        results: The number of results that arrived in time.
+        missed: The number of results that were declared missing or that the function did not have (None).
+        late: The number of results that arrived after that, and were not used.
+        errors: The number of calls of its function that raised an exception.
+        restarts: The number of times its worker was replaced, because it died or did not answer.
+        took: The times from a request to its answer, in seconds on the loop's clock.
+    """
+
+    results: int = 0
+    missed: int = 0
+    late: int = 0
+    errors: int = 0
+    restarts: int = 0
     took: Histogram = field(default_factory=Histogram)
 
     def __str__(self) -> str:
@@ -52,6 +60,13 @@ class SlowParts:
     is due by the end of the coming step, and has not arrived, is declared missing; so is one that will not arrive,
     because the function raised an exception or the worker was lost. A worker has one request at a time; samples that
     it cannot begin in time become missing, so that no queue grows.
+
+    Args:
+        parts: The slow parts, by path.
+        context: The root context of the loop.
+        period: The period of the loop, in seconds.
+        clock: The clock of the loop.
+        changed: Called with path and values of a result that has entered the context.
 
     Raises:
         ValueError: A latency is so short that no result could arrive in time, or a function cannot be sent to another
@@ -152,7 +167,7 @@ class _Part:
         self._ready = False
         self._last_failure = ""
         self._log_missed = Throttle(clock)
-        self._answers: list[tuple[Report, Any]] = []
+        self._answers: list[tuple[SupervisorMessage, Any]] = []
         name = f"the supervisor of the slow part {path}"
         self._supervisor = BackgroundProcess(supervise, function, part.patience * part.latency, path, name=name)
 
@@ -171,18 +186,18 @@ class _Part:
                 *(self.path, self._part.latency, reason, self.statistics.missed),
             )
 
-    def _handle(self, kind: Report, content: Any) -> None:
-        self._ready = kind != Report.LOST
-        if kind == Report.LOST:
+    def _handle(self, kind: SupervisorMessage, content: Any) -> None:
+        self._ready = kind != SupervisorMessage.LOST
+        if kind == SupervisorMessage.LOST:
             self.statistics.restarts += 1
             self._fail(self._requested, content)
             self._requested = None
-        elif kind in (Report.RESULT, Report.ERROR):
+        elif kind in (SupervisorMessage.RESULT, SupervisorMessage.ERROR):
             tick, answer = content
             if tick == self._requested:
                 self.statistics.took.record(self._clock.now() - self._requested_at)
                 self._requested = None
-            if kind == Report.RESULT:
+            if kind == SupervisorMessage.RESULT:
                 self._use(tick, answer)
             else:
                 self.statistics.errors += 1

@@ -6,11 +6,17 @@ from libc.stdint cimport int64_t
 from vtbdrake.control.received_signal cimport ReceivedSignal
 
 
+# Of `ReceivedSignal.refusals`: more are a fault. That is more than ten refused values in a row, or one of three for a
+# while.
+cdef int MOST_REFUSALS = 30
+
+
 cdef class StalenessMonitor:
     """Checks a sensor signal's age in every cycle, and each of its values once.
 
-    A subclass defines ``stale(now, received)``, which returns the fault of a stale signal, and ``examine(now,
-    received)``, which returns what is wrong with a new value, or None.
+    A subclass defines ``stale(now, received)``, which returns the fault of a stale signal, ``refusing(now, received)``,
+    which returns the fault of a signal that the bridge refuses again and again, and ``examine(now, received)``, which
+    returns the fault of a new value, or None.
 
     Args:
         max_age: Largest age of a value, in seconds.
@@ -38,6 +44,8 @@ cdef class StalenessMonitor:
             raise TypeError("fault_at() takes the ReceivedSignal of the signal, not None")
         if now - received.arrived > self.max_age or not received.count:
             return self.stale(now, received)
+        if received.refusals > MOST_REFUSALS:
+            return self.refusing(now, received)
         if received.count != self.count:
             self.count = received.count
             if self.trusted is not None and self.trusted is received.bounds:

@@ -11,8 +11,10 @@ from typing import Any
 RESOLUTION = 0.01
 """Ratio of the ends of a bin of a histogram, less one."""
 
-LOWEST, HIGHEST = 1e-6, 10.0
-"""Durations in seconds below and above which all share a bin; also negative ones."""
+LOWEST = 1e-6
+"""Shorter durations share a bin, negative ones too, in seconds."""
+HIGHEST = 10.0
+"""Longer durations share a bin, in seconds."""
 
 _SCALE = 1.0 / log(1.0 + RESOLUTION)
 _SHIFT = 1.0 - _SCALE * log(LOWEST)
@@ -122,12 +124,19 @@ class Histogram:
 
 @dataclass
 class Threshold:
-    """Thresholds of a duration, with counts of the durations above them."""
+    """Thresholds of a duration, with counts of the durations above them.
 
-    warning: float  # longer durations count as warnings, in seconds
-    error: float  # longer durations count as errors, in seconds
-    warnings: int = 0  # number of durations above ``warning``, up to ``error``
-    errors: int = 0  # number of durations above ``error``
+    Attributes:
+        warning: Longer durations count as warnings, in seconds.
+        error: Longer durations count as errors, in seconds.
+        warnings: Number of durations above ``warning``, up to ``error``.
+        errors: Number of durations above ``error``.
+    """
+
+    warning: float
+    error: float
+    warnings: int = 0
+    errors: int = 0
 
 
 QUANTITIES = ("lateness", "step", "cycle")
@@ -166,7 +175,13 @@ class LoopStatistics:
         self._recorders = tuple((self.histograms[name].record, self.thresholds[name]) for name in QUANTITIES)
 
     def record(self, *, lateness: float, step: float, cycle: float) -> None:
-        """Record the durations of one cycle, in seconds."""
+        """Record the durations of one cycle, in seconds.
+
+        Args:
+            lateness: Time from the deadline to the begin of the cycle, in s.
+            step: Time of the DPS's step, in s.
+            cycle: Time of the whole cycle, in s.
+        """
         for (record, threshold), seconds in zip(self._recorders, (lateness, step, cycle), strict=True):
             record(seconds)
             if seconds > threshold.warning:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, Diagram
 
+from vtbdrake.common.failures import FAILURES
 from vtbdrake.control.bridge import Bridge
-from vtbdrake.control.guards import Verdict
+from vtbdrake.control.guards import GuardDecision
 from vtbdrake.control.received_signal import ReceivedSignal
-from vtbdrake.failures import FAILURES
 from vtbdrake.state.systems import leaves
 from vtbdrake.testbed import ActuatorCommand, DpsAlone, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -25,7 +25,7 @@ from vtbdrake.testbed.switch import COMMAND, T_ACT, T_SENSE, Position
 _log = logging.getLogger(__name__)
 
 
-_ON_GRID = 1e-6  # Of a period: a start time this close to a multiple counts as one.
+_ON_GRID = 1e-6  # Share of a period: a start time this close to a multiple counts as one.
 
 
 class ChangeKind(StrEnum):
@@ -57,15 +57,24 @@ class Cycle(NamedTuple):
 
     Together with the state before the first cycle, ``changes`` and ``fed`` of every cycle determine all that the DPS
     does.
+
+    Attributes:
+        number: Number of the cycle, from 0.
+        time: DPS time at the end of the cycle, in seconds; unchanged if the DPS raised or has not started.
+        now: Time on the runtime's clock after the cycle's messages were received, in seconds.
+        changes: Changes of the target before the step, in order.
+        fed: Sensor values that are new to the DPS in this cycle, by signal.
+        actuation: The DPS's actuator commands before the guards, by signal; empty if it raised.
+        verdict: The guards' decision; `GuardDecision.actuation` was sent.
     """
 
-    number: int  # number of the cycle, from 0
-    time: float  # DPS time at the end of the cycle, in seconds; unchanged if the DPS raised or has not started
-    now: float  # time on the runtime's clock after the cycle's messages were received, in seconds
-    changes: tuple[Change, ...]  # changes of the target before the step, in order
-    fed: Mapping[str, Any]  # sensor values that are new to the DPS in this cycle, by signal
-    actuation: Mapping[str, Any]  # the DPS's actuator commands before the guards, by signal; empty if it raised
-    verdict: Verdict  # the guards' decision; `Verdict.actuation` was sent
+    number: int
+    time: float
+    now: float
+    changes: tuple[Change, ...]
+    fed: Mapping[str, Any]
+    actuation: Mapping[str, Any]
+    verdict: GuardDecision
 
 
 def time_after(steps: int, *, start: float, period: float) -> float:
@@ -73,6 +82,11 @@ def time_after(steps: int, *, start: float, period: float) -> float:
 
     If the DPS starts at a multiple of the period, every returned time is a multiple, too: samples are due at the
     multiples, and with an accumulated rounding error a step would now and then contain none or two of an update.
+
+    Args:
+        steps: Number of steps since the start.
+        start: The DPS's time at the start, in seconds.
+        period: Length of a step, in seconds.
     """
     first = round(start / period)
     if steps and abs(first * period - start) <= _ON_GRID * period:
@@ -84,6 +98,10 @@ def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:
     """Return Python's wrappers of all numeric parameters below ``diagram``, to be kept alive while it is stepped.
 
     Otherwise pydrake makes and discards a wrapper (1 us) whenever a system in Python reads its parameters.
+
+    Args:
+        diagram: The Diagram that is stepped.
+        context: Its root context, which owns the parameters.
     """
     contexts = [system.GetMyContextFromRoot(context) for _, system in leaves(diagram)]
     return [
@@ -95,6 +113,10 @@ def numeric_parameters(diagram: Diagram, context: Context) -> list[BasicVector]:
 
 class RealPorts:
     """The ports ``real.sense.*``, ``real.act.*`` and ``real.act.active`` in one context.
+
+    Args:
+        target: The testbed, or the DPS alone.
+        context: The root context.
 
     Attributes:
         feed: Sets the value of a sensor signal's input port: ``feed(name, value)``.
@@ -126,6 +148,35 @@ class RealPorts:
                 value = value.value
             actuation[name] = value
         return actuation
+
+
+class RejectionAlarm:
+    """The alarm about rejected messages of a command u: each is told, together with others of the same second.
+
+    Args:
+        name: Name of the command.
+    """
+
+    _PERIOD = 1.0  # s
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._counts: dict[str, int] = {}  # by reason, of the messages that were told
+        self._alarm_at = -inf
+
+    def due(self, now: float, rejected: Mapping[str, int]) -> str:
+        """Return the alarm at the time ``now`` about counts of rejected messages by reason; empty if none is due.
+
+        Args:
+            now: The time on the loop's clock, in seconds.
+            rejected: Counts of rejected messages since the start, by reason.
+        """
+        if now - self._alarm_at < self._PERIOD or rejected == self._counts:
+            return ""
+        new = {reason: count - self._counts.get(reason, 0) for reason, count in rejected.items()}
+        self._counts, self._alarm_at = dict(rejected), now
+        causes = ", ".join(f"{count} {reason}" for reason, count in new.items() if count > 0)
+        return f"messages with the command {self._name} were rejected: {causes}"
 
 
 class Stepped:
@@ -184,8 +235,7 @@ class Stepped:
             if signal.name in bridge.commands and signal.max_age < inf
         }
         self._lapsing: set[str] = set()
-        # For each command, the reasons to reject it that have been logged.
-        self._logged_rejections: dict[str, frozenset[str]] = dict.fromkeys(bridge.commands, frozenset())
+        self._rejection_alarms = {name: RejectionAlarm(name) for name in bridge.commands}
         self.read_switches()
 
     @property
@@ -237,7 +287,8 @@ class Stepped:
     def apply_commands(self, now: float) -> None:
         """Write the commands u that the bridge has received, and the default of one whose last value is too old.
 
-        One that cannot be written is counted as rejected. Of each reason to reject one, the first case is logged.
+        One that cannot be written is counted as rejected. `note_rejected` gets every rejection, once per second at most
+        for each command.
 
         Args:
             now: Present time on the clock of `ReceivedSignal.arrived`, in seconds.
@@ -255,12 +306,18 @@ class Stepped:
                 self._lapsing.discard(name)
                 self._write_command(name, self._lapses[name][1])
                 _log.warning("no command %s for %g s: it returns to its default", name, max_age)
-            if len(received.rejected) > len(self._logged_rejections[name]):
-                new = ", ".join(received.rejected.keys() - self._logged_rejections[name])
-                _log.warning(
-                    "a message with the command %s was rejected (%s); more like it are only counted", name, new
-                )
-                self._logged_rejections[name] = frozenset(received.rejected)
+            if received.rejected and (alarm := self._rejection_alarms[name].due(now, received.rejected)):
+                self.note_rejected(now, name, alarm)
+
+    def note_rejected(self, now: float, name: str, alarm: str) -> None:
+        """Raise the alarm that messages with the command ``name`` were rejected; ``alarm`` says how many and why.
+
+        Args:
+            now: The time on the loop's clock, in seconds.
+            name: Name of the command u.
+            alarm: The alarm, as a sentence.
+        """
+        _log.error("ALARM: %s", alarm)
 
     def _write_command(self, name: str, value: ArrayLike) -> None:
         address = f"{COMMAND}{name}"
@@ -295,7 +352,12 @@ class Stepped:
         self.note_change(ChangeKind.WRITE, values)
 
     def note_change(self, kind: str, values: Mapping[str, Any]) -> None:
-        """Record a change of the target for the watchers; see `Change`."""
+        """Record a change of the target for the watchers; see `Change`.
+
+        Args:
+            kind: A `ChangeKind`.
+            values: The new values; their keys depend on the kind.
+        """
         self._changes.append(Change(kind, dict(values)))
 
     def actuator_command(self, name: str) -> Any:

@@ -13,11 +13,11 @@ import traceback
 from enum import StrEnum
 from math import inf
 
+from vtbdrake.common.frames import FrameConnection
 from vtbdrake.control.background_process import BackgroundProcess
-from vtbdrake.frames import FrameConnection
 
 
-class Report(StrEnum):
+class SupervisorMessage(StrEnum):
     """The kinds of messages to the loop, which are pairs of a kind and its content."""
 
     READY = "ready"  # for the first request
@@ -42,7 +42,7 @@ def supervise(loop: FrameConnection, function: bytes, patience: float, name: str
             reason = _forward(loop, worker, patience)
         finally:
             worker.kill()
-        loop.send((Report.LOST, reason))
+        loop.send((SupervisorMessage.LOST, reason))
         # A worker that dies at its start must not be restarted all the time.
         if (pause := begin + patience - time.monotonic()) > 0.0:
             try:
@@ -72,14 +72,19 @@ def _forward(loop: FrameConnection, worker: BackgroundProcess, patience: float) 
 
 
 def compute(supervisor: FrameConnection, function: bytes) -> None:
-    """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error)."""
+    """Send READY, then answer every request (tick, arrays) by (tick, arrays) or (tick, traceback of the error).
+
+    Args:
+        supervisor: The connection to the supervisor.
+        function: The pickled function of the slow part, from arrays to arrays; its ``prepare()`` is called once, first.
+    """
     evaluate = pickle.loads(function)
     evaluate.prepare()
-    supervisor.send((Report.READY, None))
+    supervisor.send((SupervisorMessage.READY, None))
     while True:
         tick, arrays = supervisor.receive()
         try:
-            answer = Report.RESULT, (tick, evaluate(arrays))
+            answer = SupervisorMessage.RESULT, (tick, evaluate(arrays))
         except Exception:
-            answer = Report.ERROR, (tick, traceback.format_exc())
+            answer = SupervisorMessage.ERROR, (tick, traceback.format_exc())
         supervisor.send(answer)

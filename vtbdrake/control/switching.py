@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context
 
+from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.control.stepping import ChangeKind
-from vtbdrake.failures import FAILURES, error_text
 from vtbdrake.testbed import DpsAlone, Interface, VirtualTestbed
 from vtbdrake.testbed.switch import Position
 from vtbdrake.testbed.testbed import Positions, wanted_positions
@@ -32,12 +32,19 @@ class SwitchRefusedError(RuntimeError):
 
 @dataclass(frozen=True)
 class Preparation:
-    """The first phase of a switch: the planned changes, and the reasons against them."""
+    """The first phase of a switch: the planned changes, and the reasons against them.
 
-    sense: Mapping[str, Position]  # new positions by sensor signal
-    act: Mapping[str, Position]  # new positions by actuator signal
-    reasons: tuple[str, ...]  # the reasons against the switch; empty if there are none
-    cycle: int  # number of the runtime's cycles when they were collected
+    Attributes:
+        sense: New positions by sensor signal.
+        act: New positions by actuator signal.
+        reasons: The reasons against the switch; empty if there are none.
+        cycle: Number of the runtime's cycles when they were collected.
+    """
+
+    sense: Mapping[str, Position]
+    act: Mapping[str, Position]
+    reasons: tuple[str, ...]
+    cycle: int
 
 
 def prepare(
@@ -51,8 +58,14 @@ def prepare(
 
     A sensor signal that becomes real must be fresh and plausible. If an actuator signal is to be on real, so must all
     sensor signals on real, and the one that its command departs from. The command of an actuator signal that becomes
-    real must continue what is measured. The machine must be ready and connected, and have no other commander. Messages
-    that pace the loop must come once per period.
+    real must continue what is measured. The machine must be ready and connected, report what acts if its protocol says
+    so, and have no other commander. Messages that pace the loop must come once per period.
+
+    Args:
+        runtime: The loop.
+        mode: Mode for all switches: ``sim``, ``shadow``, ``real`` or ``twin``; None to name them one by one.
+        sense: Position of the sensor switches, or positions by signal; None leaves them.
+        act: Position of the actuator switches, or positions by signal; None leaves them.
 
     Raises:
         ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
@@ -82,6 +95,9 @@ def prepare(
             reasons.append(f"the machine must not be commanded: {blocked}")
         if runtime.pace_problem is not None:
             reasons.append(runtime.pace_problem)
+        for name in becoming:
+            if name in runtime.bridge.reported and not runtime.bridge.reported[name].count:
+                reasons.append(f"the machine has never reported what acts on {name}, and is to (Protocol.reported)")
         competing = runtime.bridge.competing_publisher
         if becoming and competing is not None:
             reasons.append(competing)
@@ -94,6 +110,11 @@ def checked_continuity(
     interface: Interface, continuity: Continuity, *, period: float
 ) -> dict[str, tuple[str, NDArray[np.float64]]]:
     """Return the ``continuity`` argument of `Runtime` as sensor signal and largest differences, by actuator signal.
+
+    Args:
+        interface: The signals of the DPS.
+        continuity: By actuator signal: a sensor signal, (sensor signal, largest difference), or None.
+        period: Period of the loop, in seconds: without a largest difference, it is the rate times the period.
 
     Raises:
         ValueError: An entry is none of the three forms, a signal does not exist, two signals have different sizes, a
@@ -131,7 +152,12 @@ def checked_continuity(
 
 
 def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
-    """Return the reasons why commands of actuator signals would not continue the measured values."""
+    """Return the reasons why commands of actuator signals would not continue the measured values.
+
+    Args:
+        runtime: The loop, with the newest measurements.
+        names: The actuator signals that become real.
+    """
     reasons = []
     for name in names:
         if name not in runtime.continuity:
@@ -156,7 +182,13 @@ def discontinuities(runtime: Runtime, names: Iterable[str]) -> list[str]:
 
 
 def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:
-    """Return why a command does not continue what is measured, and a remedy; empty if it does."""
+    """Return the reasons why a command does not continue the measured value, and a remedy; empty if it does.
+
+    Args:
+        runtime: The loop, with the newest measurements.
+        name: The actuator signal.
+        command: Its command, shape (size,), in the signal's unit.
+    """
     if name not in runtime.continuity:
         return []
     sensor, limit = runtime.continuity[name]
@@ -175,7 +207,13 @@ def discontinuity(runtime: Runtime, name: str, command: Any) -> list[str]:
 
 
 def perform(runtime: Runtime, senses: Mapping[str, Position], acts: Mapping[str, Position]) -> None:
-    """Throw the switches of a preparation without reasons against it; `Runtime.perform` calls this."""
+    """Throw the switches of a preparation without reasons against it; `Runtime.perform` calls this.
+
+    Args:
+        runtime: The loop.
+        senses: New positions by sensor signal.
+        acts: New positions by actuator signal.
+    """
     for name, position in acts.items():
         if position != Position.SIM and name in runtime.continuity and name not in runtime.guards.driven:
             # The actuator commands start from the measured values; a signal that is commanded already goes on.
@@ -198,6 +236,12 @@ def throw(target: VirtualTestbed, context: Context, senses: Mapping[str, str], a
     """Throw switches of a running testbed.
 
     If a signal goes back to sim, the simulated world continues from the DPS's belief of the machine, if it can.
+
+    Args:
+        target: The testbed.
+        context: Its root context, in which the switches are thrown.
+        senses: New positions by sensor signal; the others stay.
+        acts: New positions by actuator signal; the others stay.
     """
     before = target.positions(context)
     target.switch(context, sense=senses or None, act=acts or None)

@@ -1,5 +1,5 @@
 """LCM: the bridge between a testbed and a real machine, the codecs of its messages, and a hub for tcpq."""
 
-from vtbdrake.lazy import lazy_names
+from vtbdrake.common.lazy_names import attach_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

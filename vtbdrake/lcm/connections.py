@@ -40,8 +40,10 @@ _WORDS = struct.Struct(">II")
 _SO_TIMESTAMPNS = 35  # <asm-generic/socket.h>; the type of the control message, too
 _TIMESPEC = struct.Struct("@ll")
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
-"""Seconds between attempts to connect again; each pause is twice the one before."""
+FIRST_PAUSE = 0.005
+"""Seconds before the first attempt to connect again; each later pause is twice the one before."""
+LONGEST_PAUSE = 0.5
+"""Longest pause between two attempts, in seconds."""
 
 
 class RejectedError(ConnectionRefusedError):
@@ -89,7 +91,12 @@ class Connection(ABC):
 
 
 class LibraryConnection(Connection):
-    """A connection by liblcm: udpm, mpudpm, memq, file."""
+    """A connection by liblcm: udpm, mpudpm, memq, file.
+
+    Args:
+        url: The LCM URL of the bus.
+        handlers: By channel, the function that takes its messages.
+    """
 
     def __init__(self, url: str, handlers: Mapping[str, Handler]) -> None:
         try:
@@ -343,7 +350,7 @@ class LcmLink:
 
     @property
     def arrived(self) -> float | None:
-        """Return when the last received message arrived; see `Connection`."""
+        """Return the time at which the last received message arrived; see `Connection`."""
         return None if self._connection is None else self._connection.arrived
 
     @property

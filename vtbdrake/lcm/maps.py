@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from io import BytesIO
 from math import isfinite, nan, prod
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from vtbdrake.lcm.messages import MalformedError, MessageDecoder, MessageEncoder
@@ -37,6 +38,10 @@ _CODES = _NUMBERS | {"byte": "b", "string": "s"}
 
 def decode(message_type: Any, data: bytes) -> Any:
     """Decode one message strictly: all of it, and nothing else.
+
+    Args:
+        message_type: The class of the message, as lcm-gen made it.
+        data: The bytes of the message.
 
     Raises:
         MalformedError: ``fingerprint``: the message is of another type; ``truncated``: its end is missing;
@@ -86,7 +91,7 @@ def no_time(message: Any) -> float:
 class LcmMap:
     """One channel, the type of its messages, and how they become values of signals and the reverse.
 
-    `vector_map` makes one for messages of numbers, `vtbdrake.lcm.arm_messages` and `vtbdrake.lcm.drake_messages` some
+    `vector_map` makes one for messages of numbers, `vtbdrake.lcm.iiwa_messages` and its neighbours some
     for Drake's message types. For everything else, give functions from and to message objects::
 
         LcmMap(channel="GOAL", type=pose_t, signals=("goal",), decode=lambda message: {"goal": to_pose(message)})
@@ -100,6 +105,8 @@ class LcmMap:
         encode: Returns a message from values by signal and the time in microseconds; required for sending. Raises
             LookupError if the message makes no sense without a signal that is missing.
         sent: Returns the sender's time in a message, in seconds; NaN if it has none.
+        sender: Returns the name of a message's sender, an empty one if it has none; None if no message names it. It
+            matters for commands u, which several may send, see `LcmBridge`.
     """
 
     channel: str
@@ -108,6 +115,7 @@ class LcmMap:
     decode: Callable[[Any], Mapping[str, Any]] | None = dataclasses.field(default=None, repr=False)
     encode: Callable[[Mapping[str, Any], int], Any] | None = dataclasses.field(default=None, repr=False)
     sent: Callable[[Any], float] = dataclasses.field(default=no_time, repr=False)
+    sender: Callable[[Any], str] | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signals", tuple(self.signals))
@@ -139,6 +147,14 @@ class LcmMap:
 
         return decode_message
 
+    def sender_of(self, data: bytes) -> str:
+        """Return the name of a message's sender; empty if it names none.
+
+        Raises:
+            MalformedError: The message is not of this channel's type.
+        """
+        return "" if self.sender is None else self.sender(decode(self.type, data))
+
     def encoder(self, signals: Sequence[Signal]) -> Encoder:
         """Return the encoder of this channel's messages; see `decoder`."""
         to_message = self.encode
@@ -159,13 +175,19 @@ class LcmMap:
 
 
 class Field(NamedTuple):
-    """A field of a message type."""
+    """A field of a message type.
 
-    path: str  # its name; dotted if it lies in a message within the message
-    typename: str  # its type in LCM
-    # its shape; the path of another field where that field holds the size. Empty for a scalar.
+    Attributes:
+        path: Its name; dotted if it lies in a message within the message.
+        typename: Its type in LCM.
+        dimensions: Its shape; the path of another field where that field holds the size. Empty for a scalar.
+        members: The fields of a message within the message.
+    """
+
+    path: str
+    typename: str
     dimensions: tuple[int | str, ...] = ()
-    members: tuple[Field, ...] = ()  # the fields of a message within the message
+    members: tuple[Field, ...] = ()
 
     @property
     def code(self) -> str:
@@ -179,7 +201,7 @@ class Field(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Return how many numbers the field has if its dimensions are fixed."""
+        """Return the count of numbers in the field if its dimensions are fixed."""
         return prod(size for size in self.dimensions if isinstance(size, int))
 
 
@@ -214,15 +236,21 @@ def _by_path(fields: Sequence[Field]) -> dict[str, Field]:
 
 @dataclass(frozen=True, kw_only=True)
 class VectorMap(LcmMap):
-    """An `LcmMap` of vector signals; `vector_map` makes one."""
+    """An `LcmMap` of vector signals; `vector_map` makes one.
 
-    # by signal, the fields that hold its entries, one after the other
+    Attributes:
+        parts: By signal, the fields that hold its entries, one after the other.
+        fields: All fields of the message type.
+        stamp: Path of the field with the sender's time in microseconds; empty if there is none.
+        scale: By signal, the factor from the numbers in the message to the values; 1 for the others.
+        constants: Numbers that are the same in every message, by path.
+    """
+
     parts: Mapping[str, Sequence[Field]] = dataclasses.field(repr=False)
-    fields: Sequence[Field] = dataclasses.field(repr=False)  # all fields of the message type
-    stamp: str = ""  # path of the field with the sender's time in microseconds; empty if there is none
-    # by signal, the factor from the numbers in the message to the values; 1 for the others
+    fields: Sequence[Field] = dataclasses.field(repr=False)
+    stamp: str = ""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict, repr=False)
-    constants: Mapping[str, float] = dataclasses.field(default_factory=dict, repr=False)  # by path, in every message
+    constants: Mapping[str, float] = dataclasses.field(default_factory=dict, repr=False)
 
     def decoder(self, signals: Sequence[Signal]) -> Decoder:
         self._check(signals)
@@ -304,6 +332,7 @@ def vector_map(
     fields: Mapping[str, str | Sequence[str]],
     *,
     stamp: str = "utime",
+    sender: str = "",
     scale: Mapping[str, float] | None = None,
     constants: Mapping[str, float] | None = None,
 ) -> VectorMap:
@@ -316,6 +345,7 @@ def vector_map(
             over them. Dotted names reach into messages within the message.
         stamp: Field with the sender's time in microseconds; empty if there is none: late and repeated messages then
             count as new ones.
+        sender: Field with the sender's name, a string; empty if there is none. For commands u that several may send.
         scale: By signal, the factor from the numbers in the message to the values of the signal: 1e-3 for a field in
             mm, -1 for a machine with the opposite sign. 1 for the others.
         constants: By field, a number that it holds in every message that is sent; other fields without a signal are
@@ -342,6 +372,8 @@ def vector_map(
             )
     if stamp and _number_field(message_type, fields_by_path, stamp).dimensions:
         raise ValueError(f"field {stamp} of {message_type.__name__} is no time; give stamp='' if there is none")
+    if sender and (sender not in fields_by_path or fields_by_path[sender][1:3] != ("string", ())):
+        raise ValueError(f"field {sender} of {message_type.__name__} is no string: it holds no sender's name")
     scale = dict(scale or {})
     for name, factor in scale.items():
         if name not in parts or not (isfinite(factor) and factor != 0.0):
@@ -356,6 +388,7 @@ def vector_map(
         parts=parts,
         fields=known_fields,
         stamp=stamp,
+        sender=attrgetter(sender) if sender else None,
         scale=scale,
         constants=_constants(message_type, fields_by_path, constants or {}),
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport entries_of
+from vtbdrake.common.array_memory cimport entries_of
 from vtbdrake.lcm.byte_order cimport (
     get_double,
     get_float,
@@ -45,7 +45,7 @@ cdef struct Dimension:
 cdef struct Field:
     char code  # type as in `struct`; "s" for a string, "{" for a message
     Py_ssize_t width  # of a number, in bytes
-    Py_ssize_t dimension, dimension_end  # its dimensions among those of the layout
+    Py_ssize_t dimension, dimension_end  # its dimensions among the layout's dimensions
     Py_ssize_t end  # behind its members, which follow it
     # In the message that was located last:
     Py_ssize_t offset  # of the first number
@@ -190,7 +190,7 @@ cdef class MessageLayout:
 
 
 cdef class MessageDecoder(MessageLayout):
-    """Decodes messages whose signals are numbers; the arguments are those of `MessageLayout`."""
+    """Decodes messages whose signals are numbers; see `MessageLayout` for the arguments."""
 
     def decode(self, bytes data not None):
         """Decode one message.
@@ -235,7 +235,7 @@ cdef class MessageEncoder(MessageLayout):
 
     Args:
         example: such a message.
-        (others): those of `MessageLayout`.
+        (others): as in `MessageLayout`.
     """
 
     cdef bytes example

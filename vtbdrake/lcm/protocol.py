@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from vtbdrake.lcm.bridge import LcmBridge
+from vtbdrake.control.robot_mode import RobotMode
+from vtbdrake.lcm.lcm_bridge import LcmBridge
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.testbed import Interface, Scenario
 
@@ -33,7 +34,11 @@ class Protocol:
         act: Maps of the channels that it receives; each actuator signal in one map.
         commands: Maps of the commands u that reach the controller over LCM; the machine does not use them.
         reported: By actuator signal, the name under which a map of ``sense`` carries the actuator command that the
-            machine says it executed in the cycle that has just ended.
+            machine says it executed in the cycle that has just ended. The guards compare it with what was sent: of a
+            machine that does not report it, nobody notices that commands do not arrive.
+        robot_mode: The name under which a map of ``sense`` carries the machine's mode, and what its numbers mean. The
+            machine is commanded only while it says that it executes commands, or waits for them; see `RobotMode`. None
+            if no message tells it.
         periods: By channel of ``sense``, seconds between two messages; by default, one is sent in every cycle of the
             machine. The first message is sent in cycle 0, the others one cycle after the multiples of the period: a
             sensor that samples at these has its new value then.
@@ -43,13 +48,14 @@ class Protocol:
     act: Sequence[LcmMap]
     commands: Sequence[LcmMap] = ()
     reported: Mapping[str, str] = field(default_factory=dict)
+    robot_mode: RobotMode | None = None
     periods: Mapping[str, float] = field(default_factory=dict)
 
     def check_interface(self, interface: Interface) -> None:
         """Check that the maps carry the signals of ``interface``.
 
         Raises:
-            ValueError: A signal has no map or several, a map does not fit it, or a period is not that of a channel.
+            ValueError: A signal has no map or several, a map does not fit it, or a period belongs to no channel.
         """
         self.bridge(interface, "memq://")
         channels = [map.channel for map in self.sense]
@@ -69,7 +75,14 @@ class Protocol:
             **options: Further arguments of `LcmBridge`.
         """
         return LcmBridge(
-            interface, url, sense=self.sense, act=self.act, commands=self.commands, reported=self.reported, **options
+            interface,
+            url,
+            sense=self.sense,
+            act=self.act,
+            commands=self.commands,
+            reported=self.reported,
+            robot_mode=self.robot_mode,
+            **options,
         )
 
 

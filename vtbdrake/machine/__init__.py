@@ -9,12 +9,12 @@ It contains the world and the LCM protocol of the scenario, and nothing of the c
   command channel.
 * **Its own safety.** It checks commands as any machine does: type, length, finite values, the limits of the signals,
   newer than the last. After ``timeout`` seconds without a command it brakes until the next one, and also before the
-  first command.
+  first command. However it brakes, a commanded position is held.
 * **Differences from the simulated world**: perturbed parameters, values that are set, noise on sensors, latencies both
   ways. All random numbers come from one seed.
 * **Injected faults** on request, by LCM or by a `MachineProcess`: see `injected_faults` and `MachineLoop`.
 """
 
-from vtbdrake.lazy import lazy_names
+from vtbdrake.common.lazy_names import attach_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

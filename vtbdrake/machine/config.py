@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.settings import check_settings, setting
 
-HOLD, IDLE, LOCK = "hold", "idle", "lock"
+HOLD = "hold"
+IDLE = "idle"
+LOCK = "lock"
 BRAKES = (HOLD, IDLE, LOCK)
 
 
@@ -22,7 +24,7 @@ class MachineConfig:
 
     period: float | None = setting(
         None,
-        "The period of a cycle, which publishes the state once; by default that of the deployment.",
+        "The period of a cycle, which publishes the state once; by default the deployment's period.",
         unit="s",
         gt=0.0,
     )

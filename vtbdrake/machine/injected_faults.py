@@ -11,9 +11,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.settings import check_settings, setting
 
-SENSE, ACT = "sense", "act"
+SENSE = "sense"
+ACT = "act"
 
 
 class InjectedFaultError(ValueError):
@@ -21,12 +22,19 @@ class InjectedFaultError(ValueError):
 
 
 class Packet(NamedTuple):
-    """A message on its way."""
+    """A message on its way.
 
-    channel: str  # the LCM channel
-    type: Any  # the message type, a class made by lcm-gen
-    data: bytes  # the bytes
-    due: int  # the cycle of the machine in which it arrives
+    Attributes:
+        channel: The LCM channel.
+        type: The message type, a class made by lcm-gen.
+        data: The bytes.
+        due: The cycle of the machine in which it arrives.
+    """
+
+    channel: str
+    type: Any
+    data: bytes
+    due: int
 
 
 Effect = Callable[[Packet], Iterable[Packet]]
@@ -127,6 +135,14 @@ class NoBrake(InjectedFault):
 
 
 @dataclass(frozen=True, kw_only=True)
+class OwnStop(InjectedFault):
+    """Somebody presses the machine's own stop: it brakes and takes no command, until the fault is ended."""
+
+    name = "own_stop"
+    sides = (SENSE,)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Freeze(InjectedFault):
     """The first message on a channel is repeated, byte for byte, in place of all that follow."""
 
@@ -214,7 +230,7 @@ class Reorder(InjectedFault):
 
 # Several faults act in this order.
 FAULTS: dict[str, type[InjectedFault]] = {
-    kind.name: kind for kind in (ClockJump, NoBrake, Freeze, Corrupt, Duplicate, Drop, Delay, Reorder)
+    kind.name: kind for kind in (ClockJump, NoBrake, OwnStop, Freeze, Corrupt, Duplicate, Drop, Delay, Reorder)
 }
 
 
@@ -239,7 +255,12 @@ def fault_from_dict(data: Mapping[str, Any]) -> InjectedFault:
 
 
 def whole_cycles(seconds: float, period: float) -> int:
-    """Return a time as a number of cycles, rounded up (but 0.003 s are three cycles of 0.001 s)."""
+    """Return a time as a number of cycles, rounded up (but 0.003 s are three cycles of 0.001 s).
+
+    Args:
+        seconds: The time, in s.
+        period: The period of the machine's cycles, in s.
+    """
     return math.ceil(seconds / period - 1e-6)
 
 

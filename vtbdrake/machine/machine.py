@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.control.bridge import reported_signals
+from vtbdrake.control.bridge import Reports
+from vtbdrake.control.fallback import is_position
 from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.control.robot_mode import RobotMode
 from vtbdrake.control.sensor_monitor import LatencyMonitor
-from vtbdrake.lcm.bridge import ChannelReader
+from vtbdrake.lcm.lcm_bridge import ChannelReader
 from vtbdrake.lcm.protocol import Protocol, protocol_of
 from vtbdrake.machine.config import HOLD, IDLE, LOCK, MachineConfig
 from vtbdrake.machine.injected_faults import (
@@ -23,6 +25,7 @@ from vtbdrake.machine.injected_faults import (
     InjectedFault,
     InjectedFaultError,
     NoBrake,
+    OwnStop,
     Packet,
     whole_cycles,
 )
@@ -38,17 +41,26 @@ _MICROSECONDS = 1e6
 
 @dataclass
 class MachineStatus:
-    """The status of a machine."""
+    """The status of a machine.
 
-    cycle: int  # the number of cycles it has done
-    time: float  # the time of its world, in seconds
-    braking: bool  # True if it braked in its last cycle
-    silent: list[str]  # the command channels on which no command was accepted for longer than its timeout
-    accepted: dict[str, int]  # the number of accepted commands, by actuator signal
-    # the number of rejected commands, by actuator signal and reason; see `ReceivedSignal`, and `Machine.reject_late`
-    # for the reason ``late``
+    Attributes:
+        cycle: The number of cycles it has done.
+        time: The time of its world, in seconds.
+        braking: True if it braked in its last cycle.
+        silent: The command channels on which no command was accepted for longer than its timeout.
+        accepted: The number of accepted commands, by actuator signal.
+        rejected: The number of rejected commands, by actuator signal and reason; see `ReceivedSignal`, and
+            `Machine.reject_late` for the reason ``late``.
+        faults: The injected faults that have begun, as `InjectedFault.to_dict` gives them.
+    """
+
+    cycle: int
+    time: float
+    braking: bool
+    silent: list[str]
+    accepted: dict[str, int]
     rejected: dict[str, dict[str, int]]
-    faults: list[dict[str, Any]]  # the injected faults that have begun, as `InjectedFault.to_dict` gives them
+    faults: list[dict[str, Any]]
 
 
 class Machine:
@@ -106,7 +118,9 @@ class Machine:
         self._brake = HoldingBrake(world, config.brake)
         self._feed = world.feed(self._context)
         self._actuation = dict(self._brake.idle)  # What acts, by actuator signal.
-        self._sensors = _Sensors(world, self.protocol, period, config.noise, noise, actuation=self._actuation)
+        self._sensors = _Sensors(
+            world, self.protocol, period, config.noise, noise, actuation=self._actuation, mode=self._mode
+        )
         self._disturbances = _Disturbances(world, period, config, disturbance)
         signals = {signal.name: signal for signal in world.interface.act}
         self._received = {name: ReceivedSignal() for name in signals}
@@ -121,6 +135,7 @@ class Machine:
         self._latencies: dict[str, LatencyMonitor] = {}
         self._patience = whole_cycles(config.timeout, period)
         self._silent: list[str] = []
+        self._stopped = False
 
     @property
     def time(self) -> float:
@@ -137,6 +152,17 @@ class Machine:
         """Return True if the machine braked in its last cycle."""
         return self._brake.engaged
 
+    @property
+    def stopped(self) -> bool:
+        """Return True if its own stop was pressed in its last cycle, by the fault `OwnStop`."""
+        return self._stopped
+
+    def _mode(self, mode: RobotMode) -> int:
+        """Return the number that it reports as its mode."""
+        if self._stopped:
+            return mode.stopped
+        return mode.braking if self._brake.ends_commands else mode.active
+
     def read(self, address: str) -> Any:
         """Return the value of a variable or output port of its world."""
         return self.world.read(self._context, address)
@@ -151,7 +177,7 @@ class Machine:
         self.perturbed.update(values)
 
     def reject_late(self, reject: bool) -> None:
-        """Reject, or accept, commands whose latency exceeds that of the quickest one by more than ``max_latency``.
+        """Reject, or accept, commands whose latency exceeds the quickest one's by more than ``max_latency``.
 
         Such commands have waited somewhere, in a hub that was stopped for example. This needs a sender whose clock
         runs as fast as this computer's, so not in lock-step. A sender that does not tell the time is never late.
@@ -162,7 +188,12 @@ class Machine:
     # -- cycles
 
     def receive(self, channel: str, data: bytes) -> None:
-        """Take a message of the controller. It passes the latency and the injected faults before it is decoded."""
+        """Take a message of the controller. It passes the latency and the injected faults before it is decoded.
+
+        Args:
+            channel: Channel of the message.
+            data: The encoded message.
+        """
         self._lines[ACT].send(Packet(channel, self._types[channel], data, self.cycle))
 
     def advance(self) -> None:
@@ -173,24 +204,29 @@ class Machine:
         """
         for packet in self._lines[ACT].arrivals(self.cycle):
             self._readers[packet.channel].receive(packet.channel, packet.data)
+        self._stopped = OwnStop.name in self._lines[SENSE].faults
         for name, received in self._received.items():
             if received.count > self._counts[name]:
                 self._counts[name] = received.count
                 self._accept(name, received)
+        if self._stopped:  # The next command releases the brake, none that came before or meanwhile.
+            self._accepted = dict.fromkeys(self._accepted, -inf)
         coasting = NoBrake.name in self._lines[SENSE].faults
         oldest = self.cycle - self._patience
         self._silent = [
             map.channel for map in self.protocol.act if max(self._accepted[name] for name in map.signals) < oldest
         ]
-        self._brake.set(self._context, bool(self._silent) and not coasting)
+        self._brake.set(self._context, self._stopped or (bool(self._silent) and not coasting))
         for name, command in self._commands.items():
             # A signal may be missing in the messages that arrive; its last command becomes stale.
             stale = self._accepted[name] < oldest and not coasting
-            self._apply(name, self._brake.actuation(name, command, stale))
+            self._apply(name, self._brake.actuation(name, command, stale, stopped=self._stopped))
         self._simulator.AdvanceTo((self.cycle + 1) * self.period)
         self.cycle += 1
 
     def _accept(self, name: str, received: ReceivedSignal) -> None:
+        if self._stopped:
+            return
         latency = self._latencies.get(name)
         if latency is not None and latency.excess(received) > latency.limit:
             received.reject("late")
@@ -256,7 +292,8 @@ class HoldingBrake:
 
     ``lock``: the joints that have actuators stop at once, as if brakes engaged, and the actuators get their idle
     commands; it needs a discrete plant. ``idle``: the actuators get their idle commands. ``hold``: they keep the last
-    ones, which is right for position commands.
+    ones, unless the machine's own stop is pressed: that applies the idle ones. Position commands (in rad or m) are
+    always kept: another one would move the machine.
 
     Args:
         world: The world of the machine.
@@ -278,18 +315,36 @@ class HoldingBrake:
         self._kind = kind or (LOCK if lockable else IDLE)
         self.engaged = False
         self.idle = {s.name: s.vector(s.idle) if s.is_vector else s.idle for s in world.interface.act}
+        self._positions = {s.name for s in world.interface.act if is_position(s)}
         self._plant = plant
         self._joints = []
         if plant is not None and self._kind == LOCK:
             self._joints = [plant.get_joint_actuator(index).joint() for index in plant.GetJointActuatorIndices()]
 
-    def actuation(self, name: str, command: Any, stale: bool) -> Any:
-        """Return what acts on an actuator."""
-        idle = self._kind != HOLD if self.engaged else stale
+    @property
+    def ends_commands(self) -> bool:
+        """Return whether the machine does without commands: a brake that holds the last ones does not."""
+        return self.engaged and self._kind != HOLD
+
+    def actuation(self, name: str, command: Any, stale: bool, *, stopped: bool = False) -> Any:
+        """Return the command that acts on an actuator.
+
+        Args:
+            name: Name of the actuator signal.
+            command: The newest command that the machine has accepted; None if there is none yet.
+            stale: Whether that command is too old to be obeyed.
+            stopped: Whether the machine's own stop is pressed.
+        """
+        idle = (stopped or (self._kind != HOLD if self.engaged else stale)) and name not in self._positions
         return self.idle[name] if idle or command is None else command
 
     def set(self, context: Context, engaged: bool) -> None:
-        """Engage or release the brake in a context of the world."""
+        """Engage or release the brake in a context of the world.
+
+        Args:
+            context: The context, in which joints are locked or unlocked if the kind is ``lock``.
+            engaged: Whether the brake engages; if it does not, it is released.
+        """
         if engaged == self.engaged:
             return
         self.engaged = engaged
@@ -329,7 +384,7 @@ class _Disturbances:
 
 
 class _Sensors:
-    """Makes messages of the simulated sensor signals, with noise, and of the actuation that the machine reports."""
+    """Makes messages of the simulated sensor signals, with noise, and of what the machine reports of itself."""
 
     def __init__(
         self,
@@ -340,6 +395,7 @@ class _Sensors:
         random: np.random.Generator,
         *,
         actuation: Mapping[str, Any],
+        mode: Callable[[RobotMode], int],
     ) -> None:
         signals = {signal.name: signal for signal in world.interface.sense}
         vectors = [signal.name for signal in signals.values() if signal.is_vector]
@@ -349,9 +405,10 @@ class _Sensors:
         self._noise = deviations
         self._random = random
         self._actuation = actuation  # Kept up to date by the machine.
-        carriers = reported_signals(world.interface, protocol.reported)
-        signals_by_name = signals | {signal.name: signal for signal in carriers.values()}
-        self._reported = {signal.name: name for name, signal in carriers.items()}
+        reports = Reports(world.interface, protocol.reported, protocol.robot_mode)
+        signals_by_name = signals | {signal.name: signal for signal in reports.signals}
+        self._reported = {signal.name: name for name, signal in reports.carriers.items()}
+        self._robot_mode, self._mode = protocol.robot_mode, mode
         self._maps = [(map, map.encoder([signals_by_name[name] for name in map.signals])) for map in protocol.sense]
         self._cycles = {
             map.channel: max(1, round(protocol.periods.get(map.channel, period) / period)) for map in protocol.sense
@@ -382,6 +439,8 @@ class _Sensors:
     def _measure(self, name: str, context: Context) -> Any:
         if name in self._reported:
             return self._actuation[self._reported[name]]
+        if self._robot_mode is not None and name == self._robot_mode.carrier:
+            return np.array([float(self._mode(self._robot_mode))])
         if name not in self._ports:
             return self._readers[name](context)
         # Not a copy: it becomes a message before anything changes.
@@ -397,6 +456,12 @@ def perturbed_values(
 
     Every entry is multiplied by its own factor, uniform in [1 - relative, 1 + relative], drawn in the order of the
     addresses. Values beyond the bounds of a variable are set to the bound.
+
+    Args:
+        world: The simulated world of the machine.
+        context: Its root context, with the values before.
+        relative: Half width of the factors' range: 0.05 is 5 %.
+        random: The generator that draws the factors.
     """
     changed = {}
     for address, variable in world.variables().items():

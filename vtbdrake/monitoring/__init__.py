@@ -1,5 +1,5 @@
 """Monitoring of a running loop: residuals against a model, and live values for other processes."""
 
-from vtbdrake.lazy import lazy_names
+from vtbdrake.common.lazy_names import attach_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -1,13 +1,13 @@
 """The public names about residuals and live values."""
 
-from vtbdrake.monitoring.domain_monitor import DomainMonitor as DomainMonitor
-from vtbdrake.monitoring.live.client import LiveClient as LiveClient
-from vtbdrake.monitoring.live.client import LiveError as LiveError
-from vtbdrake.monitoring.live.client import LiveTimeoutError as LiveTimeoutError
-from vtbdrake.monitoring.live.client import LiveWatch as LiveWatch
-from vtbdrake.monitoring.live.client import watch as watch
-from vtbdrake.monitoring.live.service import LiveService as LiveService
-from vtbdrake.monitoring.residuals import Alarm as Alarm
-from vtbdrake.monitoring.residuals import NominalResiduals as NominalResiduals
-from vtbdrake.monitoring.residuals import ResidualConfig as ResidualConfig
-from vtbdrake.monitoring.residuals import ResidualMonitor as ResidualMonitor
+from .domain_monitor import DomainMonitor as DomainMonitor
+from .live.client import LiveClient as LiveClient
+from .live.client import LiveError as LiveError
+from .live.client import LiveTimeoutError as LiveTimeoutError
+from .live.client import LiveWatch as LiveWatch
+from .live.client import watch as watch
+from .live.service import LiveService as LiveService
+from .residuals import Alarm as Alarm
+from .residuals import NominalResiduals as NominalResiduals
+from .residuals import ResidualConfig as ResidualConfig
+from .residuals import ResidualMonitor as ResidualMonitor

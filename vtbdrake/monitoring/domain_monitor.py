@@ -6,12 +6,12 @@ import logging
 
 import numpy as np
 
-from vtbdrake.closing import Closing
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import FAILURES
+from vtbdrake.common.validity_domain import Departure, DomainWatch, ValidityDomain
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
-from vtbdrake.failures import FAILURES
-from vtbdrake.validity_domain import Departure, DomainWatch, ValidityDomain
 
 _log = logging.getLogger(__name__)
 

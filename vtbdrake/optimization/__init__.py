@@ -6,8 +6,7 @@ from vtbdrake.optimization.problem import Motion, Problem, ProblemRollout
 from vtbdrake.optimization.problem_file import ProblemFile, ProblemFileError
 from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst
-from vtbdrake.optimization.study import Study
-from vtbdrake.optimization.study_file import StudyError
+from vtbdrake.optimization.study import Study, StudyError
 from vtbdrake.optimization.sweep import Sweep
 
 __all__ = [

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_number, as_whole
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import as_number, as_whole
+from vtbdrake.common.summary_html import summary_html
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.optimization.records import RolloutKey
-from vtbdrake.optimization.sweep import Sweep, make_sweep, numeric, roll_out
+from vtbdrake.optimization.sweep import MOST_POINTS, Sweep, make_sweep, numeric, roll_out
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask
 from vtbdrake.rollout.task import TERMINATED
 from vtbdrake.state.variables import with_unit
@@ -28,16 +30,25 @@ Candidate = tuple[int, int]
 
 # The default number of rollouts with jitter of each value close to a boundary, under each condition.
 _REPEATS = 5
+# The largest number of them.
+_MOST_REPEATS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Chance:
-    """The share of unsafe rollouts of one value, repeated under one condition with jittered start values."""
+    """The share of unsafe rollouts of one value, repeated under one condition with jittered start values.
 
-    value: float  # the parameter's value
-    condition: int  # number of the condition
-    rollouts: int  # the number of rollouts at this value, the one without jitter included
-    unsafe: int  # the number of unsafe ones
+    Attributes:
+        value: The parameter's value.
+        condition: Number of the condition.
+        rollouts: The number of rollouts at this value, the one without jitter included.
+        unsafe: The number of unsafe ones.
+    """
+
+    value: float
+    condition: int
+    rollouts: int
+    unsafe: int
 
     @property
     def share(self) -> float:
@@ -62,33 +73,44 @@ class Boundary:
     """The interval in which the parameter's boundary lies: safe up to its lower end, unsafe at its upper end.
 
     A rollout is unsafe if it exceeds the threshold, violates a constraint, or fails.
+
+    Attributes:
+        address: The address of the parameter.
+        unit: The unit of the parameter.
+        lower: The largest value examined up to which no rollout was unsafe (-inf if one at the least value was).
+        upper: The smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is
+            none). There is one rollout per value and condition, and repeats close to the boundary.
+        by_condition: The same interval for each condition alone, shape (conditions, 2).
+        examined: The smallest and the largest value examined.
+        gap: Width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have
+            been missed.
+        step: The smallest distance of two values examined.
+        chances: One for each value and condition that was repeated, by value and condition.
+        safe_beyond: Values above a condition's first unsafe one that were safe nevertheless: the outcome is not
+            monotonic, and a bisection could have ended there.
+        ended_at: Values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was
+            safe up to there.
+        failed_at: Values at which a simulation, or the function of a quality or constraint, failed.
+        failure: The reason of the first failure.
+        sweep: The rollouts without jitter.
+        repeated: The rollouts with jitter; None if there are none.
     """
 
-    address: str  # the address of the parameter
-    unit: str  # the unit of the parameter
-    lower: float  # the largest value examined up to which no rollout was unsafe (-inf if one at the least value was)
-    # the smallest value examined at which, under some condition, all rollouts were unsafe (inf if there is none). There
-    # is one rollout per value and condition, and repeats close to the boundary.
+    address: str
+    unit: str
+    lower: float
     upper: float
-    by_condition: np.ndarray = field(compare=False)  # the same interval for each condition alone, shape (conditions, 2)
-    examined: tuple[float, float] = (-inf, inf)  # the smallest and the largest value examined
-    # width of the widest unexamined range below ``lower``, over all conditions: a narrower unsafe range may have been
-    # missed
+    by_condition: np.ndarray = field(compare=False)
+    examined: tuple[float, float] = (-inf, inf)
     gap: float = 0.0
-    step: float = inf  # the smallest distance of two values examined
-    chances: tuple[Chance, ...] = ()  # one for each value and condition that was repeated, by value and condition
-    # values above a condition's first unsafe one that were safe nevertheless: the outcome is not monotonic, and a
-    # bisection could have ended there
+    step: float = inf
+    chances: tuple[Chance, ...] = ()
     safe_beyond: tuple[float, ...] = ()
-    # values at which a system of the testbed asked for the end before t_m; such a rollout is safe if it was safe up to
-    # there
     ended_at: tuple[float, ...] = ()
-    failed_at: tuple[
-        float, ...
-    ] = ()  # values at which a simulation, or the function of a quality or constraint, failed
-    failure: str = ""  # the reason of the first failure
-    sweep: Sweep | None = field(default=None, compare=False)  # the rollouts without jitter
-    repeated: Sweep | None = field(default=None, compare=False)  # the rollouts with jitter; None if there are none
+    failed_at: tuple[float, ...] = ()
+    failure: str = ""
+    sweep: Sweep | None = field(default=None, compare=False)
+    repeated: Sweep | None = field(default=None, compare=False)
 
     @property
     def worst_chances(self) -> tuple[Chance, ...]:
@@ -105,19 +127,15 @@ class Boundary:
         Raises:
             ValueError: The boundary has no sweep.
         """
-        from vtbdrake.visualization import plot_sweep
-
         if self.sweep is None:
             raise ValueError("the boundary has no sweep to draw: take one of Problem.boundary or Sweep.boundary")
-        return plot_sweep(self.sweep, boundary=self)
+        return upper_layers.plot_sweep(self.sweep, boundary=self)
 
     def __repr__(self) -> str:
         return f"Boundary({self})"
 
     def _repr_html_(self) -> str:
         """Show the interval, the chances in between and a plot in a notebook."""
-        from vtbdrake.visualization.plots import summary_html
-
         rows = {self._amount(chance.value): str(chance) for chance in self.worst_chances}
         return summary_html(str(self), rows, None if self.sweep is None else self.plot())
 
@@ -135,7 +153,12 @@ class Boundary:
         return f"{self.address}: {interval}{self._undecided()}{missed}{beyond}{ended}{failed}"
 
     def interval_text(self, lower: float, upper: float) -> str:
-        """Return an interval of this boundary in words."""
+        """Return an interval of this boundary in words.
+
+        Args:
+            lower: The lower end, in the parameter's unit.
+            upper: The upper end, in the parameter's unit.
+        """
         least, most = self.examined
         if lower == most:
             return f"safe up to {self._amount(lower)}, the largest value examined"
@@ -161,9 +184,9 @@ class Boundary:
 
 
 def why_no_boundary(sweep: Sweep) -> str:
-    """Return why a sweep has no boundary; empty if it has one."""
+    """Return the reason why a sweep has no boundary; empty if it has one."""
     if len(sweep.parameters) != 1:
-        return f"a boundary is that of one parameter, but the sweep has {len(sweep.parameters)}"
+        return f"a boundary has one parameter, but the sweep has {len(sweep.parameters)}"
     if not sweep.complete:
         return "the sweep was interrupted: its boundary could lie where nothing was examined"
     missing = set(range(len(sweep.conditions))) - set(sweep.condition.tolist())
@@ -174,11 +197,17 @@ def why_no_boundary(sweep: Sweep) -> str:
 
 
 def why_never_unsafe(*, finite_threshold: bool, minimize: Sequence[bool], constraints: int) -> str:
-    """Return why no rollout of a problem could be unsafe; empty if one could."""
+    """Return the reason why no rollout of a problem could be unsafe; empty if one could.
+
+    Args:
+        finite_threshold: Whether the problem has a finite threshold.
+        minimize: Whether each quality is a cost, in the order of the qualities; only the first one has the threshold.
+        constraints: The number of constraints.
+    """
     if finite_threshold and minimize[0]:
         return (
-            "a rollout is unsafe where the quality exceeds its threshold, but that of a cost is a goal to be reached: "
-            "state what must not happen as a quality with a threshold, or as a constraint"
+            "a rollout is unsafe where the quality exceeds its threshold, but the threshold of a cost is a goal to be "
+            "reached: state what must not happen as a quality with a threshold, or as a constraint"
         )
     if not finite_threshold and not constraints:
         return "no rollout is unsafe: a boundary needs a finite threshold or a constraint, but the problem has neither"
@@ -291,6 +320,12 @@ class Refinement:
         self.last = int(np.ceil(width / fine - 1e-9))
         self._fine = fine
         self._coarse = max(1, round(ratio))
+        if max(self.last // self._coarse, 2 * self._coarse) > MOST_POINTS:
+            raise ValueError(
+                f"a search with a resolution of {resolution:g} and a coarse step of {coarse:g} in "
+                f"{parameter.range_text} may examine {max(self.last // self._coarse, 2 * self._coarse):,} values, more "
+                f"than {MOST_POINTS:,}: take larger steps"
+            )
 
     def value(self, index: int) -> float:
         """Return a value of the fine grid."""
@@ -317,6 +352,11 @@ def find_boundary(
     refinement: Refinement, conditions: int, examine: Callable[[Sequence[Candidate]], Sequence[bool]]
 ) -> list[dict[int, bool]]:
     """Examine candidates, in as few rounds as possible, until the refinement asks for no more.
+
+    Args:
+        refinement: Chooses the values to examine, as indices of its fine grid.
+        conditions: The number of conditions; each has a first unsafe value of its own.
+        examine: Function of candidates, (index, number of the condition) each, that returns whether each is unsafe.
 
     Returns:
         index -> unsafe, for each condition.
@@ -355,7 +395,7 @@ def parameter_with_boundary(problem: Problem) -> Parameter:
         ValueError: There is not exactly one, or no rollout could be unsafe.
     """
     if len(problem.parameters) != 1:
-        raise ValueError(f"a boundary is that of one parameter, but the problem has {len(problem.parameters)}")
+        raise ValueError(f"a boundary has one parameter, but the problem has {len(problem.parameters)}")
     (parameter,) = numeric(problem)
     reason = why_never_unsafe(
         finite_threshold=problem.task.threshold is not None,
@@ -370,12 +410,19 @@ def parameter_with_boundary(problem: Problem) -> Parameter:
 def checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> tuple[int, float]:
     """Return the number of repeats, by default that for this parameter, and their jitter.
 
+    Args:
+        parameter: The parameter that is displaced.
+        repeats: The number of rollouts with jitter for each value and condition; None: 5 (integer or field: 0).
+        jitter: The largest displacement, as a fraction of the parameter's range, in (0, 0.5].
+
     Raises:
         ValueError: One is out of range, or the parameter cannot be jittered.
     """
     if repeats is None:
         repeats = 0 if parameter.integer or parameter.is_field else _REPEATS
     repeats, jitter = as_whole("the number of repeats", repeats), as_number("the jitter", jitter)
+    if repeats > _MOST_REPEATS:
+        raise ValueError(f"a value is repeated {_MOST_REPEATS:,} times at most, not {repeats:,}: take fewer")
     if repeats < 0 or not 0.0 < jitter <= 0.5:
         raise ValueError(f"repeats >= 0 and 0 < jitter <= 0.5 are required, not {repeats} and {jitter:g}")
     if repeats and parameter.integer:
@@ -384,7 +431,15 @@ def checked_jitter(parameter: Parameter, repeats: int | None, jitter: float) -> 
 
 
 class BoundarySearch:
-    """The rollouts of a search for a boundary: one at each value, and repeats with jitter close to the boundary."""
+    """The rollouts of a search for a boundary: one at each value, and repeats with jitter close to the boundary.
+
+    Args:
+        problem: The problem.
+        task: The task of a rollout.
+        refinement: The values and repeats that are asked for.
+        executor: Where rollouts run.
+        progress: Whether a progress bar is shown.
+    """
 
     def __init__(
         self, problem: Problem, task: RolloutTask, refinement: Refinement, executor: Executor, *, progress: bool
@@ -401,7 +456,12 @@ class BoundarySearch:
         self._chances: set[Candidate] = set()
 
     def run(self, *, repeats: int, jitter: float) -> Boundary:
-        """Search the boundary, with so many rollouts with jitter for each value around it."""
+        """Search the boundary, with ``repeats`` rollouts with jitter for each value around it.
+
+        Args:
+            repeats: The number of rollouts with jitter for each value and condition; 0 for none.
+            jitter: The largest displacement of the parameter in them, as a fraction of its range.
+        """
         outcomes = find_boundary(self._refinement, len(self._problem.conditions), self.examine)
         if repeats:
             last = self._refinement.last
@@ -421,7 +481,13 @@ class BoundarySearch:
         return unsafe
 
     def repeat(self, indices: Sequence[int], *, repeats: int, jitter: float) -> dict[int, list[float]]:
-        """Repeat values under all conditions; return index -> the share of unsafe rollouts under each condition."""
+        """Repeat values under all conditions; return index -> the share of unsafe rollouts under each condition.
+
+        Args:
+            indices: The values, as indices of the fine grid.
+            repeats: The number of rollouts with jitter for each value and condition.
+            jitter: The largest displacement of the parameter in them, as a fraction of its range.
+        """
         count = len(self._problem.conditions)
         candidates = [(index, condition) for index in indices for condition in range(count)]
         new = [candidate for candidate in candidates if candidate not in self._counts]
@@ -440,7 +506,7 @@ class BoundarySearch:
         return {index: shares[k * count : (k + 1) * count] for k, index in enumerate(indices)}
 
     def _jittered(self, candidate: Candidate, repeats: int, jitter: float) -> list[float]:
-        """Return values beside that of a candidate; the same ones in every search."""
+        """Return values beside a candidate's; the same ones in every search."""
         parameter, (index, _) = self._refinement.parameter, candidate
         u = parameter.to_unit(self._refinement.value(index))
         moved = np.abs(u + np.random.default_rng(candidate).uniform(-jitter, jitter, repeats))

@@ -42,12 +42,14 @@ def _hashed(*parts: bytes) -> bytes:
 # What Python adds to a class, or what belongs to its instances.
 _SLOTS = (GetSetDescriptorType, MemberDescriptorType)
 
-# The types of what functools makes of a function.
+# The types of the wrappers that functools makes around functions.
 _CACHED = type(functools.cache(_hashed))
 _DISPATCHING = cast(FunctionType, functools.singledispatch(_hashed)).__code__
 
 # How the parts of a node are compared: in their order, as a set, or as a set of pairs.
-_ORDERED, _SET, _PAIRS = 0, 1, 2
+_ORDERED = 0
+_SET = 1
+_PAIRS = 2
 
 # The module in an import of Cython.
 _CYTHON_IMPORT = re.compile(rb"^\s*(?:from|c?import)\s+([\w.]+)", re.MULTILINE)
@@ -72,9 +74,9 @@ def digest(value: Any) -> tuple[str, tuple[str, ...]]:
     installed packages are given by their names, and the values that they hold for the user (a partial, a cache around a
     function) by their parts. Sets and dicts have no order.
 
-    The references form a graph, possibly with cycles. Its nodes get labels that are refined by those of their parts
-    until no more nodes can be told apart (Weisfeiler and Leman, 1968), so that neither the order in which the graph
-    is walked nor sharing matters.
+    The references form a graph, possibly with cycles. Its nodes get labels that are refined by the labels of their
+    parts until no more nodes can be told apart (Weisfeiler and Leman, 1968), so that neither the order in which the
+    graph is walked nor sharing matters.
     """
     graph = _Graph(value)
     return graph.digest(), tuple(sorted(graph.unreadable))
@@ -237,7 +239,7 @@ def _text(value: Any) -> bytes:
 
 
 def _reduced(value: Any) -> tuple[Any, ...] | None:
-    """Return what pickle would send of an object; None if it cannot, or would only look up its name."""
+    """Return the content that pickle would send of an object; None if it cannot, or would only look up its name."""
     registered = copyreg.dispatch_table.get(type(value))
     try:
         reduced = value.__reduce_ex__(4) if registered is None else registered(value)
@@ -293,7 +295,7 @@ def _content(cell: CellType) -> Any:
 
 
 class _References:
-    """The names to which the code of a function refers, with that of the functions, classes and comprehensions in it.
+    """The names to which the code of a function refers, including the functions, classes and comprehensions in it.
 
     Attributes:
         globals: Names of global variables.
@@ -344,7 +346,7 @@ def _used(function: FunctionType) -> dict[str, Any]:
 
 
 def _narrowed(value: Any, names: set[str], inside: frozenset[str]) -> Any:
-    """Return what is used of a module of the user: the attributes that have one of the names."""
+    """Return the used part of a module of the user: the attributes that have one of the names."""
     if not isinstance(value, ModuleType) or not is_own(value) or value.__name__ in inside:
         return value
     inside |= {value.__name__}
@@ -390,7 +392,7 @@ class _Source(NamedTuple):
         return "" if spec is None else str(spec.parent)
 
     def code(self) -> CodeType:
-        """Return the compiled module, without running it; that of an empty one if it has no source."""
+        """Return the compiled module, without running it; an empty one if it has no source."""
         file = _file(self.name) or ""
         code = SourceFileLoader(self.name, file).get_code(self.name) if file.endswith(".py") else None
         return code or compile("", self.name, "exec")

@@ -78,7 +78,13 @@ class Evaluator:
     def restrict(
         self, allows: Callable[[Point], bool], evaluations: Sequence[Evaluation], *, budget: int | None
     ) -> None:
-        """Let only points that ``allows`` accepts be the best, of those in ``evaluations`` and of new ones."""
+        """Let only points that ``allows`` accepts be the best, of those in ``evaluations`` and of new ones.
+
+        Args:
+            allows: Predicate of a point.
+            evaluations: The evaluations so far; the best one that is allowed is found again.
+            budget: Number of rollouts that the points may take together, those so far included; None: no limit.
+        """
         self._allows, self.best, self._budget = allows, None, inf if budget is None else budget
         for evaluation in evaluations:
             self._remember(evaluation)
@@ -166,7 +172,7 @@ class Evaluator:
             conditions: Numbers of the conditions that count; None: all. For the others, and for conditions that have
                 not run, the best possible outcome is assumed.
         """
-        counted = self._conditions if conditions is None else conditions
+        counted = self._conditions if conditions is None else set(conditions)
         outcomes = [self._outcomes.get((point, c)) if c in counted else None for c in self._conditions]
         ends = [outcome.end for outcome in outcomes if outcome is not None]
         exact = len(ends) == len(outcomes) and PRUNED not in ends

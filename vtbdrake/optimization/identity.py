@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from math import inf
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Diagram, System
 
-from vtbdrake.argument_checks import check_plain
+from vtbdrake.common.argument_checks import check_plain
 from vtbdrake.optimization.digest import attributes, digest, is_own
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
@@ -106,7 +107,7 @@ def _digest(name: str, value: Any, unreadable: dict[str, list[str]]) -> str:
 def _testbed_code(problem: Problem, unreadable: dict[str, list[str]]) -> dict[str, str]:
     """Return digests of the user's code in a testbed, with its values, and of the scenario's s0.
 
-    They are those of the scenario's class, the risk, the systems and what they hold. s0 depends on the files that the
+    They come from the scenario's class, the risk, the systems and what they hold. s0 depends on the files that the
     scenario reads, too.
     """
     parts: dict[str, list[Any]] = {}
@@ -139,7 +140,7 @@ def _systems(diagram: Diagram) -> Iterator[System]:
 
 
 def _state_digest(state: Snapshot, *, digits: int | None = None) -> str:
-    """Return a digest of a state, rounded to so many decimal digits of each mantissa if it is given."""
+    """Return a digest of a state, with ``digits`` decimal digits of each mantissa, or all."""
     digest = hashlib.sha256(repr(state.time).encode())
     for arrays in (state.groups, state.values):
         for name in sorted(arrays):
@@ -162,7 +163,12 @@ def dimensions(described: Mapping[str, Any]) -> tuple[Dimension, ...]:
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """Return the differences of two described problems except for their code, each as a phrase."""
+    """Return the differences of two described problems except for their code, each as a phrase.
+
+    Args:
+        theirs: What `describe` returned for the other problem, for instance the one in a file.
+        ours: What it returns for this problem.
+    """
     phrases = []
     for key in sorted({*theirs, *ours} - _CODE):
         a, b = theirs.get(key), ours.get(key)
@@ -177,16 +183,26 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
 
 
 def adds_conditions(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> bool:
-    """Return whether two described problems differ in nothing but further conditions behind theirs, and in code."""
+    """Return whether two described problems differ in nothing but further conditions behind theirs, and in code.
+
+    Args:
+        theirs: What `describe` returned for the other problem, for instance the one in a file.
+        ours: What it returns for this problem.
+    """
     count = len(theirs["conditions"])
     same, first = {**theirs, "conditions": ours["conditions"]}, ours["conditions"][:count]
     return not differences(same, ours) and first == theirs["conditions"] and len(ours["conditions"]) > count
 
 
 def code_changes(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    """Return the differences in code of two otherwise equal described problems, each as a phrase."""
+    """Return the differences in code of two otherwise equal described problems, each as a phrase.
+
+    Args:
+        theirs: What `describe` returned for the other problem, for instance the one in a file.
+        ours: What it returns for this problem.
+    """
     if theirs.get("python") != ours["python"]:
-        return [f"Python {theirs.get('python', '')}, whose code cannot be compared with that of {ours['python']}"]
+        return [f"Python {theirs.get('python', '')}, whose code cannot be compared with the code of {ours['python']}"]
     pairs = ((a, b) for key in _MEASURES for a, b in zip(theirs[key], ours[key], strict=True))
     phrases = [f"the function {a['name']} {_CHANGED}" for a, b in pairs if a["code"] != b["code"]]
     there, here = theirs["code"], ours["code"]
@@ -208,24 +224,36 @@ def _without_code(measures: Any) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages on which the numbers depend."""
-    by_package = {"python": platform.python_version()}
-    for package in ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "optuna", "casadi"):
-        try:
-            by_package[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return by_package
+    packages = ("vtbdrake", "drake", "numpy", "scipy", "cmaes", "optuna", "casadi")
+    by_package = {package: installed for package in packages if (installed := _version(package)) is not None}
+    return {"python": platform.python_version(), **by_package}
+
+
+@cache  # Each takes some milliseconds, and every run of a study asks for all.
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def revision(scenario: Scenario) -> str:
     """Return the git revision of the folder of the scenario's class, with ``+`` if it was changed.
 
-    Without git it is empty.
+    Without git it is empty. For a class in a file it is the state at the first time: later changes are not imported.
     """
     try:
-        folder = Path(inspect.getfile(type(scenario))).parent
-    except (OSError, TypeError):
-        folder = Path.cwd()
+        return _revision_of(type(scenario))
+    except (OSError, TypeError):  # The class has no file.
+        return _revision(Path.cwd())
+
+
+@lru_cache(maxsize=256)
+def _revision_of(kind: type) -> str:
+    return _revision(Path(inspect.getfile(kind)).parent)
+
+
+def _revision(folder: Path) -> str:
     try:
         call = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
         return subprocess.run(call, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

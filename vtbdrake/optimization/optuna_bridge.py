@@ -1,22 +1,22 @@
-"""Studies in Optuna's storage, for its dashboard, its plots and its importances; and points from there."""
+"""Studies in Optuna's storage, for its dashboard and its plots; and points from there."""
 
 from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.common.json_data import plain
 from vtbdrake.optimization.identity import differences
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.records import Outcome, Trial
 from vtbdrake.optimization.solvers.optuna_samplers import distribution, import_optuna, quiet
 from vtbdrake.optimization.solvers.solver import Point
-from vtbdrake.optimization.study_file import StudyError, encode
+from vtbdrake.optimization.study.study_file import StudyError, encode
 
 if TYPE_CHECKING:
     import optuna
@@ -29,12 +29,14 @@ if TYPE_CHECKING:
 # Identifies a study besides its problem: the same one may be exported again.
 _IDENTITY = ("solver", "seed", "options", "parallel")
 
-# Importances need at least so many points.
-_FEWEST = 10
-
 
 def to_optuna(study: Study, storage: str | BaseStorage, *, name: str) -> optuna.Study:
     """Write a study into Optuna's storage. See `Study.to_optuna`.
+
+    Args:
+        study: The study to export.
+        storage: A URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
+        name: The name of the study there.
 
     Raises:
         ModuleNotFoundError: Optuna is not installed.
@@ -70,6 +72,11 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
 
     See `Study.import_optuna`.
 
+    Args:
+        study: The study whose parameters, trials and queue count.
+        storage: A URL, such as ``sqlite:///study.db``, or a storage of Optuna's.
+        name: The name of Optuna's study.
+
     Raises:
         ModuleNotFoundError: Optuna is not installed.
         StudyError: The storage cannot be opened or has no study ``name``, or that study varies other parameters.
@@ -89,40 +96,6 @@ def points_from_optuna(study: Study, storage: str | BaseStorage, *, name: str) -
     present |= {encode(tuple(parameters.values())) for parameters in study.queue.values()}
     points = [point for trial in trials if (point := _point(study, trial, name)) is not None]
     return [point for text, point in {encode(point): point for point in points}.items() if text not in present]
-
-
-def importances(study: Study) -> tuple[dict[str, float], ...]:
-    """Return how much each parameter decides about whether a point is among the best tenth: by quality and address.
-
-    The shares sum to 1, the largest comes first. They are computed from the points that have a value by PED-ANOVA:
-    Watanabe, S., Bansal, A. and Hutter, F. (2023): PED-ANOVA. Efficiently quantifying hyperparameter importance in
-    arbitrary subspaces. IJCAI.
-
-    Raises:
-        ModuleNotFoundError: Optuna is not installed.
-        ValueError: Fewer than ten points have a value, or they all have the same.
-    """
-    optuna = import_optuna("the importances")
-    values = [trial.values for trial in study.trials if trial.exact and not trial.failed]
-    if len(values) < _FEWEST:
-        raise ValueError(f"importances need at least {_FEWEST} points with a value, but the study has {len(values)}")
-    shares = []
-    with quiet(), warnings.catch_warnings():
-        # Optuna warns about every target, also if its sign is right.
-        warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes the importances")
-        exported = to_optuna(study, optuna.storages.InMemoryStorage(), name="importances")
-        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-        for k, (name, direction) in enumerate(zip(study.names, study.directions, strict=True)):
-            if len({value[k] for value in values}) == 1:
-                raise ValueError(f"{name} is {values[0][k]:g} at all points, so no parameter is important")
-            # The evaluator takes small values of the target for good ones.
-            sign = 1.0 if direction == "minimize" else -1.0
-            shares.append(
-                optuna.importance.get_param_importances(
-                    exported, evaluator=evaluator, target=lambda trial, k=k, sign=sign: sign * trial.values[k]
-                )
-            )
-    return tuple(shares)
 
 
 def _open(optuna: Any, storage: str | BaseStorage, *, but: Path | None) -> BaseStorage:
@@ -189,13 +162,13 @@ def _frozen(
         "origin": trial.origin,
         "method": trial.method,
         # By condition, in the order of the problem; without those that racing has left out.
-        "values": [_plain((outcome.value, *outcome.measures[: objectives - 1])) for outcome in rollouts],
-        "t_star": _plain(outcome.t_star for outcome in rollouts),
+        "values": [plain((outcome.value, *outcome.measures[: objectives - 1])) for outcome in rollouts],
+        "t_star": plain([outcome.t_star for outcome in rollouts]),
         "end": [outcome.end for outcome in rollouts],
-        "wall_time": _plain(outcome.wall_time for outcome in rollouts),
+        "wall_time": plain([outcome.wall_time for outcome in rollouts]),
     }
     if state is states.PRUNED:
-        attributes["bound"] = _plain(trial.values)
+        attributes["bound"] = plain(trial.values)
     if trial.attributes:
         attributes["attributes"] = dict(trial.attributes)
     messages = [outcome.message for outcome in rollouts if outcome.message]
@@ -220,11 +193,6 @@ def _date(frozen: FrozenTrial, rollouts: Sequence[tuple[float, datetime]]) -> No
     if local:
         frozen.datetime_start = min(at - timedelta(seconds=seconds) for seconds, at in local)
         frozen.datetime_complete = max(at for _, at in local)
-
-
-def _plain(numbers: Iterable[float]) -> list[float | None]:
-    """Return numbers for strict JSON, which has neither NaN nor infinity."""
-    return [number if math.isfinite(number) else None for number in numbers]
 
 
 def _distribution(optuna: Any, parameter: Dimension) -> BaseDistribution:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_flag, as_number
+from vtbdrake.common.argument_checks import all_of, as_flag, as_number
+from vtbdrake.common.summary_html import summary_html
 from vtbdrake.rollout.testbeds import FIELD
 from vtbdrake.state import Variable, Variables
 from vtbdrake.state.variables import with_unit
@@ -19,6 +20,18 @@ from vtbdrake.state.variables import with_unit
 
 class _Addressed:
     address: str
+
+    def _repr_html_(self) -> str:
+        """Show address and range in a notebook, and how it is searched."""
+        kinds = {"integer": "whole numbers", "log": "on a logarithmic scale"}
+        search = [text for name, text in kinds.items() if getattr(self, name, False)]
+        rows = {"address": self.address, "range": self.range_text, **({"search": ", ".join(search)} if search else {})}
+        return summary_html(type(self).__name__, rows)
+
+    @property
+    def range_text(self) -> str:
+        """Return the range, or the options, as text."""
+        raise NotImplementedError
 
     @property
     def is_field(self) -> bool:
@@ -75,7 +88,9 @@ class Parameter(_Addressed):
                 f"{self.address} is an integer, so its range ends in whole numbers, unlike {self.range_text}"
             )
         if self.log and self.lower <= 0.0:
-            raise ValueError(f"a logarithmic range begins above 0, but that of {self.address} is {self.range_text}")
+            raise ValueError(
+                f"a logarithmic range begins above 0, but the range of {self.address} is {self.range_text}"
+            )
         object.__setattr__(self, "lower", kind(self.lower))
         object.__setattr__(self, "upper", kind(self.upper))
 
@@ -228,8 +243,28 @@ Dimension = Parameter | Choice
 _AT_END = 1e-6
 
 
+def short_address(address: str, addresses: Iterable[str]) -> str:
+    """Return the end of an address, as many of its words as tell it from all others.
+
+    Args:
+        address: The address.
+        addresses: All addresses among which it is meant, the address itself included.
+    """
+    words, lists = address.split("."), [other.split(".") for other in addresses]
+    for count in range(1, len(words)):
+        if sum(other[-count:] == words[-count:] for other in lists) == 1:
+            return ".".join(words[-count:])
+    return address
+
+
 def point_text(parameters: Sequence[Dimension], point: Sequence[Any], units: Sequence[str]) -> str:
-    """Return the values of a point with six digits and units; a value at an end of its range is pointed out."""
+    """Return the values of a point with six digits and units; a value at an end of its range is pointed out.
+
+    Args:
+        parameters: The parameters, in order.
+        point: One value per parameter.
+        units: One unit per parameter; empty or ``"1"`` for numbers without one.
+    """
     texts = []
     for parameter, value, unit in zip(parameters, point, units, strict=True):
         if isinstance(parameter, Choice):
@@ -244,6 +279,10 @@ def point_text(parameters: Sequence[Dimension], point: Sequence[Any], units: Seq
 
 def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[str, Any]) -> tuple[Any, ...]:
     """Check a point s^0, given as values in the order of the parameters or by address, and return its values.
+
+    Args:
+        parameters: The parameters, in order.
+        point: One value per parameter, or address -> value of all of them.
 
     Raises:
         ValueError: The point has another number of entries, sets what is not varied, or one lies outside its range.
@@ -262,7 +301,12 @@ def checked_point(parameters: Sequence[Dimension], point: ArrayLike | Mapping[st
 
 
 def checked_points(parameters: Sequence[Dimension], points: Sequence[Sequence[Any]]) -> list[tuple[Any, ...]]:
-    """Check points and return their values; see `checked_point`. Floats are compared with the ranges all at once."""
+    """Check points and return their values; see `checked_point`. Floats are compared with the ranges all at once.
+
+    Args:
+        parameters: The parameters, in order.
+        points: Points of one value per parameter.
+    """
     continuous = [parameter for parameter in parameters if isinstance(parameter, Parameter) and not parameter.integer]
     are_floats = {type(value) for point in points for value in point} == {float}
     if are_floats and len(continuous) == len(parameters) and {*map(len, points)} == {len(parameters)}:

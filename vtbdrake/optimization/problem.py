@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_number, as_whole
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import all_of, as_number, as_whole
+from vtbdrake.common.summary_html import summary_html
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.optimization.boundary import Boundary, BoundarySearch, Refinement, checked_jitter, parameter_with_boundary
 from vtbdrake.optimization.parameter import Dimension, checked_point, checked_points
 from vtbdrake.optimization.risk import Risk, make_risk
@@ -36,16 +39,13 @@ from vtbdrake.rollout.testbeds import FIELD, Testbeds, split
 from vtbdrake.state import Snapshot
 from vtbdrake.state.variables import overlap
 from vtbdrake.testbed import Scenario, VirtualTestbed
-from vtbdrake.testbed.interrupt import Interruptible
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
 
-    from vtbdrake.optimization.casadi_function import ProblemFunction
-    from vtbdrake.optimization.study import Study
     from vtbdrake.rollout.repeatability import Check
-    from vtbdrake.visualization import Scene
+    from vtbdrake.upper_layers import Scene, Study
 
 Condition = Mapping[str, Any]
 
@@ -58,6 +58,13 @@ class Motion:
     """The motion of the simulated world: the plant's states [q; v] at ``times``, shape (n, nq + nv).
 
     With the quality trajectory f' at the same times, equation (13), and t* of its rollout, equation (16), if any.
+
+    Attributes:
+        scenario: The scenario of the testbed.
+        times: The times in s, shape (n,).
+        states: The plant's states [q; v] at these times, shape (n, nq + nv).
+        quality: The quality trajectory f' at these times, equation (13), shape (n,), or None.
+        t_star: The instant t* of the rollout, equation (16), in s; NaN if there is none.
     """
 
     scenario: Scenario
@@ -68,13 +75,22 @@ class Motion:
 
     @classmethod
     def of(cls, scenario: Scenario, result: RolloutResult) -> Motion:
-        """Return the motion in a rollout that `recording_motion` has prepared."""
+        """Return the motion in a rollout that `recording_motion` has prepared.
+
+        Args:
+            scenario: The scenario that was rolled out.
+            result: The result of its rollout.
+        """
         quality = result.quality if len(result.times) and len(result.quality) == len(result.times) else None
         return cls(scenario, result.times, result.record[PLANT_STATE], quality, result.t_star)
 
 
 def recording_motion(task: RolloutTask, testbed: VirtualTestbed) -> RolloutTask:
     """Return a task whose rollouts record all that a `Motion` needs, to the end.
+
+    Args:
+        task: The task whose rollouts are to be shown; it stays as it is.
+        testbed: The testbed of its scenario.
 
     Raises:
         ValueError: The testbed has no plant.
@@ -89,31 +105,35 @@ def recording_motion(task: RolloutTask, testbed: VirtualTestbed) -> RolloutTask:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ProblemRollout(RolloutResult):
-    """A rollout with a reference to its problem, so that it can be shown."""
+    """A rollout with a reference to its problem, so that it can be shown.
 
-    problem: Problem  # the problem of which it is a rollout
-    condition: Mapping[str, Any] = field(default_factory=dict)  # address -> value of its condition
+    Attributes:
+        problem: The problem that it belongs to.
+        condition: Address -> value of its condition.
+    """
+
+    problem: Problem
+    condition: Mapping[str, Any] = field(default_factory=dict)
 
     def _repr_html_(self) -> str:
         """Show the result with the quality trajectory in a notebook."""
-        from vtbdrake.visualization.plots import summary_html
-
         rows = {**{address: np.asarray(value).tolist() for address, value in self.parameters.items()}, "end": self.end}
         rows |= {"message": self.message} if self.message else {}
         drawn = self.quality.size > 0 and not self.failed
         return summary_html(repr(self), rows, self.plot() if drawn else None)
 
     def show(self, meshcat: Meshcat, *, prefix: str = "rollout") -> Scene:
-        """Record the motion in ``meshcat`` under ``prefix``; the returned scene shows itself in a notebook."""
-        from vtbdrake.visualization import show_motion
+        """Record the motion in ``meshcat`` under ``prefix``; the returned scene shows itself in a notebook.
 
-        return show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
+        Args:
+            meshcat: The Meshcat to record in.
+            prefix: Path of the drawing in Meshcat's tree.
+        """
+        return upper_layers.show_motion(meshcat, self.problem.motion(self.parameters), prefix=prefix)
 
     def plot(self) -> Figure:
         """Plot the quality trajectory with t* marked (Figure 5); of a cost, the cost itself."""
-        from vtbdrake.visualization import plot_quality
-
-        return plot_quality([self], quality=self.problem.objectives[0])
+        return upper_layers.plot_quality([self], quality=self.problem.objectives[0])
 
 
 class Problem:
@@ -201,8 +221,6 @@ class Problem:
 
     def _repr_html_(self) -> str:
         """Show the parts of the problem in a notebook."""
-        from vtbdrake.visualization.plots import summary_html
-
         parts = zip(self.parameters, self.units, strict=True)
         rows: dict[str, object] = {p.address: f"{p.range_text} {unit}".strip() for p, unit in parts}
         for quality in self.objectives:
@@ -244,7 +262,7 @@ class Problem:
                 part = "it" if both[0] == both[1] else both[1]
                 raise ValueError(f"{both[0]} is a parameter, so that no condition can set {part}")
             if both := overlap(condition, condition):
-                raise ValueError(f"a condition sets {both[0]} and {both[1]}, of which one is an entry of the other")
+                raise ValueError(f"a condition sets {both[0]} and {both[1]}, but one is an entry of the other")
         for measure in (*self.objectives, *self.constraints):
             for address in measure.of:
                 self.testbed.reader(address)
@@ -278,7 +296,11 @@ class Problem:
         return checked_points(self.parameters, points)
 
     def values(self, point: ArrayLike | Mapping[str, Any], *, condition: int | None = None) -> dict[str, Any]:
-        """Return the values that a point sets in s0, address -> value, and those of a condition if it is given.
+        """Return the values that a point, and a condition if it is given, set in s0, address -> value.
+
+        Args:
+            point: Values of the parameters, (n,), or address -> value.
+            condition: Number of a condition, from 0; None for the values of the point alone.
 
         Raises:
             ValueError: As in `point`, or there is no such condition.
@@ -286,7 +308,12 @@ class Problem:
         return self.assigned(self.point(point), condition=condition)
 
     def assigned(self, point: Point, *, condition: int | None = None) -> dict[str, Any]:
-        """Return the same for a point whose values are valid: a study may have widened the ranges."""
+        """Return the same for a point whose values are valid: a study may have widened the ranges.
+
+        Args:
+            point: Values of the parameters, in their order.
+            condition: Number of a condition, from 0; None for the values of the point alone.
+        """
         values = {p.address: value for p, value in zip(self.parameters, point, strict=True)}
         return values if condition is None else {**self._condition(condition), **values}
 
@@ -299,14 +326,14 @@ class Problem:
         other = copy(self)
         other.parameters = tuple(parameters)
         if [p.address for p in parameters] != [p.address for p in self.parameters]:
-            raise ValueError("the ranges belong to other parameters than those of the problem")
+            raise ValueError("the ranges belong to other parameters than the problem's")
         other._check_addresses()
         return other
 
     def values_in(self, snapshot: Snapshot) -> dict[str, Any]:
         """Return the values of the parameters in a state of the problem's testbed, by address.
 
-        Unlike those of a point, they may lie outside the ranges.
+        Unlike a point's values, they may lie outside the ranges.
 
         Raises:
             SnapshotError: The snapshot is of another scenario.
@@ -347,7 +374,13 @@ class Problem:
         return ProblemRollout(**vars(result), problem=self, condition=condition_values)
 
     def state(self, point: ArrayLike | Mapping[str, Any], t: float, *, condition: int = 0) -> Snapshot:
-        """Return s(t) = Gamma'(s^0, t), equation (10), at a sample time t in seconds."""
+        """Return s(t) = Gamma'(s^0, t), equation (10), at a sample time t in seconds.
+
+        Args:
+            point: Values of the parameters, (n,), or address -> value.
+            t: A sample time, in s since the start.
+            condition: Number of the condition, from 0.
+        """
         parameters = self.values(point, condition=condition)
         return self._runner(self.task, parameters).state(split(parameters)[1], as_number("the time t", t))
 
@@ -365,7 +398,12 @@ class Problem:
         return RolloutRunner(*self.placed(task, parameters))
 
     def placed(self, task: RolloutTask, values: Mapping[str, Any]) -> tuple[RolloutTask, VirtualTestbed]:
-        """Return task and testbed for ``values`` (address -> value), which may set fields of the scenario."""
+        """Return task and testbed for ``values`` (address -> value), which may set fields of the scenario.
+
+        Args:
+            task: The rollout task.
+            values: Values by address; ``scenario.<field>`` sets a field.
+        """
         scenario = self._scenario(values)
         return replace(task, scenario=scenario), self._testbeds.get(scenario)
 
@@ -507,12 +545,6 @@ class Problem:
             search = BoundarySearch(self, task, refinement, opened, progress=progress)
             return search.run(repeats=repeats, jitter=jitter)
 
-    def casadi_function(self, **options: Any) -> ProblemFunction:
-        """Return h(s^0) as a ``casadi.Function`` with derivatives, for ``Opti`` and ``nlpsol``: a `ProblemFunction`."""
-        from vtbdrake.optimization.casadi_function import ProblemFunction
-
-        return ProblemFunction(self, **options)
-
     def study(
         self,
         path: str | os.PathLike[str] | None = None,
@@ -529,8 +561,8 @@ class Problem:
         Args:
             path: Path of the file; None keeps the study in memory.
             solver: Name of the solver, see `vtbdrake.optimization.solvers`; by default ``auto``, which chooses by the
-                problem, or that of the file.
-            seed: Seed of the solver; 0 by default, or that of the file.
+                problem, or the file's.
+            seed: Seed of the solver; 0 by default, or the file's.
             options: Options of the solver.
             parallel: The number of rollouts that can run side by side, at least: the solver asks for enough points at a
                 time for as many workers, and racing goes in rounds of as many rollouts. The points depend on it, never
@@ -542,16 +574,14 @@ class Problem:
                 but those in which a quality function failed run again. What a function looks up by a computed name
                 (``getattr``, ``eval``), a file that it reads, and global state of installed packages are not seen;
                 objects that cannot be read are named in a warning, and in `Study.summary`.
-            more_conditions: Whether the problem may have further conditions behind those of the file. Its rollouts
+            more_conditions: Whether the problem may have further conditions behind the file's. Its rollouts
                 stay; its points are evaluated again, by the rollouts that are missing.
 
         Raises:
             StudyError: The file is no study or is damaged, or was made by another version, problem, solver, seed,
                 width or code.
         """
-        from vtbdrake.optimization.study import Study
-
-        return Study.of(
+        return upper_layers.Study.of(
             self,
             path,
             solver=solver,

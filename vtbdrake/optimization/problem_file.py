@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from vtbdrake.common.settings import schema, setting
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import make_risk
 from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.rollout.executor import NAMES
+from vtbdrake.rollout.executor_choice import NAMES
 from vtbdrake.rollout.named_function import LIBRARY, named_function
 from vtbdrake.rollout.quality import READINGS
 from vtbdrake.rollout.testbeds import split
-from vtbdrake.settings import schema, setting
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import load_scenario
-from vtbdrake.testbed.scenario_file import resolve_types
+from vtbdrake.testbed.scenario_file import is_trusted
 from vtbdrake.testbed.settings_file import Lines, read_settings, scenario_beside
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class StatedConstraint:
     at_least: float | None = setting(None, "The smallest number that is allowed.")
     reading: str = setting(
         "worst",
-        "How the samples of f become one number; worst and best are those of the limit.",
+        "How the samples of f become one number; worst and best refer to the limit.",
         choices=tuple(READINGS),
     )
     unit: str = setting("", "The unit of f, for plots and reports.")
@@ -136,14 +136,14 @@ class StatedConstraint:
 class Solving:
     """The solver of a study; see `Problem.study`."""
 
-    name: str | None = setting(None, "The name of the solver; by default auto, or that of the study's file.")
+    name: str | None = setting(None, "The name of the solver; by default auto, or the one of the study's file.")
     options: dict[str, Any] = setting(default_factory=dict, doc="Options of the solver.")
-    seed: int | None = setting(None, "The seed of the solver; by default 0, or that of the study's file.")
-    parallel: int | None = setting(None, "Ask for enough points for so many rollouts side by side.", ge=1)
+    seed: int | None = setting(None, "The seed of the solver; by default 0, or the one of the study's file.")
+    parallel: int | None = setting(None, "Ask for enough points for this number of rollouts side by side.", ge=1)
 
 
 @dataclass
-class Budget:
+class StudyBudget:
     """The end of a study: the first limit that is reached."""
 
     rollouts: int | None = setting(None, "The number of rollouts that the study has in the end.", ge=1)
@@ -200,34 +200,68 @@ class StatedRollouts(ABC):
             ValueError: The scenario, an address, a value or a function does not exist or does not fit.
         """
 
+    @property
+    @abstractmethod
+    def functions(self) -> list[str]:
+        """Return the functions ``package.module:function`` that the file names, whose modules are imported."""
+
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
+    def load(cls, path: str | os.PathLike[str], *, trusted: Sequence[str] | None = None) -> Self:
         """Read a file.
 
         The modules that the file names are imported, which runs their code.
 
+        Args:
+            path: The file.
+            trusted: The only modules, or packages of them, that may be imported because the file names them, beside
+                vtbdrake's and the ones that are imported already; None for all.
+
         Raises:
-            ValueError: The file cannot be read, or something in it cannot be used; with the line.
+            ValueError: The file cannot be read, it names a module that is not trusted, or something in it cannot be
+                used; with the line.
         """
         path = Path(path)
         stated, lines = read_settings(cls, path, noun=cls.noun, example=cls.example, error=cls.error)
         stated.path, stated.lines = path, lines
         try:
-            stated.problem  # noqa: B018 - it checks scenario, addresses and functions
+            if trusted is not None:
+                stated._refuse_strangers(trusted)
+            stated.check()
         except (ValueError, OSError) as error:
             raise cls.error(lines.message(error)) from error
         return stated
 
+    def check(self) -> None:
+        """Check scenario, addresses and functions, whose modules are imported.
+
+        Raises:
+            ValueError: As for `problem`, which is kept.
+        """
+        _ = self.problem
+
+    def _refuse_strangers(self, trusted: Sequence[str]) -> None:
+        for name in (scenario_beside(self.path, self.scenario).partition("@")[0], *self.functions):
+            if ":" in name and not is_trusted(name, trusted=trusted):
+                module = name.partition(":")[0]
+                raise ValueError(
+                    f"it names {name}, and importing its module runs its code: if you trust it, add --trust {module}"
+                )
+
     @classmethod
     def schema(cls) -> dict[str, Any]:
         """Return the JSON Schema of the file."""
-        resolve_types(cls)
         return schema(cls)
 
 
 @dataclass
 class ProblemFile(StatedRollouts):
-    """A problem as its file states it, and how it is solved."""
+    """A problem as its file states it, and how it is solved.
+
+    Attributes:
+        solver: The solver of its study.
+        budget: When the study ends.
+        running: How the rollouts are run.
+    """
 
     noun, example, error = "problem", "scenario, parameters and qualities", ProblemFileError
 
@@ -247,8 +281,13 @@ class ProblemFile(StatedRollouts):
     constraints: dict[str, StatedConstraint] = setting(default_factory=dict, doc="The constraints by their names.")
     start: str = setting("", "A file with a snapshot, which is s0 instead of the defaults.")
     solver: Solving = field(default_factory=Solving)
-    budget: Budget = field(default_factory=Budget)
+    budget: StudyBudget = field(default_factory=StudyBudget)
     running: Running = field(default_factory=Running)
+
+    @property
+    def functions(self) -> list[str]:
+        names = [quality.f for quality in self.qualities] + [constraint.f for constraint in self.constraints.values()]
+        return [name for name in names if name not in ("", *LIBRARY)]
 
     @cached_property
     def problem(self) -> Problem:
@@ -300,5 +339,10 @@ class ProblemFile(StatedRollouts):
         return {**asdict(self.budget), **asdict(self.running)}
 
     def run(self, path: str | os.PathLike[str] | None = None, *, progress: bool = True) -> Study:
-        """Begin the study of the problem, or resume the one in ``path``, run it within the budget, and return it."""
+        """Begin the study of the problem, or resume the one in ``path``, run it within the budget, and return it.
+
+        Args:
+            path: File of the study; None keeps it in memory.
+            progress: Whether a progress bar is shown.
+        """
         return self.problem.study(path, **self.study_arguments).run(**self.run_arguments, progress=progress)

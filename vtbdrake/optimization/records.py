@@ -9,14 +9,20 @@ from datetime import datetime
 from math import isnan, nan
 from typing import Any
 
-from vtbdrake.failures import safe_text
+from vtbdrake.common.failures import safe_text
+from vtbdrake.common.summary_html import summary_html
 from vtbdrake.optimization.solvers.solver import Point, PointValues
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.course import Course
 from vtbdrake.rollout.task import FAILED
 
-# How a point came out beside `FAILED`: it keeps the constraints, it breaks one, or racing dropped it.
-FEASIBLE, BROKEN, DROPPED = "feasible", "broken", "dropped"
+# How a point came out beside `FAILED`.
+# It keeps the constraints.
+FEASIBLE = "feasible"
+# It breaks a constraint.
+BROKEN = "broken"
+# Racing dropped it.
+DROPPED = "dropped"
 
 # (point, number of the condition)
 RolloutKey = tuple[Point, int]
@@ -24,7 +30,17 @@ RolloutKey = tuple[Point, int]
 
 @dataclass(frozen=True)
 class Outcome:
-    """The record of one finished rollout in a study; its fields are those of `RolloutResult`."""
+    """The record of one finished rollout in a study; see `RolloutResult` for its fields.
+
+    Attributes:
+        h: The value of h, equation (17).
+        value: The quality of the rollout.
+        measures: The values of the other measures: further qualities and constraints.
+        t_star: The instant t*, equation (16), in s.
+        end: Why the rollout ended.
+        message: The error of a rollout that failed; empty otherwise.
+        wall_time: The wall time that the rollout took, in seconds.
+    """
 
     h: float
     value: float
@@ -46,24 +62,45 @@ class Outcome:
         return cls(**{**values, "message": safe_text(result.message)})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trial(PointValues):
-    """A point s^0 of a study with its values."""
+    """A point s^0 of a study or a sweep with its values.
 
-    parameters: Mapping[str, Any]  # the point, address -> value
-    # one per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a simulation
-    # failed.
+    Attributes:
+        parameters: The point, address -> value.
+        values: One per quality, aggregated over the conditions, in the user's terms: a cost as a cost. NaN if a
+            simulation failed.
+        violations: One per constraint, the worst over the conditions: at most 0 where it holds.
+        exact: False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is
+            known but that the point violates a constraint.
+        origin: ``solver`` or ``user``, whichever asked for the point.
+        method: The solver's method at that time; of a sweep, ``sweep``.
+        batch: The number of the batch of points that were evaluated together.
+        number: Number in the order of the study, counted by the study file; or of the sweep.
+        attributes: The user's notes on the point, see `Study.set_attribute`.
+    """
+
+    parameters: Mapping[str, Any]
     values: tuple[float, ...]
-    violations: tuple[float, ...]  # one per constraint, the worst over the conditions: at most 0 where it holds
-    # False if racing dropped the point: it is no better than ``values``, which are infinite if nothing is known but
-    # that the point violates a constraint
+    violations: tuple[float, ...]
     exact: bool
-    origin: str  # ``solver`` or ``user``, whichever asked for the point
-    method: str  # the solver's method at that time
-    batch: int  # the number of the batch of points that were evaluated together
-    number: int = 0  # number in the order of the study; counted by the study file
-    # the user's notes on the point, see `Study.set_attribute`
+    origin: str
+    method: str
+    batch: int
+    number: int = 0
     attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{value:.6g}" for value in self.values)
+        return f"<Trial {self.number}: {values} ({self.kind}) at {dict(self.parameters)}>"
+
+    def _repr_html_(self) -> str:
+        """Show the point in a notebook."""
+        values = {f"value of quality {k}" if k else "value": f"{value:.6g}" for k, value in enumerate(self.values)}
+        violations = {f"violation of constraint {k}": f"{value:.6g}" for k, value in enumerate(self.violations)}
+        origin = f"{self.method}, batch {self.batch}" + (", by hand" if self.origin == "user" else "")
+        rows = {**self.parameters, **values, **violations, "asked for by": origin, **self.attributes}
+        return summary_html(f"Trial {self.number}: {self.kind}", rows)
 
     @property
     def point(self) -> Point:
@@ -72,7 +109,7 @@ class Trial(PointValues):
 
     @property
     def kind(self) -> str:
-        """Return how the point came out: `FEASIBLE`, `BROKEN`, `DROPPED` or `FAILED`."""
+        """Return the outcome of the point: `FEASIBLE`, `BROKEN`, `DROPPED` or `FAILED`."""
         # The bound of a dropped point may be infinite; only a failed simulation gives NaN.
         if any(isnan(value) for value in self.values):
             return FAILED
@@ -137,12 +174,12 @@ class DrivenTrial:
     course: Course
 
     def values(self, qualities: int) -> tuple[float, ...]:
-        """Return the values of the study's qualities, of which there are so many, in the user's terms."""
+        """Return the values of the study's ``qualities`` qualities, in the user's terms."""
         values = (self.outcome.value, *self.outcome.measures)[:qualities]
         return values if len(values) == qualities else (nan,) * qualities
 
     def kind(self, qualities: int) -> str:
-        """Return how it came out, as `Trial.kind` does: `FEASIBLE`, `BROKEN` or `FAILED`."""
+        """Return its outcome, as `Trial.kind` does: `FEASIBLE`, `BROKEN` or `FAILED`."""
         if any(isnan(value) for value in self.values(qualities)):
             return FAILED
         return FEASIBLE if all(v <= 0.0 for v in self.outcome.measures[qualities - 1 :]) else BROKEN

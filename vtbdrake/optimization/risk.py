@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_number
+from vtbdrake.common.argument_checks import as_number
 
 if TYPE_CHECKING:
     from vtbdrake.optimization.records import Outcome

@@ -7,14 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from math import isinf
 from typing import Any
 
-from vtbdrake.failures import FAILURES, one_line
+from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.optimization.identity import dimensions
 from vtbdrake.optimization.problem import Problem
 from vtbdrake.optimization.risk import RISKS, CVaR, Quantile, Risk
 from vtbdrake.rollout import Constraint, Quality, RecordedMotion
 from vtbdrake.rollout.named_function import is_named, named_function
 from vtbdrake.testbed import ScenarioError
-from vtbdrake.testbed.scenario_file import is_trusted, scenario_of_text, scenario_text
+from vtbdrake.testbed.scenario_file import is_trusted, scenario_of_text
+from vtbdrake.testbed.scenario_text import scenario_text
 
 _LEVELS: Mapping[str, Callable[[float], Risk]] = {"Quantile": Quantile, "CVaR": CVaR}
 _LEVEL = re.compile(r"(\w+)\(level=([^)]*)\)")
@@ -25,7 +26,7 @@ class StatementError(ValueError):
 
 
 def statement(problem: Problem) -> dict[str, Any]:
-    """Return what `restated` needs beside the identity of a problem: the scenario as YAML, its functions by name.
+    """Return the data for `restated` beside the identity of a problem: the scenario as YAML, its functions by name.
 
     ``scenario`` is empty if no file can hold it. A function that no module has under its name (a lambda, one of a
     script or a notebook) is None.
@@ -45,7 +46,7 @@ def _name(function: Callable[..., Any]) -> str | None:
 def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Problem:
     """Return the problem of a study, stated again from the record of its file.
 
-    Importing a module runs its code. So no module is imported because a file names it, except those of vtbdrake.
+    Importing a module runs its code. So no module is imported because a file names it, except vtbdrake's.
 
     Args:
         record: `Study.record`.
@@ -65,6 +66,10 @@ def restated(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> Probl
 
 def check_statement(record: Mapping[str, Any], *, trusted: Sequence[str] = ()) -> None:
     """Check that the record of a study tells enough for `restated`, whose arguments these are; nothing is built.
+
+    Args:
+        record: `Study.record`.
+        trusted: Modules that may be imported, or packages of them.
 
     Raises:
         StatementError: The file does not tell enough, or a module is not trusted.

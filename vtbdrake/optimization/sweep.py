@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import all_of, as_whole, check_plain, counted
-from vtbdrake.lazy import extra_module
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import all_of, as_whole, check_plain, counted
+from vtbdrake.common.extras import extra_module
+from vtbdrake.common.json_data import plain
+from vtbdrake.common.summary_html import summary_html
 from vtbdrake.optimization.parameter import Parameter, point_text
-from vtbdrake.optimization.records import RolloutKey
+from vtbdrake.optimization.records import RolloutKey, Trial
 from vtbdrake.optimization.risk import CVaR, Mean, Quantile, Risk, Worst, aggregate
 from vtbdrake.optimization.solvers.solver import Evaluation
 from vtbdrake.rollout import Executor, RolloutResult, RolloutTask, make_executor
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 
 KIND = "vtbdrake sweep"
 VERSION = 3
+# The largest number of points of a grid: the results of as many rollouts fill the memory of most computers.
+MOST_POINTS = 10_000_000
 
 # The risks that a file can hold.
 _RISKS: dict[str, type[Risk]] = {kind.__name__: kind for kind in (Mean, Worst, Quantile, CVaR)}
@@ -38,20 +43,33 @@ _RISKS: dict[str, type[Risk]] = {kind.__name__: kind for kind in (Mean, Worst, Q
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """The rollouts of a problem at several points, one row per point and condition."""
+    """The rollouts of a problem at several points, one row per point and condition.
 
-    parameters: tuple[Parameter, ...]  # what was varied; p of them
-    units: tuple[str, ...]  # the units of the parameters
-    conditions: tuple[Mapping[str, Any], ...]  # address -> value of each condition
-    points: np.ndarray  # shape (n, p)
-    condition: np.ndarray  # number of the condition in each row, shape (n,)
-    rollouts: tuple[RolloutResult, ...]  # the n results, in the order in which the points were given
-    scenario: Mapping[str, Any] = field(default_factory=dict)  # the scenario's name and fields
-    complete: bool = True  # False if it was interrupted; it then holds the finished rollouts
-    minimize: tuple[bool, ...] = (False,)  # whether a quality is a cost, for each quality of the problem
-    constraints: tuple[str, ...] = ()  # the name of each of the problem's constraints
-    # how a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's class,
-    # which a file cannot hold
+    Attributes:
+        parameters: What was varied; p of them.
+        units: The units of the parameters.
+        conditions: Address -> value of each condition.
+        points: The points, shape (n, p).
+        condition: Number of the condition in each row, shape (n,).
+        rollouts: The n results, in the order in which the points were given.
+        scenario: The scenario's name and fields.
+        complete: False if it was interrupted; it then holds the finished rollouts.
+        minimize: Whether a quality is a cost, for each quality of the problem.
+        constraints: The name of each of the problem's constraints.
+        risk: How a quality under several conditions becomes one; None after loading a sweep whose risk is of a user's
+            class, which a file cannot hold.
+    """
+
+    parameters: tuple[Parameter, ...]
+    units: tuple[str, ...]
+    conditions: tuple[Mapping[str, Any], ...]
+    points: np.ndarray
+    condition: np.ndarray
+    rollouts: tuple[RolloutResult, ...]
+    scenario: Mapping[str, Any] = field(default_factory=dict)
+    complete: bool = True
+    minimize: tuple[bool, ...] = (False,)
+    constraints: tuple[str, ...] = ()
     risk: Risk | None = field(default_factory=Worst)
 
     def __len__(self) -> int:
@@ -64,11 +82,8 @@ class Sweep:
 
     def _repr_html_(self) -> str:
         """Show a summary with a plot in a notebook."""
-        from vtbdrake.visualization.plots import summary_html
-
         try:
-            point, h = self.best()
-            best = f"{h:g} at {point_text(self.parameters, list(point.values()), self.units)}"
+            best = f"{self.best.value:g} at {point_text(self.parameters, self.best.point, self.units)}"
         except ValueError as error:
             best = str(error)
         rows: dict[str, object] = {p.address: p.range_text for p in self.parameters}
@@ -141,10 +156,11 @@ class Sweep:
         )
         return Evaluation(point, values, violations)
 
-    def best(self) -> tuple[dict[str, float], float]:
-        """Return (s^0*, h(s^0*)), equation (18), over the points examined: the best that keeps all constraints.
+    @property
+    def best(self) -> Trial:
+        """Return s^0*, equation (18), among the points examined: the best that keeps all constraints; as `Study.best`.
 
-        The problem's risk aggregates several conditions, as in `Study.best`. For a cost, h is the cost.
+        The problem's risk aggregates several conditions. The trial's number counts the points in their order.
 
         Raises:
             ValueError: There are several qualities; no point has finished all its conditions and keeps the constraints;
@@ -152,16 +168,24 @@ class Sweep:
         """
         if len(self.minimize) > 1:
             raise ValueError("several qualities have no single best point: use problem.study() and its pareto()")
-        candidates = [evaluation for evaluation in self.evaluations if evaluation.feasible]
+        candidates = {n: evaluation for n, evaluation in enumerate(self.evaluations) if evaluation.feasible}
         if not candidates:
             feasible = " and keeps the constraints" if self.constraints else ""
             raise ValueError(
                 f"no point of the sweep has a quality under all conditions{feasible}{self._first_failure()}"
             )
-        best = max(candidates, key=lambda evaluation: evaluation.values[0])
+        number, best = max(candidates.items(), key=lambda item: item[1].values[0])
         value = -best.values[0] if self.minimize[0] else best.values[0]
-        # Adding 0 makes 0 of -0.
-        return {p.address: v for p, v in zip(self.parameters, best.point, strict=True)}, value + 0.0
+        return Trial(
+            parameters={p.address: v for p, v in zip(self.parameters, best.point, strict=True)},
+            values=(value + 0.0,),  # adding 0 makes 0 of -0
+            violations=best.violations,
+            exact=True,
+            origin="user",
+            method="sweep",
+            batch=0,
+            number=number,
+        )
 
     def boundary(self) -> Boundary:
         """Return the boundary: the largest parameter value below which every rollout examined here was safe.
@@ -212,9 +236,7 @@ class Sweep:
         Raises:
             ValueError: There are more than two parameters.
         """
-        from vtbdrake.visualization import plot_sweep
-
-        return plot_sweep(self)
+        return upper_layers.plot_sweep(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the sweep to a file; recordings of abstract ports cannot be saved.
@@ -232,8 +254,8 @@ class Sweep:
             for name in ("times", "quality", "exceedances"):
                 arrays[f"{name}/{i}"] = getattr(rollout, name)
             scalars = ("end", "message", "t_star", "h", "value", "threshold", "wall_time")
-            row = {name: _plain(getattr(rollout, name)) for name in scalars}
-            rows.append({**row, "measures": [_plain(number) for number in rollout.measures]})
+            row = {name: getattr(rollout, name) for name in scalars}
+            rows.append(plain({**row, "measures": rollout.measures}, nonfinite=repr))
         header = {
             "parameters": [asdict(parameter) for parameter in self.parameters],
             "units": list(self.units),
@@ -261,9 +283,14 @@ class Sweep:
         parameters = tuple(Parameter(**parameter) for parameter in header["parameters"])
         conditions = tuple(header["conditions"])
         points, condition = arrays["points"], arrays["condition"]
+        records: list[dict[str, np.ndarray]] = [{} for _ in header["rollouts"]]
+        for name, array in arrays.items():
+            kind, _, rest = name.partition("/")
+            if kind == "record":
+                number, _, key = rest.partition("/")
+                records[int(number)][key] = array
         rollouts = []
-        for i, row in enumerate(header["rollouts"]):
-            prefix = f"record/{i}/"
+        for i, (row, record) in enumerate(zip(header["rollouts"], records, strict=True)):
             values = {p.address: float(v) for p, v in zip(parameters, points[i], strict=True)}
             rollouts.append(
                 RolloutResult(
@@ -271,7 +298,7 @@ class Sweep:
                     times=arrays[f"times/{i}"],
                     quality=arrays[f"quality/{i}"],
                     exceedances=arrays[f"exceedances/{i}"],
-                    record={k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)},
+                    record=record,
                     measures=tuple(_number(number) for number in row.pop("measures")),
                     **{name: _number(value) for name, value in row.items()},
                 )
@@ -300,11 +327,6 @@ def _risk_from_file(data: Mapping[str, Any] | None) -> Risk | None:
     return None if data is None else _RISKS[data["kind"]](**data["options"])
 
 
-def _plain(value: Any) -> Any:
-    # JSON has neither inf nor nan.
-    return repr(value) if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def _number(value: Any) -> Any:
     return {"inf": inf, "nan": np.nan}.get(value, value) if isinstance(value, str) else value
 
@@ -314,15 +336,24 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
 
     Logarithmic ranges are spaced on that scale; values of integers are rounded to whole numbers.
 
+    Args:
+        parameters: One or two parameters.
+        points: The number of values per parameter, or one number for all, each at least 2.
+
     Raises:
         ValueError: There are more than two parameters, too few points for one of them, more than an integer has values,
-            or more in all than there is memory for.
+            or more in all than `MOST_POINTS`.
     """
     if not 1 <= len(parameters) <= 2:
         raise ValueError(f"a sweep goes over one or two parameters, not {len(parameters)}")
     each = [points] * len(parameters) if isinstance(points, int | float | np.number) else points
     form = "one whole number, or one for each parameter"
     counts = [as_whole("a number of points", count) for count in all_of(object, each, name="points", form=form)]
+    if prod(counts) > MOST_POINTS:
+        raise ValueError(
+            f"a sweep of {prod(counts):,} points is larger than the largest, {MOST_POINTS:,}: take fewer points, or "
+            "let a study search"
+        )
     if len(counts) != len(parameters) or min(counts) < 2:
         raise ValueError(f"a sweep has at least two points for each of its {len(parameters)} parameters, not {points}")
     for parameter, count in zip(parameters, counts, strict=True):
@@ -331,11 +362,8 @@ def grid(parameters: Sequence[Parameter], points: int | Sequence[int]) -> np.nda
                 f"{parameter.address} is an integer in {parameter.range_text}, which does not have {count} different "
                 "whole numbers in equal steps: take fewer points, or give values"
             )
-    try:
-        axes = [_axis(parameter, count) for parameter, count in zip(parameters, counts, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
-    except (MemoryError, ValueError, OverflowError):
-        raise ValueError(f"a sweep of {prod(counts):.3g} points does not fit into memory: take fewer") from None
+    axes = [_axis(parameter, count) for parameter, count in zip(parameters, counts, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(parameters))
 
 
 def _axis(parameter: Parameter, count: int) -> np.ndarray:
@@ -346,6 +374,10 @@ def _axis(parameter: Parameter, count: int) -> np.ndarray:
 
 def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
     """Return given points, shape (n, p) or (n,) of a single parameter, as shape (n, p).
+
+    Args:
+        parameters: The p parameters.
+        values: The points, numbers in the parameters' units.
 
     Raises:
         ValueError: They have another shape, or are no numbers.
@@ -363,7 +395,7 @@ def as_points(parameters: Sequence[Parameter], values: ArrayLike) -> np.ndarray:
 
 
 def numeric(problem: Problem) -> tuple[Parameter, ...]:
-    """Return the parameters of a problem, all of which must be numbers.
+    """Return the parameters of a problem; all must be numbers.
 
     Raises:
         ValueError: One is a choice.
@@ -378,7 +410,14 @@ def numeric(problem: Problem) -> tuple[Parameter, ...]:
 
 @contextmanager
 def borrowed(problem: Problem, executor: Any, *, rollouts: int, **settings: Any) -> Iterator[Executor]:
-    """Provide what `make_executor` returns, and close it afterwards unless it is the user's."""
+    """Provide what `make_executor` returns, and close it afterwards unless it is the user's.
+
+    Args:
+        problem: The problem whose testbed runs the rollouts.
+        executor: The name of an executor, or an executor, pool or client of the user, see `make_executor`.
+        rollouts: The number of rollouts that it will run at most.
+        settings: ``workers`` and ``time_limit`` of `make_executor`.
+    """
     borrowed_executor = make_executor(executor, testbed=problem.testbed, rollouts=rollouts, **settings)
     try:
         yield borrowed_executor
@@ -390,13 +429,28 @@ def borrowed(problem: Problem, executor: Any, *, rollouts: int, **settings: Any)
 def roll_out(
     problem: Problem, executor: Executor, task: RolloutTask, keys: Sequence[RolloutKey], *, name: str, progress: bool
 ) -> list[RolloutResult | None]:
-    """Run the rollouts of some points and conditions; those that were interrupted are None."""
+    """Run the rollouts of some points and conditions; those that were interrupted are None.
+
+    Args:
+        problem: The problem, which turns points and conditions into values by address.
+        executor: Runs the rollouts.
+        task: The task of the rollouts.
+        keys: (point, number of the condition) of each rollout.
+        name: The text before the progress bar.
+        progress: Whether to show a progress bar in a terminal or a notebook.
+    """
     points = [problem.values(point, condition=condition) for point, condition in keys]
     return run_rollouts(executor, task, points, progress=progress, description=name)
 
 
 def make_sweep(problem: Problem, keys: Sequence[RolloutKey], results: Sequence[RolloutResult | None]) -> Sweep:
-    """Return the sweep of the results that are finished."""
+    """Return the sweep of the results that are finished.
+
+    Args:
+        problem: The problem.
+        keys: (point, number of the condition) of each rollout.
+        results: The result of each rollout, or None where it is not finished.
+    """
     finished = [(*key, result) for key, result in zip(keys, results, strict=True) if result is not None]
     return Sweep(
         parameters=numeric(problem),

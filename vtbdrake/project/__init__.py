@@ -2,7 +2,15 @@
 
 from pathlib import Path
 
-from vtbdrake.project.robot_file import Robot, RobotFileError, read_robot, replace_servo, resolve
+from vtbdrake.project.model_scenario import ModelFileScenario
+from vtbdrake.project.robot_file import (
+    ProjectRobot,
+    RobotFileError,
+    add_model,
+    read_robot,
+    replace_servo,
+    resolve,
+)
 from vtbdrake.project.station_file import StationFile, StationFileError, read_station
 from vtbdrake.project.writer import ProjectError, check_name, write_project
 
@@ -11,11 +19,13 @@ SMALL_ARM = Path(__file__).parent / "arm.urdf"
 
 __all__ = [
     "SMALL_ARM",
+    "ModelFileScenario",
     "ProjectError",
-    "Robot",
+    "ProjectRobot",
     "RobotFileError",
     "StationFile",
     "StationFileError",
+    "add_model",
     "check_name",
     "read_robot",
     "read_station",

@@ -6,11 +6,12 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from xml.etree import ElementTree
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,24 +23,39 @@ from pydrake.multibody.tree import Joint
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from vtbdrake.common.failures import one_line
 from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
-from vtbdrake.failures import one_line
+from vtbdrake.components.standing import WholeBodyModel
+from vtbdrake.project.model_copy import MJCF, URDF, copy_model
+from vtbdrake.project.rotors import FlyingRobot, flying_robot
+from vtbdrake.project.stance import StanceError, StanceFinder, StandingRobot, named_postures, with_shift
+from vtbdrake.project.xml_text import XmlText
 
 SUFFIXES = (".urdf", ".sdf", ".xml")
 
-REVOLUTE, PRISMATIC = "revolute", "prismatic"
+REVOLUTE = "revolute"
+PRISMATIC = "prismatic"
 # What is assumed where a file says nothing, by the kind of joint: in rad or m, and per second.
 _ASSUMED_REACH = {REVOLUTE: 2.0 * math.pi, PRISMATIC: 1.0}
 _ASSUMED_SPEED = {REVOLUTE: 3.0, PRISMATIC: 0.5}
-# An assumed drive carries so many times the weight, and beside it accelerates to its speed within this time, in s.
-_WEIGHTS, _TIME_TO_SPEED = 2.0, 0.02
+# An assumed drive carries the weight multiplied by this number.
+_WEIGHTS = 2.0
+# Beside the weight, an assumed drive accelerates to its speed within this time, in s.
+_TIME_TO_SPEED = 0.02
+# The share of the effort of a drive that the damping of its joint takes at most, at the speed of the reference.
+_DAMPED = 0.5
 # The other posture of examples lies at most this far from home, and this share of the way to the farther end.
 _STEP = {REVOLUTE: 0.4, PRISMATIC: 0.1}
 _SHARE = 0.15
 
-_MODEL_SUFFIXES = "urdf|sdf|xml|obj|mtl|stl|dae|gltf|glb|bin|vtk|png|jpe?g|ktx2|tga|bmp"
-_QUOTED_FILE = re.compile(rf"""["'>]\s*([^"'<>]+?\.(?:{_MODEL_SUFFIXES}))\s*["'<]""", re.IGNORECASE)
-_OBJ_FILE = re.compile(rf"^\s*(?:mtllib|map_\w+|bump|disp|norm)\b.*?(\S+\.(?:{_MODEL_SUFFIXES}))\s*$", re.M | re.I)
+# The other posture is moved closer to home, or to its other side, until nothing touches on the way.
+_SHARES_OF_THE_WAY = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
+# The postures that are looked at on the way.
+_POSTURES = 12
+
+# The file and the line with which a message of Drake's parser begins.
+_PLACE = re.compile(r"([^\s:]*:\d+): ")
+_SEE_ALSO = " See https://drake.mit.edu/troubleshooting.html for additional resources."
 
 
 class RobotFileError(ValueError):
@@ -48,21 +64,37 @@ class RobotFileError(ValueError):
 
 @dataclass(frozen=True)
 class RobotJoint:
-    """A joint with one degree of freedom: rad or m, per second, N m or N."""
+    """A joint with one degree of freedom: rad or m, per second, N m or N.
+
+    Attributes:
+        name: The name of the joint.
+        kind: REVOLUTE or PRISMATIC.
+        lower, upper: The ends of its range.
+        speed: The largest speed.
+        effort: 0: it has no drive.
+        home: The position at the start.
+        assumed: The names of the values that are not in the file.
+    """
 
     name: str
-    kind: str  # REVOLUTE or PRISMATIC
+    kind: str
     lower: float
     upper: float
     speed: float
-    effort: float  # 0: it has no drive
+    effort: float
     home: float
-    assumed: tuple[str, ...]  # the names of the values that are not in the file
+    assumed: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Coupling:
-    """A joint that follows another one: its velocity is ``multiplier`` times that of ``leader``."""
+    """A joint that follows another one: its velocity is ``multiplier`` times the velocity of ``leader``.
+
+    Attributes:
+        joint: The joint that follows.
+        leader: The joint that it follows.
+        multiplier: The ratio of their velocities.
+    """
 
     joint: str
     leader: str
@@ -70,35 +102,38 @@ class Coupling:
 
 
 @dataclass
-class Robot:
+class ProjectRobot:
     """A robot as a project needs it.
 
     Attributes:
         model: The path of its file among ``files``.
-        files: The files that the model consists of: path in the project's folder ``models`` -> source.
+        files: The files that the model consists of: path in the project's folder ``models`` -> source, or content.
         joints: Its joints, in the order of the plant's positions.
         driven: The names of the joints with drives, in the order of the plant's actuators.
         away: Another posture of the driven joints, for examples.
-        packages: Whether the model refers to its files by ``package://``.
+        packages: The packages to which the model refers, by name: their folders in ``models``.
         welded: The bodies that are free in the file, and where they are welded to the world.
         adds_drives: Whether the file has no actuators, so that they are added.
         servos: The names of actuators of the file with position or velocity controllers, which are left out.
         without_drive: The names of actuators of the file that are left out, with their joints' drives.
-        sets_efforts: Whether the effort limits of some actuators are not those of the file.
+        sets_efforts: Whether the effort limits of some actuators differ from the file's.
         has_constraints: Whether there are constraints between joints or bodies.
         couplings: The joints that follow driven ones.
-        motions: Where other constraints close loops: the velocities of all joints by those of the driven ones, at home,
-            shape (joints, driven); otherwise None.
+        motions: Where other constraints close loops: the velocities of all joints by the driven joints' velocities, at
+            home, shape (joints, driven); otherwise None.
         touching: The names of bodies that touch each other at home.
-        notes: What is missing or unusual in the file, and what is done about it.
+        standing: How it stands, if its base is free and has legs.
+        flying: How it flies, if its base is free and has rotors; then it has no joints.
+        assumptions: The limits that the file does not give, each with the values that are assumed instead.
+        notes: What else is missing or unusual in the file, and what is done about it.
     """
 
     model: Path
-    files: dict[Path, Path]
+    files: dict[Path, Path | bytes]
     joints: tuple[RobotJoint, ...] = ()
     driven: tuple[str, ...] = ()
     away: tuple[float, ...] = ()
-    packages: bool = False
+    packages: dict[str, Path] = field(default_factory=dict)
     welded: dict[str, RigidTransform] = field(default_factory=dict)
     adds_drives: bool = False
     servos: tuple[str, ...] = ()
@@ -108,17 +143,23 @@ class Robot:
     couplings: tuple[Coupling, ...] = ()
     motions: NDArray[np.float64] | None = None
     touching: tuple[str, ...] = ()
+    standing: StandingRobot | None = None
+    flying: FlyingRobot | None = None
+    assumptions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        return f"{self.model.name}, {len(self.driven)} of its {len(self.joints)} joints driven"
+        if self.flying is not None:
+            return f"{self.model.name}, which flies with {len(self.flying.rotors)} rotors"
+        legs = f", which stands on {', '.join(self.standing.feet)}" if self.standing is not None else ""
+        return f"{self.model.name}, {len(self.driven)} of its {len(self.joints)} joints driven{legs}"
 
 
 def resolve(text: str) -> Path:
     """Return the path of a model file that is given by its path or as ``package://...``.
 
     Raises:
-        RobotFileError: There is no such file, or its name has another suffix than those of `SUFFIXES`.
+        RobotFileError: There is no such file, or its name has a suffix that is not in `SUFFIXES`.
     """
     path = Path(text)
     if "://" in text:
@@ -139,43 +180,59 @@ def resolve(text: str) -> Path:
     return path.resolve()
 
 
-def read_robot(path: Path) -> Robot:
+def read_robot(path: Path, packages: Mapping[str, Path] = MappingProxyType({})) -> ProjectRobot:
     """Return the robot in a model file.
+
+    Meshes that Drake does not read are converted, and spellings that it refuses, and other programs take, are mended
+    in the copy that the project gets; each change is in the notes.
 
     Args:
         path: A path of `resolve`.
+        packages: The folders of packages by name, which are not searched for (see `find_packages`).
 
     Raises:
         RobotFileError: Drake cannot read it, it has no joints to drive, or joints or links of unsupported kinds.
     """
-    return _Reader(path).robot()
+    with tempfile.TemporaryDirectory(prefix="vtbdrake-model-") as folder:
+        return _ModelReader(path, packages, Path(folder)).robot()
 
 
-class _Reader:
-    """Reads one model file."""
+class _ModelReader:
+    """Reads one model file, by the copy that a project gets."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, packages: Mapping[str, Path], folder: Path) -> None:
+        self._path = path = path.resolve()
         self._shown = min(str(path), os.path.relpath(path), key=len)
         self._text = path.read_text(encoding="utf-8", errors="replace")
-        self._notes: list[str] = []
+        self._copy = copy_model(path, self._shown, packages)
+        self._written = self._copy.write(folder)
+        self._folders = {name: folder / root for name, root in self._copy.packages.items()}
+        self._parser_notes = _Grouped()
+        self._notes: list[str] = list(self._copy.notes)
+        self._folder = folder
+        self._home_notes: list[str] = []  # they do not matter where a robot stands in another posture
 
-    def robot(self) -> Robot:
-        files, packages = self._files()
-        robot = Robot(next(p for p, source in files.items() if source == self._path), files, packages=packages)
-        with self._warnings():
-            plant = self._load()[0]
-            self._finalize(plant)
+    def robot(self) -> ProjectRobot:
+        robot = ProjectRobot(self._copy.model, self._copy.files, packages=self._copy.packages)
+        robot.assumptions = list(self._copy.assumptions)
+        plant = self._load()[0]
+        self._finalize(plant)
+        if (flying := self._flying()) is not None:
+            robot.flying = flying
+            robot.assumptions += [f"{self._shown} {assumption}" for assumption in flying.assumptions]
+            robot.notes = [*self._notes, *self._parser_notes.sentences()]
+            return robot
         joints = self._joints(plant)
         robot.welded = self._free_bodies(plant)
         robot.couplings = self._couplings(joints)
         self._choose_drives(plant, joints, robot)
         plant, scene_graph, diagram = self._as_in_project(robot, [joint.name() for joint in joints])
         self._read_limits(plant, joints, robot)
+        self._find_legs(robot)
         if robot.has_constraints and plant.num_constraints() > len(robot.couplings):
             robot.motions = self._motions(robot)
         robot.touching = self._touching(plant, scene_graph, diagram, robot)
-        robot.notes = self._notes
+        robot.notes = [*self._notes, *self._home_notes, *self._parser_notes.sentences()]
         return robot
 
     # -- Drake's parser
@@ -187,32 +244,51 @@ class _Reader:
         return plant, scene_graph, builder
 
     def _parse(self, plant: MultibodyPlant) -> None:
-        parser = Parser(plant)
-        for root in _package_roots(self._path, self._text).values():
-            parser.package_map().AddPackageXml(str(root / "package.xml"))
-        try:
-            parser.AddModels(str(self._path))
-        except RuntimeError as error:
-            raise self._error(one_line(error)) from error
+        with self._warnings():
+            try:
+                parse(plant, self._written, self._folders)
+            except (RuntimeError, SystemExit) as error:
+                raise self._error(one_line(error)) from error
 
     def _finalize(self, plant: MultibodyPlant) -> None:
         try:
-            plant.Finalize()
+            with self._warnings():
+                plant.Finalize()
         except (RuntimeError, SystemExit) as error:
-            remedy = ""
-            if "loop" in str(error):
-                remedy = "; open each loop at one joint, and close it by a <drake:ball_constraint> or a <mimic>"
-            raise self._error(f"{one_line(error)}{remedy}") from error
+            if "loop" not in str(error):
+                raise self._error(one_line(error)) from error
+            where, joint = self._closing_joint()
+            raise RobotFileError(
+                f"{where}: joints form a loop{joint}, which Drake takes as a constraint only: open each loop at one "
+                "joint, and close it by a <drake:ball_constraint> or a <mimic>"
+            ) from error
+
+    def _closing_joint(self) -> tuple[str, str]:
+        """Return the place of a joint whose child is already the child of another one, and text with its name."""
+        children: dict[str, str] = {}
+        for joint in self._copy.xml.root.iter("joint") if self._copy.xml is not None else ():
+            child = joint.find("child")
+            if child is not None:
+                link, name = child.get("link") or child.text.strip(), joint.get("name")
+                if children.setdefault(link, name) != name:
+                    return f"{self._shown}:{joint.line}", f" that {name} closes"
+        return self._shown, ""
 
     def _error(self, message: str) -> RobotFileError:
         """Return an error with file, line (where Drake gives one) and remedy."""
-        if "does not exist" in message:
-            message += " Put the file there, or take its <visual> or <collision> out"
-        elif "unknown package" in message:
-            message += ". Put the package's folder, with its package.xml, around the model file"
-        if str(self._path) not in message:
-            message = f"{self._path}: {message}"
-        return RobotFileError(message.replace(str(self._path), self._shown))
+        if "does not exist" in message or "could not be found" in message:
+            message += " Put the file there, or take what refers to it out"
+        elif "not supported for joint" in message:
+            message += " Take it out, or replace it by a fixed, revolute or prismatic joint"
+        elif package := re.search(r"unknown package '([^']+)'", message):
+            message += f": {self._copy.missing.get(package[1], '')}"
+        message = self._in_original(message.replace(_SEE_ALSO, ""))
+        return RobotFileError(message if self._shown in message else f"{self._shown}: {message}")
+
+    def _in_original(self, message: str) -> str:
+        """Return a message of Drake about the copy as one about the file."""
+        message = re.sub(rf"/*{re.escape(str(self._written))}", self._shown, message)
+        return message.replace(str(self._folder), str(self._copy.original_folder))
 
     @contextmanager
     def _warnings(self) -> Iterator[None]:
@@ -228,8 +304,8 @@ class _Reader:
             logger.removeHandler(handler)
             logger.setLevel(level)
             logger.propagate = propagate
-            messages = (message.replace(str(self._path), self._shown) for message in handler.messages)
-            self._notes += [message for message in dict.fromkeys(messages) if message not in self._notes]
+            for message in handler.messages:
+                self._parser_notes.add(self._in_original(message))
 
     def _place(self, name: str) -> str:
         """Return file and line where ``name`` is defined, or the file alone."""
@@ -255,7 +331,8 @@ class _Reader:
         if not moving:
             raise RobotFileError(
                 f"{self._shown} has no joints to drive: its links are fixed to each other, or move freely. It is an "
-                "object, not a robot; add it to the world of a scenario (Parser(plant).AddModels in add_world)"
+                "object, not a robot; add it to the world of a scenario (Parser(plant).AddModels in add_world). "
+                "A drone is known by motors at sites, bodies named rotor or propeller, or its own name"
             )
         names = [joint.name() for joint in moving]
         if twins := sorted({name for name in names if names.count(name) > 1}):
@@ -266,19 +343,76 @@ class _Reader:
 
     def _free_bodies(self, plant: MultibodyPlant) -> dict[str, RigidTransform]:
         free = [plant.get_body(index) for index in sorted(plant.GetFloatingBaseBodies())]
-        poses = {body.name(): plant.GetDefaultFloatingBaseBodyPose(body) for body in free}
-        if poses:
+        return {body.name(): plant.GetDefaultFloatingBaseBodyPose(body) for body in free}
+
+    def _flying(self) -> FlyingRobot | None:
+        plant, scene_graph, builder = self._load()
+        self._finalize(plant)
+        root = builder.Build().CreateDefaultContext()
+        context = plant.GetMyMutableContextFromRoot(root)
+        return flying_robot(self._path, self._text, plant, scene_graph.model_inspector(), context)
+
+    def _find_legs(self, robot: ProjectRobot) -> None:
+        """Let a robot with legs stand on them; what moves freely otherwise is welded to the world, with a note."""
+        reason = ", because it has neither legs below a trunk nor rotors"
+        for base in tuple(robot.welded):
+            X_WB = robot.welded.pop(base)
+            try:
+                robot.standing = self._standing(base, robot)
+            except StanceError as error:
+                reason = f", because it cannot stand on its legs: {error}"
+            if robot.standing is not None:
+                homes = robot.standing.posture
+                robot.joints = tuple(replace(joint, home=homes[joint.name]) for joint in robot.joints)
+                source = robot.standing.source or "a posture that was searched for"
+                self._home_notes.clear()
+                self._notes.append(f"{self._place(base)}: {base} moves freely; the robot stands in {source}")
+                break
+            robot.welded[base] = X_WB
+        if robot.welded:
             self._notes.append(
-                f"{self._place(next(iter(poses)))}: {_listed(poses)} can move freely in the file: welded to the world "
-                "(WeldFrames in robot.py). A robot that walks or flies needs sensors of its pose, another controller"
+                f"{self._place(next(iter(robot.welded)))}: {_listed(robot.welded)} can move freely in the file: welded "
+                f"to the world (WeldFrames in robot.py){reason}"
             )
-        return poses
+
+    def _standing(self, base: str, robot: ProjectRobot) -> StandingRobot | None:
+        """Return the stance of a robot whose base is free, or None if it has no legs."""
+        plant, scene_graph, builder = self._load()
+        self._change(plant, robot)
+        self._finalize(plant)
+        diagram = builder.Build()
+        context = plant.GetMyMutableContextFromRoot(diagram.CreateDefaultContext())
+        finder = StanceFinder(
+            plant, context, scene_graph.model_inspector(), base=plant.GetBodyByName(base), joints=robot.joints
+        )
+        standing = finder.stance(list(named_postures(self._path, self._text)))
+        if standing is None:
+            return None
+        if robot.has_constraints and plant.num_constraints() > len(robot.couplings):
+            raise StanceError("constraints close loops between its links, which the controller does not know")
+        names = [joint.name for joint in robot.joints]
+        motions = np.array([[float(name == driven) for driven in robot.driven] for name in names])
+        for coupling in robot.couplings:
+            motions[names.index(coupling.joint), robot.driven.index(coupling.leader)] = coupling.multiplier
+        limit = np.array([robot.joints[names.index(driven)].effort for driven in robot.driven])
+
+        def make_plant() -> MultibodyPlant:
+            model = self._load()[0]
+            self._change(model, robot)
+            for constraint in model.GetConstraintIds():
+                model.RemoveConstraint(constraint)
+            model.Finalize()
+            return model
+
+        return with_shift(
+            standing, lambda stance: WholeBodyModel(make_plant, stance, motions=motions, limit=limit), names
+        )
 
     def _couplings(self, joints: list[Joint]) -> tuple[Coupling, ...]:
         names = {joint.name() for joint in joints}
-        return tuple(c for c in _mimics(self._text) if c.joint in names and c.leader in names)
+        return tuple(c for c in _mimics(self._copy.xml) if c.joint in names and c.leader in names)
 
-    def _choose_drives(self, plant: MultibodyPlant, joints: list[Joint], robot: Robot) -> None:
+    def _choose_drives(self, plant: MultibodyPlant, joints: list[Joint], robot: ProjectRobot) -> None:
         followers = {coupling.joint for coupling in robot.couplings}
         drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         controlled = [drive for drive in drives if drive.has_controller()]
@@ -313,24 +447,23 @@ class _Reader:
                 "controlled. Give it an actuator in the file if it has a drive"
             )
 
-    def _as_in_project(self, robot: Robot, joint_names: list[str]) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
+    def _as_in_project(self, robot: ProjectRobot, joint_names: list[str]) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
         """Return the plant of the project's world: as the file has it, with the changes that ``robot`` lists."""
-        with self._warnings():
-            plant, scene_graph, builder = self._load()
-            self._change(plant, robot)
-            followers = {coupling.joint for coupling in robot.couplings}
-            for name in joint_names if robot.adds_drives else ():
-                if name not in followers:
-                    plant.AddJointActuator(name, plant.GetJointByName(name))
-            drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-            robot.driven = tuple(drive.joint().name() for drive in drives)
-            robot.has_constraints = plant.num_constraints() > 0
-            self._finalize(plant)
-            self._check_model(robot)
-            return plant, scene_graph, builder.Build()
+        plant, scene_graph, builder = self._load()
+        self._change(plant, robot)
+        followers = {coupling.joint for coupling in robot.couplings}
+        for name in joint_names if robot.adds_drives else ():
+            if name not in followers:
+                plant.AddJointActuator(name, plant.GetJointByName(name))
+        drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+        robot.driven = tuple(drive.joint().name() for drive in drives)
+        robot.has_constraints = plant.num_constraints() > 0
+        self._finalize(plant)
+        self._check_model(robot)
+        return plant, scene_graph, builder.Build()
 
     @staticmethod
-    def _change(plant: MultibodyPlant, robot: Robot) -> None:
+    def _change(plant: MultibodyPlant, robot: ProjectRobot) -> None:
         """Make the changes that ``robot`` lists, but for the drives that are added."""
         for name, X_WB in robot.welded.items():
             plant.WeldFrames(plant.world_frame(), plant.GetBodyByName(name).body_frame(), X_WB)
@@ -339,7 +472,7 @@ class _Reader:
         for name in robot.servos:
             replace_servo(plant, name)
 
-    def _check_model(self, robot: Robot) -> None:
+    def _check_model(self, robot: ProjectRobot) -> None:
         """Check that the controller can compute with the model, without the constraints."""
         plant = self._load()[0]
         self._change(plant, robot)
@@ -352,8 +485,8 @@ class _Reader:
         except UnsupportedPlantError as error:
             raise RobotFileError(f"{self._shown}: the controller needs a model of the robot, but {error}") from error
 
-    def _motions(self, robot: Robot) -> NDArray[np.float64]:
-        """Return the velocities at home that a small torque of each drive causes, by those of the driven joints.
+    def _motions(self, robot: ProjectRobot) -> NDArray[np.float64]:
+        """Return the velocities at home that a small torque of each drive causes, by the driven joints' velocities.
 
         Drake's solver keeps the constraints, without gravity and contact.
         """
@@ -385,51 +518,16 @@ class _Reader:
 
     # -- numbers
 
-    def _read_limits(self, plant: MultibodyPlant, joints: list[Joint], robot: Robot) -> None:
+    def _read_limits(self, plant: MultibodyPlant, joints: list[Joint], robot: ProjectRobot) -> None:
         names = [joint.name() for joint in joints]
-        kinds = {joint.name(): joint.type_name() for joint in joints}
-        context = plant.CreateDefaultContext()
-        defaults = plant.GetDefaultPositions()
-        ranges: dict[str, tuple[float, float]] = {}
-        homes: dict[str, float] = {}
         assumed: dict[str, list[str]] = {name: [] for name in names}
-        for joint, default in zip(joints, defaults, strict=True):
-            name, reach = joint.name(), _ASSUMED_REACH[joint.type_name()]
-            lower, upper = float(joint.position_lower_limit()), float(joint.position_upper_limit())
-            if not (math.isfinite(lower) and math.isfinite(upper)):
-                assumed[name].append("range")
-                lower, upper = max(lower, -reach), min(upper, reach)
-            if not lower < upper:
-                raise RobotFileError(
-                    f"{self._place(name)}: the range of {name} is empty, {lower:g} to {upper:g}: give it a lower and "
-                    "an upper limit, or make it a fixed joint"
-                )
-            ranges[name] = (lower, upper)
-            homes[name] = float(default) if lower <= default <= upper else 0.5 * (lower + upper)
-            if homes[name] != default:
-                self._notes.append(
-                    f"{self._place(name)}: the default position {default:g} of {name} is outside its range: its home "
-                    f"is {homes[name]:.4g}, in the middle"
-                )
+        ranges = {joint.name(): self._range(joint, assumed) for joint in joints}
+        defaults = plant.GetDefaultPositions()
+        homes = {name: self._home(name, float(q), ranges[name]) for name, q in zip(names, defaults, strict=True)}
+        context = plant.CreateDefaultContext()
         plant.SetPositions(context, [homes[name] for name in names])
         self._check_inertia(plant, context, joints)
-        weights = self._weights(plant, context, ranges, names)
-        M = plant.CalcMassMatrix(context)
-        efforts = {name: 0.0 for name in names}
-        for index in plant.GetJointActuatorIndices():
-            drive = plant.get_joint_actuator(index)
-            name, limit = drive.joint().name(), drive.effort_limit()
-            if self._path.suffix == ".xml" and math.isfinite(limit) and drive.default_gear_ratio() != 1.0:
-                # In MuJoCo the gear multiplies the command, in Drake it does not.
-                limit *= abs(drive.default_gear_ratio())
-                robot.sets_efforts = True
-            if not math.isfinite(limit):
-                k = names.index(name)
-                acceleration = _speed(joints[k]) / _TIME_TO_SPEED
-                limit = _rounded_up(_WEIGHTS * weights[:, k].max() + acceleration * M[k, k])
-                assumed[name].append("effort")
-                robot.sets_efforts |= not robot.adds_drives
-            efforts[name] = limit
+        efforts = self._efforts(plant, context, joints, robot, ranges=ranges, assumed=assumed)
         at_home = self._weights(plant, context, {name: (homes[name], homes[name]) for name in names}, names)[0]
         for name in robot.driven:
             if at_home[names.index(name)] > efforts[name]:
@@ -437,25 +535,115 @@ class _Reader:
                     f"{self._place(name)}: the drive of {name} cannot carry the robot at home: its limit is "
                     f"{efforts[name]:g}, the weight {at_home[names.index(name)]:.3g} (N m or N)"
                 )
-        result = []
+        result, damped = [], []
         for joint in joints:
             name, speed = joint.name(), _speed(joint)
             if speed != joint.velocity_upper_limit():
                 assumed[name].append("speed")
+            braked = _braked(speed, efforts[name], float(joint.default_damping()))
+            if braked < speed:
+                damped.append(f"{name} {braked:g}")
+                speed = braked
+            gaps = tuple(sorted(assumed[name]))
             result.append(
-                RobotJoint(
-                    name, kinds[name], *ranges[name], speed, efforts[name], homes[name], tuple(sorted(assumed[name]))
-                )
+                RobotJoint(name, joint.type_name(), *ranges[name], speed, efforts[name], homes[name], assumed=gaps)
+            )
+        if damped:
+            self._notes.append(
+                f"{self._shown}: at the speed limit, the damping of joints takes more than half of the effort of their "
+                f"drives; the speeds (rad/s or m/s) are therefore {_listed(damped)}"
             )
         robot.joints = tuple(result)
         by_name = {joint.name: joint for joint in result}
         robot.away = tuple(_away(by_name[name]) for name in robot.driven)
-        for value in ("range", "speed", "effort"):
-            if missing := [name for name in names if value in assumed[name]]:
-                self._notes.append(
-                    f"{self._place(missing[0])}: no limit of the {value} of {_listed(missing)}: assumed, see JOINTS in "
-                    "robot.py"
+        robot.assumptions += self._assumptions(result)
+
+    def _range(self, joint: Joint, assumed: dict[str, list[str]]) -> tuple[float, float]:
+        """Return the range of a joint; what the file does not state is noted as assumed."""
+        name, reach = joint.name(), _ASSUMED_REACH[joint.type_name()]
+        lower, upper = float(joint.position_lower_limit()), float(joint.position_upper_limit())
+        if not (math.isfinite(lower) and math.isfinite(upper)):
+            assumed[name].append("range")
+            lower, upper = max(lower, -reach), min(upper, reach)
+        if not lower < upper:
+            raise RobotFileError(
+                f"{self._place(name)}: the range of {name} is empty, {lower:g} to {upper:g}: give it a lower and "
+                "an upper limit, or make it a fixed joint"
+            )
+        return lower, upper
+
+    def _home(self, name: str, default: float, ends: tuple[float, float]) -> float:
+        """Return the home position of a joint: its default, or the middle of its range if that lies outside."""
+        lower, upper = ends
+        home = default if lower <= default <= upper else 0.5 * (lower + upper)
+        if home != default:
+            self._home_notes.append(
+                f"{self._place(name)}: the default position {default:g} of {name} is outside its range: its home "
+                f"is {home:.4g}, in the middle"
+            )
+        return home
+
+    def _efforts(
+        self,
+        plant: MultibodyPlant,
+        context: Context,
+        joints: list[Joint],
+        robot: ProjectRobot,
+        *,
+        ranges: dict[str, tuple[float, float]],
+        assumed: dict[str, list[str]],
+    ) -> dict[str, float]:
+        """Return the limit of the effort of each joint, 0 if it has no drive; unstated ones are noted as assumed.
+
+        Args:
+            plant: The robot.
+            context: A context of it, at home.
+            joints: Its joints.
+            robot: It learns whether the project must set the limits of its drives.
+            ranges: Range of each joint.
+            assumed: Names of the limits that the file does not state, by joint.
+        """
+        names = [joint.name() for joint in joints]
+        weights = self._weights(plant, context, ranges, names)
+        M = plant.CalcMassMatrix(context)
+        efforts = {name: 0.0 for name in names}
+        stated = _stated_efforts(self._copy.xml)
+        forces = {name: force for name, force in _forces(self._copy.xml).items() if name in robot.servos}
+        for index in plant.GetJointActuatorIndices():
+            drive = plant.get_joint_actuator(index)
+            name, limit = drive.joint().name(), drive.effort_limit()
+            if self._path.suffix == ".xml" and math.isfinite(limit) and drive.default_gear_ratio() != 1.0:
+                # In MuJoCo the gear multiplies the command, in Drake it does not.
+                limit *= abs(drive.default_gear_ratio())
+                robot.sets_efforts = True
+            if drive.name() in forces:
+                # Drake takes the ctrlrange for a torque or force, but it is one of positions or velocities.
+                limit = forces[drive.name()]
+                robot.sets_efforts = True
+            if not math.isfinite(limit) and name in stated:
+                # Drake takes over a URDF's limit for the joint of a <transmission> only, and none of a joint in MJCF.
+                limit = stated[name]
+                robot.sets_efforts |= not robot.adds_drives
+            if not math.isfinite(limit):
+                k = names.index(name)
+                acceleration = _speed(joints[k]) / _TIME_TO_SPEED
+                limit = _rounded_up(_WEIGHTS * weights[:, k].max() + acceleration * M[k, k])
+                assumed[name].append("effort")
+                robot.sets_efforts |= not robot.adds_drives
+            efforts[name] = limit
+        return efforts
+
+    def _assumptions(self, joints: list[RobotJoint]) -> list[str]:
+        """Return a sentence for each kind of limit that the file does not state for every joint."""
+        sentences = []
+        for value in ("effort", "speed", "range"):
+            if missing := [joint for joint in joints if value in joint.assumed]:
+                values = _listed(f"{joint.name} {_limit(joint, value)}" for joint in missing)
+                sentences.append(
+                    f"{self._place(missing[0].name)} gives no limit of the {value}, assumed is {values}: compare "
+                    "JOINTS in robot.py with the data sheet"
                 )
+        return sentences
 
     def _check_inertia(self, plant: MultibodyPlant, context: Context, joints: list[Joint]) -> None:
         M = plant.CalcMassMatrix(context)
@@ -483,40 +671,100 @@ class _Reader:
         return np.array(weights)
 
     def _touching(
-        self, plant: MultibodyPlant, scene_graph: SceneGraph, diagram: Diagram, robot: Robot
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, diagram: Diagram, robot: ProjectRobot
     ) -> tuple[str, ...]:
-        context = diagram.CreateDefaultContext()
-        plant.SetPositions(plant.GetMyMutableContextFromRoot(context), [joint.home for joint in robot.joints])
-        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-        frame_of = query.inspector().GetFrameId
-        touching: set[str] = set()
-        for pair in query.ComputePointPairPenetration():
-            bodies = [plant.GetBodyFromFrameId(frame_of(geometry)) for geometry in (pair.id_A, pair.id_B)]
-            touching.update(body.name() for body in bodies)
+        """Return the bodies that touch each other at home, and change ``robot.away`` until no met do on the way."""
+        contacts = _Contacts(plant, scene_graph, diagram)
+        home = np.array([joint.home for joint in robot.joints])
+        touching = contacts.touching(home)
         if touching:
             self._notes.append(
                 f"{self._shown}: {_listed(sorted(touching))} touch each other at home: their contact is left out "
                 "(TOUCHING in robot.py)"
             )
-        return tuple(sorted(touching))
+        names = [joint.name for joint in robot.joints]
+        speed = np.array([robot.joints[names.index(driven)].speed for driven in robot.driven])
+        B = _selection(robot)
+        start = home[[names.index(driven) for driven in robot.driven]]
+        away = np.array(robot.away)
+        met: set[str] = set()
+        for share in _SHARES_OF_THE_WAY:
+            step = share * (away - start)
+            seconds = np.linspace(0.0, (np.abs(step) / speed).max(), _POSTURES)[1:]
+            postures = [home + B @ np.clip(step, -t * speed, t * speed) for t in seconds]
+            met = set().union(*(contacts.touching(q, among=touching) for q in postures))
+            robot.away = tuple(float(f"{value:.4g}") for value in start + step)
+            if not met:
+                break
+        if met:
+            self._notes.append(
+                f"{self._shown}: {_listed(sorted(met))} touch something wherever the robot moves from home: their "
+                "contact is left out (TOUCHING in robot.py)"
+            )
+        return tuple(sorted(touching | met))
 
-    # -- files
 
-    def _files(self) -> tuple[dict[Path, Path], bool]:
-        """Return the files of the model by their paths in the project, and whether it refers to packages."""
-        roots = _package_roots(self._path, self._text)
-        sources = closure(self._path, roots)
-        homeless = [path for path in sources if not any(path.is_relative_to(root) for root in roots.values())]
-        top = _common_folder(homeless)
-        files = {path.relative_to(top): path for path in homeless}
-        for root in roots.values():
-            files[Path(root.name) / "package.xml"] = root / "package.xml"
-            files |= {Path(root.name) / p.relative_to(root): p for p in sources if p.is_relative_to(root)}
-        return files, bool(roots)
+class _Contacts:
+    """Which bodies touch each other in a posture."""
+
+    def __init__(self, plant: MultibodyPlant, scene_graph: SceneGraph, diagram: Diagram) -> None:
+        self._plant = plant
+        context = diagram.CreateDefaultContext()
+        self._context = plant.GetMyMutableContextFromRoot(context)
+        self._query = scene_graph.get_query_output_port()
+        self._query_context = scene_graph.GetMyContextFromRoot(context)
+
+    def touching(self, positions: NDArray[np.float64], among: Collection[str] = ()) -> set[str]:
+        """Return the names of bodies that touch each other, but for pairs of two that are in ``among``."""
+        self._plant.SetPositions(self._context, positions)
+        query = self._query.Eval(self._query_context)
+        frame_of = query.inspector().GetFrameId
+        bodies: set[str] = set()
+        for pair in query.ComputePointPairPenetration():
+            names = {self._plant.GetBodyFromFrameId(frame_of(geometry)).name() for geometry in (pair.id_A, pair.id_B)}
+            if not names <= set(among):
+                bodies |= names
+        return bodies
+
+
+def parse(plant: MultibodyPlant, model: Path, packages: Mapping[str, Path] = MappingProxyType({})) -> None:
+    """Add a model file to a plant.
+
+    Args:
+        plant: The plant, which is changed.
+        model: The file.
+        packages: The folders of the packages that it names.
+    """
+    parser = Parser(plant)
+    for name, folder in packages.items():
+        parser.package_map().Add(name, str(folder))
+    parser.AddModels(str(model))
+
+
+def add_model(plant: MultibodyPlant, model: Path, packages: Mapping[str, Path] = MappingProxyType({})) -> None:
+    """Add the model file of a project to a plant, without the parser's warnings, which ``vtbdrake new`` printed.
+
+    Args:
+        plant: The plant, which is changed.
+        model: The file.
+        packages: The folders of the packages that it names.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        parse(plant, model, packages)
+    finally:
+        logger.setLevel(level)
 
 
 def replace_servo(plant: MultibodyPlant, name: str) -> None:
-    """Replace an actuator that has a controller by one that takes a torque or force, with the same rotor."""
+    """Replace an actuator that has a controller by one that takes a torque or force, with the same rotor.
+
+    Args:
+        plant: The plant, before it is finalized; it is changed.
+        name: Name of the actuator, which only one model instance has.
+    """
     servo = plant.GetJointActuatorByName(name)
     joint, limit = servo.joint(), servo.effort_limit()
     rotor, gear = servo.default_rotor_inertia(), servo.default_gear_ratio()
@@ -524,6 +772,29 @@ def replace_servo(plant: MultibodyPlant, name: str) -> None:
     drive = plant.AddJointActuator(name, joint, limit)
     drive.set_default_rotor_inertia(rotor)
     drive.set_default_gear_ratio(gear)
+
+
+class _Grouped:
+    """Messages about places, those that are alike in one sentence."""
+
+    def __init__(self) -> None:
+        self._groups: dict[str, dict[str, None]] = {}
+
+    def add(self, message: str) -> None:
+        """Add a message ``FILE:LINE: ...``, unless it is there."""
+        _, _, text = message.rpartition(": ") if not _PLACE.match(message) else ("", "", _PLACE.sub("", message))
+        key = re.sub(r"'[^']*'|\"[^\"]*\"|[-+.\d]+", "*", text)
+        self._groups.setdefault(key, {})[message] = None
+
+    def sentences(self) -> Iterator[str]:
+        """Yield the first message of each group, with the number of the further."""
+        for messages in self._groups.values():
+            first, *further = messages
+            place = _PLACE.match(first)
+            if further and place:
+                yield f"{place[1]} and {len(further)} more of the kind: {_PLACE.sub('', first)}"
+            else:
+                yield f"{first} ({len(further)} more of the kind)" if further else first
 
 
 class _Collector(logging.Handler):
@@ -537,13 +808,41 @@ class _Collector(logging.Handler):
         self.messages.append(record.getMessage().partition("\n")[0].replace(": warning:", ":"))
 
 
+def _selection(robot: ProjectRobot) -> NDArray[np.float64]:
+    """Return the velocities of all joints by the driven joints' velocities, shape (joints, driven)."""
+    if robot.motions is not None:
+        return robot.motions
+    names = [joint.name for joint in robot.joints]
+    B = np.array([[float(name == driven) for driven in robot.driven] for name in names])
+    for coupling in robot.couplings:
+        B[names.index(coupling.joint), robot.driven.index(coupling.leader)] = coupling.multiplier
+    return B
+
+
 def _listed(names: object) -> str:
     return ", ".join(map(str, names))  # type: ignore[call-overload]
+
+
+def _limit(joint: RobotJoint, value: str) -> str:
+    """Return an effort, speed or range with its unit."""
+    unit = "m" if joint.kind == PRISMATIC else "rad"
+    if value == "range":
+        return f"{joint.lower:.3g} to {joint.upper:.3g} {unit}"
+    if value == "speed":
+        return f"{joint.speed:g} {unit}/s"
+    return f"{joint.effort:g} {'N' if joint.kind == PRISMATIC else 'N m'}"
 
 
 def _speed(joint: Joint) -> float:
     limit = float(joint.velocity_upper_limit())  # 0 is what exporters write where they know none
     return limit if math.isfinite(limit) and limit > 0.0 else _ASSUMED_SPEED[joint.type_name()]
+
+
+def _braked(speed: float, effort: float, damping: float) -> float:
+    """Return the speed at which the damping of a joint takes half of the effort of its drive, if it is slower."""
+    if not effort or damping * speed <= _DAMPED * effort:
+        return speed
+    return float(f"{_DAMPED * effort / damping:.2g}")
 
 
 def _rounded_up(value: float) -> float:
@@ -559,64 +858,41 @@ def _away(joint: RobotJoint) -> float:
     return float(f"{joint.home + math.copysign(step, end - joint.home):.4g}")
 
 
-def _mimics(text: str) -> Iterator[Coupling]:
+def _stated_efforts(xml: XmlText | None) -> dict[str, float]:
+    """Return the effort limits (N m or N) by joint that Drake leaves out; 0 is what exporters write for unknown ones.
+
+    These are <limit effort> in a URDF, and actuatorfrcrange in MJCF.
+    """
+    efforts = {}
+    for joint in xml.root.iter("joint") if xml is not None else ():
+        limit = joint.find("limit")
+        text = limit.get("effort") if limit is not None else joint.get("actuatorfrcrange")
+        effort = max((abs(float(number)) for number in text.split()), default=0.0)
+        if effort > 0.0 and xml is not None and xml.root.tag in (URDF, MJCF):
+            efforts[joint.get("name")] = effort
+    return efforts
+
+
+def _forces(xml: XmlText | None) -> dict[str, float]:
+    """Return the largest force or torque of each actuator in MJCF by its forcerange, infinite where it has none."""
+    forces: dict[str, float] = {}
+    if xml is None:
+        return forces
+    defaults = [child for part in xml.root.iter("default") for child in part.children if child.get("forcerange")]
+    for actuator in [child for part in xml.root.iter("actuator") for child in part.children]:
+        of_class = next((default.get("forcerange") for default in defaults if default.tag == actuator.tag), "")
+        numbers = (actuator.get("forcerange") or of_class).split()
+        forces[actuator.get("name")] = max((abs(float(number)) for number in numbers), default=math.inf)
+    return forces
+
+
+def _mimics(xml: XmlText | None) -> Iterator[Coupling]:
     """Yield the couplings in a URDF (<mimic> in a joint) or SDF (<drake:mimic> in a joint)."""
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:
+    if xml is None:
         return
-    mimic = ("mimic",) if root.tag == "robot" else ("{http://drake.mit.edu}mimic",)
-    for joint in root.iter("joint"):
-        for element in joint.iter():
-            # Drake has no couplings for the <mimic> of SDF, only for its own.
-            if element.tag in mimic and "joint" in element.attrib:
-                multiplier = float(element.get("multiplier", "1"))
-                yield Coupling(joint.get("name", ""), element.get("joint", ""), multiplier)
-
-
-def _package_roots(path: Path, text: str) -> dict[str, Path]:
-    """Return the folders of the packages that a model refers to, by name; Drake's own are not among them."""
-    named = set(re.findall(r"package://([^/\"'<>\s]+)/", text)) - {"drake", "drake_models"}
-    roots: dict[str, Path] = {}
-    for folder in path.parents if named else ():
-        for xml in (folder / "package.xml", *sorted(folder.glob("*/package.xml"))):
-            match = re.search(r"<name>\s*([^<\s]+)\s*</name>", xml.read_text("utf-8")) if xml.is_file() else None
-            if match and match[1] in named:
-                roots.setdefault(match[1], xml.parent)
-        if named <= roots.keys():
-            break
-    return roots
-
-
-def closure(path: Path, roots: dict[str, Path]) -> list[Path]:
-    """Return a model file and the files that it needs, directly or through others."""
-    files, waiting = [path], [path]
-    while waiting:
-        for target in _references(waiting.pop(), roots):
-            if target not in files:
-                files.append(target)
-                waiting.append(target)
-    return files
-
-
-def _references(path: Path, roots: dict[str, Path]) -> Iterator[Path]:
-    if path.suffix.lower() not in (".urdf", ".sdf", ".xml", ".obj", ".mtl", ".gltf"):
-        return
-    text = path.read_text(encoding="utf-8", errors="replace")
-    pattern = _OBJ_FILE if path.suffix.lower() in (".obj", ".mtl") else _QUOTED_FILE
-    folders = [path.parent, *(path.parent / name for name in re.findall(r'(?:mesh|texture|asset)dir="([^"]+)"', text))]
-    for name in pattern.findall(text):
-        if match := re.match(r"(?:package|model)://([^/]+)/(.*)", name):
-            candidates = [roots[match[1]] / match[2]] if match[1] in roots else []
-        else:
-            candidates = [folder / name.removeprefix("file://") for folder in folders]
-        yield from (candidate.resolve() for candidate in candidates if candidate.is_file())
-
-
-def _common_folder(paths: list[Path]) -> Path:
-    """Return the innermost folder that holds all files."""
-    parents = [path.parent for path in paths]
-    folder = parents[0] if parents else Path()
-    while not all(parent.is_relative_to(folder) for parent in parents):
-        folder = folder.parent
-    return folder
+    # Drake has no couplings for the <mimic> of SDF, only for its own.
+    tag = "mimic" if xml.root.tag == URDF else "drake:mimic"
+    for joint in xml.root.iter("joint"):
+        for element in joint.iter(tag):
+            if "joint" in element.attributes:
+                yield Coupling(joint.get("name"), element.get("joint"), float(element.get("multiplier", "1")))

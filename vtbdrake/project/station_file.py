@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.manipulation import IiwaDriver, SchunkWsgDriver
 
-from vtbdrake.project.robot_file import closure
+from vtbdrake.project.model_copy import closure
 from vtbdrake.station import Station
 from vtbdrake.testbed import Interface, ScenarioError, VirtualTestbedBuilder
 
@@ -20,11 +20,17 @@ class StationFileError(ValueError):
 
 @dataclass(frozen=True)
 class StationArm:
-    """An arm of a station: a model with an `IiwaDriver`."""
+    """An arm of a station: a model with an `IiwaDriver`.
+
+    Attributes:
+        name: The name of the model.
+        home: The posture at the start, in rad.
+        away: Another posture, for examples.
+    """
 
     name: str
-    home: tuple[float, ...]  # rad
-    away: tuple[float, ...]  # another posture, for examples
+    home: tuple[float, ...]
+    away: tuple[float, ...]
 
 
 @dataclass(frozen=True)

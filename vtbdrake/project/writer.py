@@ -13,9 +13,11 @@ from pathlib import Path
 from string import Template
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from vtbdrake.project.robot_file import PRISMATIC, Robot, RobotJoint
+from vtbdrake.project.robot_file import PRISMATIC, ProjectRobot, RobotJoint
+from vtbdrake.project.rotors import FlyingRobot
 from vtbdrake.project.station_file import StationFile
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -34,6 +36,19 @@ _ROBOT = {
     "test.py": "tests/test_{name}.py",
     **{f"package/{file}.py": f"{{name}}/{file}.py" for file in ("robot", "dps", "scenario", "optimize")},
 }
+_LEGGED = {
+    **_COMMON,
+    "legged/README.md": "README.md",
+    "legged/test.py": "tests/test_{name}.py",
+    "package/robot.py": "{name}/robot.py",
+    **{f"legged/{file}.py": f"{{name}}/{file}.py" for file in ("dps", "scenario", "optimize")},
+}
+_FLYING = {
+    **_COMMON,
+    "flying/README.md": "README.md",
+    "flying/test.py": "tests/test_{name}.py",
+    **{f"flying/{file}.py": f"{{name}}/{file}.py" for file in ("robot", "dps", "scenario", "optimize")},
+}
 _STATION = {
     **_COMMON,
     "station/README.md": "README.md",
@@ -50,6 +65,10 @@ class ProjectError(ValueError):
 def check_name(name: str, folder: Path) -> None:
     """Check that a project may be written as ``folder/name``, with a Python package of this name.
 
+    Args:
+        name: The name of the project.
+        folder: The folder in which the folder of the project would be made.
+
     Raises:
         ProjectError: The name is no identifier, names another module, or is there already.
     """
@@ -57,7 +76,7 @@ def check_name(name: str, folder: Path) -> None:
         near = "".join(c if c.isascii() and c.isalnum() else "_" for c in name).strip("_").lower()
         near = near if near.isidentifier() and not keyword.iskeyword(near) else "my_robot"
         raise ProjectError(
-            f"the name of a project is that of its Python package: letters, digits and _, as in {near}, not {name!r}"
+            f"a project is named like its Python package: letters, digits and _, as in {near}, not {name!r}"
         )
     if (folder / name).exists() or (folder / name).is_symlink():
         raise ProjectError(f"{folder / name} exists, and is not overwritten: give another name, or remove it")
@@ -69,7 +88,7 @@ def check_name(name: str, folder: Path) -> None:
         raise ProjectError(f"{folder} is a folder that you cannot write to: change to one of yours")
 
 
-def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
+def write_project(folder: Path, name: str, source: ProjectRobot | StationFile) -> Path:
     """Write a project whole, or not at all, and return its folder.
 
     Args:
@@ -81,17 +100,16 @@ def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
         ProjectError: See `check_name`.
     """
     check_name(name, folder)
-    if isinstance(source, Robot):
-        templates, values, kind = _ROBOT, _robot_values(source), "Scenario"
+    if isinstance(source, ProjectRobot):
+        templates = _FLYING if source.flying is not None else _ROBOT if source.standing is None else _LEGGED
+        values, kind = _robot_values(source), "Scenario"
     else:
         templates, values, kind = _STATION, _station_values(source), "Station"
     values |= {
         "name": name,
         "NAME": name.upper(),
         "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")) + kind,
-        "notes": "".join(["\n## What is assumed\n\n", *(f"* {note}\n" for note in source.notes)])
-        if source.notes
-        else "",
+        "notes": _section("About the model file", source.notes),
     }
     with tempfile.TemporaryDirectory(dir=folder, prefix=f".{name}-") as temporary:
         project = Path(temporary) / name
@@ -103,25 +121,66 @@ def write_project(folder: Path, name: str, source: Robot | StationFile) -> Path:
         for relative, original in source.files.items():
             file = project / name / "models" / relative
             file.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(original, file)
+            if isinstance(original, Path):
+                shutil.copyfile(original, file)
+            else:
+                file.write_bytes(original)
         project.rename(folder / name)
     return folder / name
 
 
-def _robot_values(robot: Robot) -> dict[str, str]:
+def _section(title: str, items: Sequence[str]) -> str:
+    """Return a section of a README, or nothing if there are no items."""
+    return "".join([f"\n## {title}\n\n", *(f"* {item}\n" for item in items)]) if items else ""
+
+
+def _flying_values(robot: ProjectRobot, flying: FlyingRobot) -> dict[str, str]:
+    rotors = [
+        f"    {json.dumps(rotor.name)}: Rotor(position={_point(rotor.position)}, moment={_number(rotor.moment)}, "
+        f"most={_number(rotor.most)}),\n"
+        for rotor in flying.rotors
+    ]
+    return {
+        "subject": "robot",
+        "assumptions": _section("What is assumed", robot.assumptions),
+        "assumed_comment": "\n# What the file does not say is assumed." if robot.assumptions else "",
+        "model_file": robot.model.name,
+        "model_path": robot.model.as_posix(),
+        "add_robot": "".join(f"    {line}\n" for line in _add_robot(robot)),
+        "base": json.dumps(flying.base),
+        "height": _number(flying.height),
+        "rotors": "".join(rotors),
+        "position_unit": "m",
+    }
+
+
+def _point(values: NDArray[np.float64]) -> str:
+    return f"({', '.join(_number(value) for value in values)})"
+
+
+def _robot_values(robot: ProjectRobot) -> dict[str, str]:
+    if robot.flying is not None:
+        return _flying_values(robot, robot.flying)
     joints = {joint.name: joint for joint in robot.joints}
     drives = [joints[driven] for driven in robot.driven]
     is_exact = len(drives) == len(joints)
-    names = ["DRIVEN", "JOINTS", *(["TOUCHING"] if robot.touching else []), "B", "add_robot", "limits"]
+    touching = ["TOUCHING"] if robot.touching else []
+    has_passive = any(_is_passive(joint, robot) for joint in robot.joints)
+    names = ["DRIVEN", "JOINTS", *touching, "B", "add_robot", "limits"]
+    if robot.standing is not None:
+        names = ["BASE", "DRIVEN", "FEET", "JOINTS", "SHIFT", "SOLES", *touching, *(["B"] if has_passive else [])]
+        names += ["add_robot", "limits"]
     return {
         "subject": "robot",
+        "assumptions": _section("What is assumed", robot.assumptions),
         "model_file": robot.model.name,
         "model_path": robot.model.as_posix(),
         "robot_imports": _robot_imports(robot),
         "assumed_comment": "\n# What the file does not say is assumed." if any(j.assumed for j in robot.joints) else "",
         "joints": "\n".join(map(_joint, robot.joints)),
         "driven": _list("DRIVEN = ", [json.dumps(name) for name in robot.driven]),
-        "away": _list("AWAY = ", [_number(value) for value in robot.away]),
+        "examples": _examples(robot),
+        "reached": f"{0.8 * robot.standing.reached:.2f}" if robot.standing is not None else "",
         "B": _motions(robot),
         "couplings": "".join(
             f"B[list(JOINTS).index({json.dumps(c.joint)}), DRIVEN.index({json.dumps(c.leader)})] = "
@@ -140,6 +199,7 @@ def _robot_values(robot: Robot) -> dict[str, str]:
         "position_unit": _unit(robot.joints),
         "velocity_unit": _unit(robot.joints, "/s"),
         "driven_unit": _unit(drives),
+        "driven_velocity_unit": _unit(drives, "/s"),
         # A variable of one entry is a number.
         "entry": "[0]" if len(drives) == 1 else "",
         "driven_position": "np.atleast_1d(position)[INDICES]" if len(joints) == 1 else "position[INDICES]",
@@ -147,11 +207,34 @@ def _robot_values(robot: Robot) -> dict[str, str]:
         "scenario_imports": "from pydrake.geometry import CollisionFilterDeclaration\n" if robot.touching else "",
         "robot_names": ", ".join(names),
         "scene_graph": "scene_graph" if robot.touching else "_",
-        "filter": _FILTER if robot.touching else "",
+        "filter": _filter(robot),
         "tolerance": "0.02" if is_exact else "0.2",
+        "passive": _PASSIVE if has_passive else "",
+        "numpy": "import numpy as np\n" if has_passive else "",
     }
 
 
+# The signals of joints that move freely are not guarded: such a joint falls, and may turn over.
+_PASSIVE = """\
+        passive = (limits("effort") == 0.0) & (B == 0.0).all(axis=1)  # may fall, turn over and hit its stops
+        margin, speed = np.where(passive, 100.0, margin), np.where(passive, 100.0, speed)
+"""
+
+
+def _is_passive(joint: RobotJoint, robot: ProjectRobot) -> bool:
+    """Return whether neither a drive nor another joint moves a joint."""
+    return not joint.effort and robot.motions is None and joint.name not in {c.joint for c in robot.couplings}
+
+
+def _filter(robot: ProjectRobot) -> str:
+    if not robot.touching:
+        return ""
+    return _FILTER if robot.standing is None else _FILTER_ON_FEET
+
+
+_FILTER_ON_FEET = """\
+        without.ExcludeWithin(plant.CollectRegisteredGeometries([plant.GetBodyByName(name) for name in TOUCHING]))
+"""
 _FILTER = """\
         # Else their contact would push the robot away from home.
         touching = plant.CollectRegisteredGeometries([plant.GetBodyByName(name) for name in TOUCHING])
@@ -160,17 +243,55 @@ _FILTER = """\
 
 
 _SELECTION = """\
-# The velocities of all joints are B times those of the driven ones.
+# The velocities of all joints are B times the driven joints' velocities.
 B = np.array([[float(name == driven) for driven in DRIVEN] for name in JOINTS])
 """
 
 
-def _motions(robot: Robot) -> str:
+def _examples(robot: ProjectRobot) -> str:
+    """Return the constants of examples and tests: another posture, or stance and shift of a robot with legs."""
+    standing = robot.standing
+    if standing is None:
+        away = _list("AWAY = ", [_number(value) for value in robot.away])
+        return f"# Another posture of these joints, for examples.\nAWAY = {away}\n"
+    stance = standing.stance([])
+    feet = "".join(_foot(name, points) for name, points in standing.feet.items())
+    soles = "".join(f"    {json.dumps(name)}: np.array({_row(up)}),\n" for name, up in standing.soles.items())
+    direction = "left" if standing.direction == (0.0, 1.0) else "front"
+    return (
+        "# The trunk, and its pose when the robot stands: a quaternion wxyz, and the position over the ground in m.\n"
+        f"BASE = {json.dumps(standing.base)}\n"
+        f"X_WB = np.array({_row(stance.X_WB)})\n"
+        "# The contact points of the feet, in the frame of each, in m.\n"
+        f"FEET = {{\n{feet}}}\n"
+        "# The feet with a sole, or without collision geometry: they touch the ground by small spheres at their\n"
+        "# contact points. The direction up in the frame of each.\n"
+        f"SOLES = {f'{{{chr(10)}{soles}}}' if soles else '{}'}\n"
+        f"# The weight is shifted to the {direction}, in examples by this distance in m.\n"
+        f"DIRECTION = ({_number(standing.direction[0])}, {_number(standing.direction[1])})\n"
+        f"SHIFT = {_number(standing.shift)}\n"
+    )
+
+
+def _row(values: NDArray[np.float64]) -> str:
+    return f"[{', '.join(_number(value) for value in np.where(np.abs(values) < 1e-12, 0.0, values))}]"
+
+
+def _foot(name: str, points: NDArray[np.float64]) -> str:
+    """Return the entry of FEET: the contact points of a foot."""
+    line = f"    {json.dumps(name)}: np.array([{', '.join(map(_row, points))}]),\n"
+    if len(line) <= _LONGEST_LINE + 1:  # with its end
+        return line
+    rows = "".join(f"            {_row(point)},\n" for point in points)
+    return f"    {json.dumps(name)}: np.array(\n        [\n{rows}        ]\n    ),\n"
+
+
+def _motions(robot: ProjectRobot) -> str:
     if robot.motions is None:
         return _SELECTION
     rows = [", ".join(map(_number, np.round(row, 3))) for row in robot.motions]
     lines = "".join(f"        [{row}],\n" for row in rows)
-    comment = "# Near home, the velocities of all joints are B times those of the driven ones."
+    comment = "# Near home, the velocities of all joints are B times the driven joints' velocities."
     return f"{comment}\nB = np.array(\n    [\n{lines}    ]\n)\n"
 
 
@@ -199,11 +320,13 @@ def _unit(joints: Sequence[RobotJoint], per: str = "") -> str:
     return ", ".join(dict.fromkeys(("m" if joint.kind == PRISMATIC else "rad") + per for joint in joints))
 
 
-def _robot_imports(robot: Robot) -> str:
+def _robot_imports(robot: ProjectRobot) -> str:
     moved = any(not _is_identity(X_WB) for X_WB in robot.welded.values())
     lines = ["from pydrake.math import RigidTransform, RollPitchYaw"] if moved else []
-    lines += ["from pydrake.multibody.parsing import Parser", "from pydrake.multibody.plant import MultibodyPlant"]
-    lines += ["from vtbdrake.project import replace_servo"] if robot.servos else []
+    if robot.standing is not None and not moved:
+        lines = ["from pydrake.math import RigidTransform"]
+    lines += ["from pydrake.multibody.plant import MultibodyPlant"]
+    lines += [f"from vtbdrake.project import {'add_model, replace_servo' if robot.servos else 'add_model'}"]
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -211,21 +334,21 @@ def _is_identity(X: RigidTransform) -> bool:
     return bool(X.IsNearlyIdentity(1e-12))
 
 
-def _add_robot(robot: Robot) -> list[str]:
-    """Return the lines that make the plant of the file that of the project."""
-    lines = ["Parser(plant).AddModels(str(MODEL))"]
-    if robot.packages:
-        up = len(robot.model.parts) - 1
-        lines = [
-            "parser = Parser(plant)",
-            f"parser.package_map().PopulateFromFolder(str(MODEL.parents[{up}]))",
-            "parser.AddModels(str(MODEL))",
-        ]
+def _add_robot(robot: ProjectRobot) -> list[str]:
+    """Return the lines that turn the plant of the file into the project's plant."""
+    up = len(robot.model.parts) - 1
+    folders = [f'{json.dumps(name)}: MODEL.parents[{up}] / "{path}"' for name, path in robot.packages.items()]
+    lines = [f"add_model(plant, MODEL, {{{', '.join(folders)}}})" if folders else "add_model(plant, MODEL)"]
     for name, X_WB in robot.welded.items():
         pose = "" if _is_identity(X_WB) else ", X_WB"
         lines += [f"X_WB = {_pose(X_WB)}"] if pose else []
         frame = f"plant.GetBodyByName({json.dumps(name)}).body_frame()"
         lines.append(f"plant.WeldFrames(plant.world_frame(), {frame}{pose})")
+    if robot.standing is not None:
+        lines += [
+            "base = plant.GetBodyByName(BASE)",
+            "plant.SetDefaultFloatingBaseBodyPose(base, RigidTransform(X_WB[4:]))",
+        ]
     lines += [
         f"plant.RemoveJointActuator(plant.GetJointActuatorByName({json.dumps(name)}))  # it follows another joint"
         for name in robot.without_drive

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from html import escape
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +13,11 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeDelay, ZeroOrderHold
 
-from vtbdrake.argument_checks import as_whole
+from vtbdrake.common.argument_checks import as_whole
 from vtbdrake.rollout.start import Start
 from vtbdrake.state import Variable, VariableError
 from vtbdrake.state.layout import FlatState, LayoutError
-from vtbdrake.state.variables import A, with_unit
+from vtbdrake.state.variables import A, html_table, with_unit
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.dps_state import DpsState
@@ -60,14 +61,30 @@ class Belief:
     Attributes:
         dps: The DPS: its state, parameters and commands, and the sensor values that it has received last.
         world: The true world if the belief is perfect, else None.
+
+    Raises:
+        ValueError: ``dps`` is no state of a DPS.
     """
 
     dps: DpsState
     world: World | None = None
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.dps, DpsState):
+            raise ValueError(f"a belief is made of the state of a DPS, by Belief.of(...), not of {self.dps!r}")
+
     def __repr__(self) -> str:
         kind = "perfect belief" if self.world is not None else "belief"
         return f"<{kind} at t = {self.dps.time:g} s>"
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what the DPS has received and is told, and of the world what is believed."""
+        rows: list[tuple[str, str, ArrayLike]] = [("received", name, v) for name, v in self.dps.received.items()]
+        rows += [("command", name, value) for name, value in self.dps.commands.items()]
+        rows += [("world", address, value) for address, value in (self.world.values if self.world else {}).items()]
+        cells = [(kind, name, np.array2string(np.asarray(v), precision=5, threshold=6)) for kind, name, v in rows]
+        table = html_table([("", "name", "value"), *cells])
+        return f"<b>{escape(repr(self))}</b>{table}"
 
     @classmethod
     def of(cls, target: AddressedDiagram, context: Context) -> Belief:
@@ -92,9 +109,15 @@ class Belief:
         this time and advanced to the sample times of the rollout, see `AddressedDiagram.fork`. With another mental
         scenario, all variables of the world that both scenarios have get their true values.
 
+        Args:
+            testbed: The running testbed.
+            context: Its root context at the time of the belief.
+
         Raises:
             ValueError: The context belongs to another testbed.
         """
+        if not isinstance(testbed, VirtualTestbed):
+            raise ValueError(f"a perfect belief is one of a testbed, scenario.build(), not of {testbed!r}")
         testbed.check_context(context)
         settable = [v for a, v in testbed.variables().items() if a.startswith("sim.") and not v.derived]
         values = {variable.address: variable.get(context) for variable in settable}
@@ -108,7 +131,7 @@ class Belief:
 # How an estimate is uncertain: a standard deviation (scalar or of the variable's shape), a covariance matrix, or a
 # function that draws: (believed value, random generator) -> value.
 Uncertainty = ArrayLike | Callable[[Any, np.random.Generator], ArrayLike]
-# By address; or samples of variables that vary together, such as those of `Scenario.samples`.
+# By address; or samples of variables that vary together, such as `Scenario.samples`.
 Uncertainties = Mapping[str, Uncertainty] | Sequence[Mapping[str, ArrayLike]]
 
 
@@ -149,7 +172,7 @@ class BeliefToStart:
     """Turns beliefs into starts for the rollouts of one mental testbed.
 
     1. The DPS continues in its present state, at its own time, with its present commands u.
-    2. The world is that of the mental scenario, except for the variables that the DPS's estimates set by the
+    2. The world is the mental scenario's, except for the variables that the DPS's estimates set by the
        scenario's rules (`VirtualTestbedBuilder.believe`). An estimate that lies beyond the bounds of its variable by at
        most 5 % of their distance is clipped. Velocities without a rule are zero.
     3. Sensors keep the values that the DPS has received last, also for samples in transit, until they sample in the
@@ -168,7 +191,7 @@ class BeliefToStart:
         mental: The testbed of the rollouts.
         uncertainty: Uncertainty of the belief, by address of a variable of the simulated world: a standard deviation, a
             covariance matrix, or a function (believed value, random generator) -> value. For a variable without a
-            rule, the believed value is that of the mental scenario. Or samples (address -> value) of variables that
+            rule, the believed value is the mental scenario's. Or samples (address -> value) of variables that
             vary together, as `Scenario.samples` draws them: world n takes sample n, and begins again after the last.
         seed: With the number of a sample, determines its random numbers, in the same way for every belief.
         max_age: The largest age of a belief in seconds.
@@ -262,7 +285,7 @@ class BeliefToStart:
             now: The present time of the DPS in seconds, from which the age of the belief follows.
 
         Raises:
-            BeliefError: The belief is too old; its DPS does not fit that of the mental testbed; an estimate is
+            BeliefError: The belief is too old; its DPS does not fit the DPS of the mental testbed; an estimate is
                 missing (not finite) or lies outside the bounds of its variable; or the mental scenario has no rules.
         """
         self._check_belief(belief, now)
@@ -274,22 +297,31 @@ class BeliefToStart:
         """Return starts in ``samples`` worlds, drawn from the belief and its uncertainty; see `start`.
 
         World n is drawn with the seed and n, so that the same belief gives the same starts. A value beyond the bounds
-        of its variable is clipped. Without uncertainty, all worlds are the believed one.
+        of its variable is clipped. Without uncertainty, all worlds are the believed one; with a perfect belief, they
+        are drawn around the true one.
+
+        Args:
+            belief: The belief.
+            samples: Number of worlds.
+            now: Present time in s, which the belief's age is judged by.
 
         Raises:
             BeliefError: As in `start`.
         """
-        if not (self._draws or self._samples) or belief.world is not None:
+        if not (self._draws or self._samples):
             return [self.start(belief, now=now)] * samples
         self._check_belief(belief, now)
+        if belief.world is not None:
+            start, truth = self._perfect(belief.dps, belief.world), {**self._prior, **belief.world.values}
+            return [replace(start, values={**start.values, **self._sample(n, truth)}) for n in range(samples)]
         numbers, believed = self._believed(belief.dps)
-        starts = []
-        for n in range(samples):
-            rng = np.random.default_rng([self._seed, n])
-            drawn = {a: self._drawn(a, draw(np.asarray(believed[a]), rng)) for a, draw in self._draws.items()}
-            drawn |= self._samples[n % len(self._samples)] if self._samples else {}
-            starts.append(self._start(belief.dps, numbers, believed | drawn))
-        return starts
+        return [self._start(belief.dps, numbers, believed | self._sample(n, believed)) for n in range(samples)]
+
+    def _sample(self, n: int, believed: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+        """Return the uncertain values of world n by address."""
+        rng = np.random.default_rng([self._seed, n])
+        drawn = {a: self._drawn(a, draw(np.asarray(believed[a]), rng)) for a, draw in self._draws.items()}
+        return drawn | (self._samples[n % len(self._samples)] if self._samples else {})
 
     def _drawn(self, address: str, value: ArrayLike) -> np.ndarray:
         variable = self._variables[address]
@@ -356,7 +388,7 @@ class BeliefToStart:
             self._mental.dps_layout.check(dps.contents)
         except LayoutError as error:
             raise BeliefError(
-                f"the DPS that believes does not fit that of the mental scenario {self._mental.scenario!r}: {error}"
+                f"the DPS that believes does not fit the DPS of the mental scenario {self._mental.scenario!r}: {error}"
             ) from error
 
     def _commands(self, dps: DpsState) -> dict[str, ArrayLike]:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import as_number, as_whole
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import as_number, as_whole
+from vtbdrake.common.summary_html import summary_html
 from vtbdrake.rollout import RolloutResult
 from vtbdrake.rollout.start import Start
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -19,7 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # What became of a candidate.
-ELIGIBLE, VIOLATES, CUT_OFF, FAILED, UNFINISHED = "eligible", "violates", "cut off", "failed", "unfinished"
+ELIGIBLE = "eligible"
+VIOLATES = "violates"
+CUT_OFF = "cut off"
+FAILED = "failed"
+UNFINISHED = "unfinished"
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,10 @@ class Budget:
 
 def check_budget(budget: Budget, samples: int) -> None:
     """Check that a budget suffices for one candidate.
+
+    Args:
+        budget: The budget of a decision.
+        samples: The number of samples of the belief; each takes one rollout per candidate.
 
     Raises:
         ValueError: The budget does not suffice, or is not a `Budget`.
@@ -120,9 +130,9 @@ class Health:
         rollout_time: The mean wall time of a rollout, in seconds.
         elapsed: The wall time of the decision, in seconds.
         used: The share of the budget that was used, of rollouts or of time, whichever is larger.
-        improvement: By how much the quality is better than that of the plan in use, in the unit of the quality; at
-            least 0. NaN without a decision, or if the plan in use is not eligible.
-        margin: By how much the quality is better than that of the second best eligible candidate; NaN if there is none.
+        improvement: By how much the quality is better than the quality of the plan in use, in the unit of the quality;
+            at least 0. NaN without a decision, or if the plan in use is not eligible.
+        margin: By how much the quality is better than the second best eligible candidate's; NaN if there is none.
         spread: The standard deviation of the quality over the samples of the belief.
     """
 
@@ -186,6 +196,10 @@ class Decision:
     def apply(self, testbed: AddressedDiagram, context: Context) -> None:
         """Set the chosen values in a context of the running testbed, or of its DPS alone.
 
+        Args:
+            testbed: The running testbed, or its DPS alone.
+            context: Its root context, which is changed.
+
         Raises:
             ValueError: No candidate is eligible.
         """
@@ -232,7 +246,7 @@ class Decision:
     def _facts(self) -> dict[str, str]:
         health = self.health
         facts = {
-            "rollouts": f"{health.rollouts}, of which {health.failed} failed and {health.cut_off} ended early; "
+            "rollouts": f"{health.rollouts} ({health.failed} failed, {health.cut_off} ended early); "
             f"{health.rollout_time * 1e3:.3g} ms each",
             "time": f"{health.elapsed:.3g} s, {health.used:.0%} of the budget",
             "end": f"{self.end}: {self.message}",
@@ -247,8 +261,6 @@ class Decision:
 
     def _repr_html_(self) -> str:
         """Show the facts and the quality trajectories of the candidates in a notebook."""
-        from vtbdrake.visualization.plots import summary_html
-
         rows = {c.text or "none": f"{_number(c)} ({c.status})" for c in self.ranked[:_SHOWN]}
         drawn = any(candidate.has_trajectory for candidate in self.candidates)
         return summary_html(repr(self), {**rows, **self._facts()}, self.plot() if drawn else None)
@@ -259,9 +271,7 @@ class Decision:
         Raises:
             ValueError: No rollout has a quality.
         """
-        from vtbdrake.visualization import plot_decision
-
-        return plot_decision(self)
+        return upper_layers.plot_decision(self)
 
 
 # The largest number of candidates shown.

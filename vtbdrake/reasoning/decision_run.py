@@ -9,6 +9,7 @@ from dataclasses import replace
 from math import inf, nan
 from typing import TYPE_CHECKING, Any
 
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.optimization.evaluator import Evaluator
 from vtbdrake.optimization.records import RolloutKey
 from vtbdrake.optimization.risk import Worst
@@ -30,13 +31,14 @@ from vtbdrake.rollout.pruning import PRUNED, STALLED
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import FAILED as ROLLOUT_FAILED
 from vtbdrake.rollout.task import TERMINATED
-from vtbdrake.testbed.interrupt import Interruptible
 
 if TYPE_CHECKING:
     from vtbdrake.reasoning.reasoner import Reasoner
 
 # Why a decision ended.
-ROLLOUTS, TIME, METHOD = "rollouts", "time", "method"
+ROLLOUTS = "rollouts"
+TIME = "time"
+METHOD = "method"
 
 # Candidate 0 as a point of the search: it sets nothing, so that the DPS goes on with the plan in use.
 KEEP: Point = ()
@@ -332,7 +334,7 @@ def _warnings(
     if failures:
         yield f"{len(failures)} of {len(results)} rollouts failed, the first: {failures[0]}"
     if not results:
-        yield "no rollout has finished, not even that of the plan in use: the budget is too small, or one is too slow"
+        yield "no rollout has finished, not even of the plan in use: the budget is too small, or one is too slow"
     elif len(candidates) == 1:
         yield "nothing but the plan in use was tried: the budget is too small, or a rollout too slow"
     elif candidates[0].status == UNFINISHED:

@@ -37,8 +37,12 @@ _SHARE = 0.8
 # The niceness of the processes beside a loop, so that they leave the processors to others.
 _NICENESS = 5
 
-_DECISION, _CANDIDATE, _CANDIDATE_AT = "decision", "candidate", "candidate_at"
-_QUALITY, _IMPROVEMENT, _ROLLOUTS = "quality", "improvement", "rollouts"
+_DECISION = "decision"
+_CANDIDATE = "candidate"
+_CANDIDATE_AT = "candidate_at"
+_QUALITY = "quality"
+_IMPROVEMENT = "improvement"
+_ROLLOUTS = "rollouts"
 
 
 class OnboardReasoner(SlowPart):
@@ -165,6 +169,10 @@ class OnboardReasoner(SlowPart):
         """Return the decision that the ports of ``context`` show, with its reasoner.
 
         It is None if it is neither remembered nor ``also``: simulations of other contexts make decisions, too.
+
+        Args:
+            context: The part's own context.
+            also: A reasoner and a decision that may be the one shown, though it is not remembered.
         """
         sampled_at, quality = (self.GetOutputPort(name).Eval(context).item() for name in ("sampled_at", _QUALITY))
         candidates = [*self._decider.remembered, *([] if also is None else [also])]
@@ -178,6 +186,10 @@ class OnboardReasoner(SlowPart):
         """Return the equations of the part of a mental copy; see `VirtualTestbed.compiled`.
 
         A class derived from this one has the same equations if it defines a constructor alone; else it writes its own.
+
+        Args:
+            context: The context of this part, whose values are compiled in.
+            varied: The variables of this part that stay arguments of the compiled functions.
         """
         # Imported here: without it, a reasoner needs no CasADi.
         from vtbdrake.compiled.components import CandidateEquations
@@ -237,7 +249,7 @@ class _Decider:
         self._arguments = dict(arguments)
         self._seconds = seconds
         self._budget: Budget = replace(self._arguments["budget"], seconds=None)
-        self._reasoner: Reasoner | None = None
+        self._reasoner: _CandidateReasoner | None = None
         self._last_reason = ""
         self.remembered: deque[tuple[Reasoner, Decision]] = deque(maxlen=0)
         self._taking_turns = threading.Lock()
@@ -258,7 +270,8 @@ class _Decider:
         os.nice(_NICENESS)
         budget = self._arguments["budget"]
         self._budget = replace(budget, seconds=budget.seconds or self._seconds)
-        self._make(**self._arguments).warm_up()
+        self._reasoner = _CandidateReasoner(self._arguments)
+        self._reasoner.reasoner.warm_up()
 
     def __call__(
         self, *, dps: DpsState, request: np.ndarray | None = None, **believed: np.ndarray
@@ -273,10 +286,9 @@ class _Decider:
         with self._taking_turns:
             if self._reasoner is None:
                 search = replace(self._arguments["search"], executor="serial", workers=None)
-                self._make(**{**self._arguments, "search": search})
-            assert self._reasoner is not None
+                self._reasoner = _CandidateReasoner({**self._arguments, "search": search})
             try:
-                decision = self._reasoner.decide(self._belief(dps, believed), budget=self._budget, now=dps.time)
+                decision = self._reasoner.decide(dps, believed, budget=self._budget)
                 reason = "" if decision else decision.message
             except BeliefError as error:
                 reason = str(error)
@@ -285,19 +297,31 @@ class _Decider:
             self._last_reason = reason
             if reason:
                 return None
-            self.remembered.append((self._reasoner, decision))
-            # The decision may set only some entries of the candidate.
-            decision.apply(self._testbed, self._context)
+            self.remembered.append((self._reasoner.reasoner, decision))
             return {
-                _DECISION: np.atleast_1d(self._variables[_CANDIDATE].get(self._context)),
+                _DECISION: self._reasoner.candidate_of(decision),
                 _QUALITY: np.array([decision.quality]),
                 _IMPROVEMENT: np.array([decision.health.improvement]),
                 _ROLLOUTS: np.array([float(decision.health.rollouts)]),
             }
 
-    def _make(self, **arguments: Any) -> Reasoner:
-        self._reasoner = reasoner = Reasoner(**arguments)
-        self._testbed = testbed = reasoner.problem.testbed
+
+class _CandidateReasoner:
+    """A reasoner with the variables of its `OnboardReasoner`, and a candidate in a context of its testbed.
+
+    Args:
+        arguments: Arguments of the reasoner.
+
+    Attributes:
+        reasoner: The reasoner.
+
+    Raises:
+        ValueError: The mental scenario reasons itself, or something else than the candidate is decided.
+    """
+
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        self.reasoner = Reasoner(**arguments)
+        self._testbed = testbed = self.reasoner.problem.testbed
         self._context = testbed.default_context()
         parts = {path: part for path, part in slow_parts(testbed.diagram).items() if isinstance(part, OnboardReasoner)}
         if [part.mental for part in parts.values()] != [True]:
@@ -308,10 +332,27 @@ class _Decider:
         ((path, part),) = parts.items()
         self._variables = {element.name: testbed.variables()[f"{path}.{element.name}"] for element in part.variables}
         self._places = {name: testbed.dps_layout.slice_of(variable) for name, variable in self._variables.items()}
-        for element in self._arguments["decision"]:
+        for element in arguments["decision"]:
             if element.address.partition("[")[0] != self._variables[_CANDIDATE].address:
                 raise ValueError(f"a reasoner on board decides {path}.{_CANDIDATE}, not {element.address}")
-        return reasoner
+
+    def decide(self, dps: DpsState, believed: Mapping[str, np.ndarray], *, budget: Budget) -> Decision:
+        """Return the decision of the reasoner for a DPS.
+
+        Args:
+            dps: The state of the DPS.
+            believed: The values of the ports of the part, by name.
+            budget: How much the decision may take.
+
+        Raises:
+            BeliefError: See `Reasoner.decide`.
+        """
+        return self.reasoner.decide(self._belief(dps, believed), budget=budget, now=dps.time)
+
+    def candidate_of(self, decision: Decision) -> np.ndarray:
+        """Return the candidate of the last belief with the entries that the decision sets, which may be only some."""
+        decision.apply(self._testbed, self._context)
+        return np.atleast_1d(self._variables[_CANDIDATE].get(self._context))
 
     def _belief(self, dps: DpsState, believed: Mapping[str, np.ndarray]) -> Belief:
         """Return the belief of a DPS in which the plan in use is the candidate."""

@@ -10,28 +10,31 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import inf
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import as_whole
+from vtbdrake.common.argument_checks import as_whole, counted
+from vtbdrake.common.validity_domain import ValidityDomain
 from vtbdrake.optimization.problem import Motion, Problem, recording_motion
 from vtbdrake.optimization.solvers import Solver, make_solver, solver_type
-from vtbdrake.optimization.solvers.solver import Point
+from vtbdrake.optimization.solvers.solver import BudgetTooSmallError, Point, SolverError
 from vtbdrake.reasoning.belief import Belief, BeliefConfig, BeliefError, BeliefToStart
 from vtbdrake.reasoning.decision import Budget, Decision, check_budget
 from vtbdrake.reasoning.decision_run import DecisionRun
 from vtbdrake.reasoning.space import DecisionSpace, Element
 from vtbdrake.reasoning.unbelieved import UnbelievedReadings
 from vtbdrake.rollout import Constraint, Executor, Pruning, Quality, RolloutRunner, StartError, make_executor
-from vtbdrake.rollout.executor import checked_workers, choose_executor
+from vtbdrake.rollout.executor import checked_workers
+from vtbdrake.rollout.executor_choice import choose_executor
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.addressed import AddressedDiagram
-from vtbdrake.validity_domain import ValidityDomain
 
 _log = logging.getLogger(__name__)
+
+_Config = TypeVar("_Config")
 
 # The time limit of a rollout in a process, if none is given, is at least this, in seconds.
 _LEAST_TIME_LIMIT = 10.0
@@ -59,6 +62,9 @@ class SearchConfig:
         workers: Number of threads or processes; by default the number of cores.
         time_limit: The longest wall time of one rollout in a process, in seconds; a worker that takes longer is killed.
             By default the horizon, but at least 10 s.
+
+    Raises:
+        ValueError: The options are no mapping.
     """
 
     method: str | type[Solver] = "MPPI"
@@ -67,6 +73,10 @@ class SearchConfig:
     executor: str | Executor = "auto"
     workers: int | None = None
     time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.options, Mapping):
+            raise ValueError(f"options are given by name, such as {{'samples': 24}}, not as {self.options!r}")
 
 
 class Reasoner:
@@ -129,18 +139,13 @@ class Reasoner:
     ) -> None:
         if not isinstance(quality, Quality):
             raise ValueError(f"a decision has one quality, Quality(f, of=[address, ...]), not {quality!r}")
-        search = SearchConfig() if search is None else search
-        belief = BeliefConfig() if belief is None else belief
-        for config, kind in ((search, SearchConfig), (belief, BeliefConfig)):
-            if not isinstance(config, kind):
-                raise ValueError(f"a reasoner is configured by a {kind.__name__}(...), not by {config!r}")
+        search, belief = _checked_config(search, SearchConfig), _checked_config(belief, BeliefConfig)
         self.samples = belief.samples
         check_budget(budget, self.samples)
         self.budget = budget
         self.space = DecisionSpace(decision)
-        mental = _mental(scenario)
         self.problem = Problem(
-            scenario=mental,
+            scenario=_mental(scenario),
             parameters=self.space.parameters,
             quality=quality,
             horizon=horizon,
@@ -150,12 +155,12 @@ class Reasoner:
             risk=belief.risk,
             constraints=constraints,
         )
-        self.space.find(self.problem.testbed.variables())
+        testbed = self.problem.testbed
+        self.space.find(testbed.variables())
         # A quality that fails is a reason against a candidate, and no end of the DPS.
         self._domain = domain
-        features = () if domain is None else domain.addresses
-        self.task = replace(self.problem.task, catch=True, pruning=search.pruning, record=features)
-        testbed = self.problem.testbed
+        record = () if domain is None else domain.addresses
+        self.task = replace(self.problem.task, catch=True, pruning=search.pruning, record=record)
         self.belief_to_start = BeliefToStart(testbed, uncertainty=belief.uncertainty, seed=seed, max_age=belief.max_age)
         self._unbelieved = UnbelievedReadings(testbed, uncertain=self.belief_to_start.uncertain)
         # Reads values from a start.
@@ -163,29 +168,38 @@ class Reasoner:
         self._readers = {address: testbed.reader(address) for address in self.space.addresses}
         self._search = search
         self._seed = as_whole("a seed", seed)
-        # A method that cannot decide this is refused here. Candidate 0 does not count: the method does not propose it.
-        affordable = None if budget.rollouts is None else max(budget.rollouts // self.samples - 1, 1)
-        self.solver(0.0, budget=affordable).close()
+        self._check_method()
         self._workers = checked_workers(search.workers)
         self._owned = not isinstance(search.executor, Executor)
-        compiles = search.executor in ("auto", "compiled") and search.time_limit is None
-        compiled = self._compiled_executor() if compiles else None
-        self.executor = compiled or _make_executor(search, self.problem, budget)
+        self.executor = self._compiled_executor() or _make_executor(search, self.problem, budget)
         if search.pruning is not None or budget.seconds is not None:
             self._check_executor()
-        # Of a Ctrl-C between two lines it may be left behind: the same thread takes it again.
+        # A Ctrl-C between two lines may leave it locked: the same thread takes it again.
         self._alone = threading.RLock()
         self._warm = False
         self._has_warned = False
         self._closed = False
 
+    def _check_method(self) -> None:
+        """Refuse a method that cannot decide this."""
+        allowed = self.budget.rollouts
+        # Candidate 0 does not count: the method does not propose it.
+        affordable = None if allowed is None else max(allowed // self.samples - 1, 1)
+        try:
+            self.solver(0.0, budget=affordable).close()
+        except BudgetTooSmallError as error:
+            rollouts = counted(self.samples, "rollout")
+            raise SolverError(f"{error}: of the {allowed} rollouts, the plan in use takes {rollouts}") from None
+
     def _compiled_executor(self) -> Executor | None:
         """Return the executor of the compiled testbed, if it is equal to the mental testbed as far as was checked.
 
-        Otherwise, ``auto`` does without it, and ``compiled`` raises the error.
+        Otherwise, ``auto`` does without it, and ``compiled`` raises the error. No other search has one.
         """
+        if self._search.executor not in ("auto", "compiled") or self._search.time_limit is not None:
+            return None
         # Imported here: without it, a reasoner needs no CasADi.
-        from vtbdrake.rollout.compiled import CompiledExecutor
+        from vtbdrake.rollout.compiled_executor import CompiledExecutor
 
         executor = CompiledExecutor(self.problem.testbed, workers=self._search.workers)
         points = [dict.fromkeys([*self.space.addresses, *self.belief_to_start.uncertain])]
@@ -384,6 +398,14 @@ def _make_executor(search: SearchConfig, problem: Problem, budget: Budget) -> Ex
         workers=workers,
         time_limit=time_limit,
     )
+
+
+def _checked_config(config: _Config | None, kind: type[_Config]) -> _Config:
+    """Return a configuration, by default one of this kind; refuse another kind."""
+    config = kind() if config is None else config
+    if not isinstance(config, kind):
+        raise ValueError(f"a reasoner is configured by a {kind.__name__}(...), not by {config!r}")
+    return config
 
 
 def _mental(scenario: Scenario) -> Scenario:

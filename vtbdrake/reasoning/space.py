@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.argument_checks import all_of
+from vtbdrake.common.argument_checks import all_of
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter, checked_points
 from vtbdrake.optimization.solvers.solver import Point
 from vtbdrake.reasoning.trajectory import Trajectory
@@ -50,7 +50,7 @@ class DecisionSpace:
         self._parts = [slice(end - len(part), end) for end, part in zip(ends, parts, strict=True)]
 
     def find(self, variables: Variables) -> None:
-        """Check that a testbed has the variables of the trajectories; `Problem` checks those of the parameters.
+        """Check that a testbed has the variables of the trajectories; `Problem` checks the variables of the parameters.
 
         Raises:
             ValueError: There is no such variable, or one of another size or with narrower bounds.
@@ -109,5 +109,10 @@ def _value_at(trajectory: Trajectory, plan: np.ndarray, time: float) -> np.ndarr
 
 
 def same_values(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Return whether two mappings address -> value are equal, to the last bit."""
+    """Return whether two mappings address -> value are equal, to the last bit.
+
+    Args:
+        a: One mapping; the order of its addresses does not matter.
+        b: The other one.
+    """
     return a.keys() == b.keys() and all(np.array_equal(a[address], b[address]) for address in a)

@@ -9,18 +9,20 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import as_whole
-from vtbdrake.arrays import Array
+from vtbdrake.common.argument_checks import as_whole
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.spline import Spline
 from vtbdrake.optimization.parameter import Parameter
-from vtbdrake.spline import Spline
 from vtbdrake.state import Variables
 
 # Rows that are this small beside the largest one are rounding errors of zero.
 _NEGLIGIBLE = 1e-12
 # A limit this many times as far away as the largest violation is not reached.
 _FAR = 1e3
-# Relative: limits that are exceeded by less count as kept, and the projection aims below those of rates by this.
-_ROUNDING, _ACCURACY = 1e-9, 1e-5
+# Limits that are exceeded by less than this share count as kept.
+_ROUNDING = 1e-9
+# The projection aims below the limits of rates by this share.
+_ACCURACY = 1e-5
 _LIMITS = ("lower", "upper", "rate", "acceleration")
 
 
@@ -164,7 +166,7 @@ class Trajectory:
         Args:
             knots: Shape (N, n m).
             begin: Time t_begin in seconds.
-            start: The value at which the trajectories begin, a scalar or shape (m,); None: that of the first knot.
+            start: The value at which the trajectories begin, a scalar or shape (m,); None: the value of the first knot.
 
         Returns:
             Shape (N, 1 + n m).
@@ -211,7 +213,7 @@ class Trajectory:
 
         Args:
             knots: Shape (n m,) or (n, m).
-            start: The value at which the trajectory begins, a scalar or shape (m,); None: that of the first knot.
+            start: The value at which the trajectory begins, a scalar or shape (m,); None: the value of the first knot.
 
         Returns:
             Knots in the shape of those given.

@@ -22,7 +22,7 @@ class UnbelievedReadings:
 
     They depend on the state of the simulated world, but on nothing that is believed of it: for example the angles of
     wheels, if no belief rule sets them. A DPS that counts up such a reading takes its step from the last received value
-    to that of the mental copy for a motion.
+    to the mental copy's value for a motion.
 
     What a reading depends on is found once, by changing the state in a context, so that no threshold is needed. Only
     sensors with the methods ``resume`` and ``measurement``, as every `SampledSensor` has, and Drake's sampled holds and
@@ -78,7 +78,7 @@ class UnbelievedReadings:
 
 
 def _world(variables: Variables) -> list[Variable]:
-    """Return the state of the world that can be set, without that of sensors and actuators."""
+    """Return the state of the world that can be set, without the state of sensors and actuators."""
     world = [v for v in variables.values() if v.address.startswith(("sim.sys.", "sim.env."))]
     return [v for v in world if v.kind == X and not v.derived]
 
@@ -88,7 +88,7 @@ def _is_examined(sensor: System) -> bool:
 
 
 def _measurement(sensor: System, root: Context) -> np.ndarray:
-    """Return what a sensor would sample now, without its errors."""
+    """Return the sample that a sensor would take now, without its errors."""
     context = sensor.GetMyContextFromRoot(root)
     return np.array(sensor.get_input_port().Eval(context) if is_hold(sensor) else sensor.measurement(context))
 

@@ -15,6 +15,6 @@ Playing a log onto a bus plays its actuator commands too: select channels with `
 the command channels with a hub.
 """
 
-from vtbdrake.lazy import lazy_names
+from vtbdrake.common.lazy_names import attach_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from vtbdrake.common.extras import extra_module
+from vtbdrake.common.json_data import plain
 from vtbdrake.control.stepping import Change, ChangeKind
-from vtbdrake.lazy import extra_module
 from vtbdrake.recording.log_reader import ControlLog
-from vtbdrake.state.archive import whole_file
+from vtbdrake.state.archive import PRIVATE, whole_file
 
 
-def export(log: ControlLog, path: str | os.PathLike[str]) -> None:
+def export(log: ControlLog, path: str | os.PathLike[str], *, mode: int = PRIVATE) -> None:
     """Write a log in the format that the file's suffix names: .csv, .mcap or .parquet.
 
     CSV and Parquet get the table of `columns`. MCAP gets JSON messages with their schemas, for Foxglove, under the
@@ -31,6 +32,7 @@ def export(log: ControlLog, path: str | os.PathLike[str]) -> None:
     Args:
         log: The log.
         path: Path of the file. It is written as a whole or not at all.
+        mode: Permissions of the file, as far as the umask leaves them; by default only its owner reads it.
 
     Raises:
         ValueError: The suffix is none of them.
@@ -39,7 +41,7 @@ def export(log: ControlLog, path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix
     if suffix not in EXPORTS:
         raise ValueError(f"a log is exported to a file that ends in {', '.join(EXPORTS)}, unlike {os.fspath(path)!r}")
-    with whole_file(path) as partial:
+    with whole_file(path, mode=mode) as partial:
         EXPORTS[suffix](log, partial)
 
 
@@ -80,7 +82,9 @@ def _write_parquet(log: ControlLog, path: Path) -> None:
 
 _NUMBERS = {"type": "array", "items": {"type": ["number", "null"]}}  # JSON has no NaN.
 _TIME = {"type": "number", "description": "of the DPS, in seconds"}
-_INFO, _ERROR = 2, 4  # levels of foxglove.Log
+# Levels of foxglove.Log.
+_INFO = 2
+_ERROR = 4
 
 _SCHEMAS: Mapping[str, Mapping[str, Any]] = {
     "vtbdrake.Value": {"time": _TIME, "value": _NUMBERS},
@@ -163,7 +167,7 @@ def _series(log: ControlLog) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 def _json_rows(values: np.ndarray) -> list[list[float | None]]:
     rows: list[list[float | None]] = values.tolist()
     for i in np.flatnonzero(~np.isfinite(values).all(axis=1)):
-        rows[i] = [entry if np.isfinite(entry) else None for entry in values[i].tolist()]
+        rows[i] = plain(values[i])
     return rows
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.recording.log_format import LogError
 
 # Times are sums with rounding errors: they are the same within this time in s.
@@ -55,7 +55,12 @@ class Series:
 
     @classmethod
     def with_last_of_equal_times(cls, times: Array, values: Array) -> Series:
-        """Return the samples, of several with the same time the last; times must not decrease."""
+        """Return the samples, of several with the same time the last; times must not decrease.
+
+        Args:
+            times: Times in s, shape (n,).
+            values: One row per time, shape (n, m).
+        """
         last = np.append(np.diff(times) > 0.0, True)
         return cls(times[last], values[last])
 
@@ -64,7 +69,7 @@ class Series:
 
     @property
     def uniformity(self) -> Uniformity:
-        """Return how regular the times are; NaN for a single sample."""
+        """Return the regularity of the times; NaN for a single sample."""
         steps = np.diff(self.times)
         if not steps.size:
             return Uniformity(np.nan, np.nan, np.nan)
@@ -81,7 +86,12 @@ class Series:
         return samples
 
     def between(self, start: float, end: float) -> Series:
-        """Return the samples from ``start`` to below ``end``, in s; a LogError if there is none."""
+        """Return the samples from ``start`` to below ``end``, in s; a LogError if there is none.
+
+        Args:
+            start: The first time, in s.
+            end: The end, which does not belong to the part, in s.
+        """
         part = slice(*np.searchsorted(self.times, [start, end]).tolist())
         if part.start >= part.stop:
             raise LogError(
@@ -155,7 +165,12 @@ class Log:
         return digest.hexdigest()
 
     def between(self, start: float, end: float) -> Log:
-        """Return the part from ``start`` to below ``end``, in s; a LogError if a signal has no sample there."""
+        """Return the part from ``start`` to below ``end``, in s; a LogError if a signal has no sample there.
+
+        Args:
+            start: The first time, in s.
+            end: The end, which does not belong to the part, in s.
+        """
 
         def cut(signals: Mapping[str, Series]) -> dict[str, Series]:
             return {name: series.between(start, end) for name, series in signals.items()}

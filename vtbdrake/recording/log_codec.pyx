@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t, int64_t, uint32_t, uint64_t
 from libc.string cimport memcpy, memset
 
 from vtbdrake.lcm.byte_order cimport get_uint32, get_uint64, put_double, put_uint32, put_uint64
-from vtbdrake.state.arrays cimport entries_of
+from vtbdrake.common.array_memory cimport entries_of
 from vtbdrake.lcm.maps import LONGEST_CHANNEL_NAME
 from vtbdrake.recording.log_format import (
     COMMANDED,

@@ -24,9 +24,13 @@ from vtbdrake.testbed.addressed import record_differences
 from vtbdrake.testbed.scenario_file import is_imported, scenario_of_text
 
 VERSION = 3
-LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END = (
-    f"VTB_{name}" for name in ("LOG", "STATE", "CYCLE", "CHANGE", "FAULT", "DIGEST", "END")
-)
+LOG = "VTB_LOG"
+STATE = "VTB_STATE"
+CYCLE = "VTB_CYCLE"
+CHANGE = "VTB_CHANGE"
+FAULT = "VTB_FAULT"
+DIGEST = "VTB_DIGEST"
+END = "VTB_END"
 OWN_PREFIX = "VTB_"
 """Prefix of the channels that the recorder itself writes."""
 
@@ -44,10 +48,13 @@ MAX_SIZE = 1 << 20
 DIGEST_SIZE = 16
 VECTOR = -1
 """Value of `lcmt_vtb_cycle.source` for a new value of a vector signal."""
-COMMANDED, SENT = 1, 2
-"""Bits of `lcmt_vtb_cycle.act`."""
+COMMANDED = 1
+"""Bit of `lcmt_vtb_cycle.act`: the DPS commanded the signal."""
+SENT = 2
+"""Bit of `lcmt_vtb_cycle.act`: the command was sent."""
 
-TESTBED, DPS = "testbed", "dps"
+TESTBED = "testbed"
+DPS = "dps"
 _MAX_COUNT = 1 << 52
 
 
@@ -56,12 +63,25 @@ class LogError(ValueError):
 
 
 def event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
-    """Return one event of an LCM log; ``utime`` is in microseconds since 1970."""
+    """Return one event of an LCM log; ``utime`` is in microseconds since 1970.
+
+    Args:
+        number: The number of the event in the log.
+        utime: Time of day in microseconds since 1970.
+        channel: The name of the LCM channel, in UTF-8.
+        data: The encoded message.
+    """
     return EVENT.pack(SYNC, number, utime, len(channel), len(data)) + channel + data
 
 
 class LoggedSignal(NamedTuple):
-    """A signal as a log describes it: name, size (None if it is abstract) and unit."""
+    """A signal as a log describes it: name, size (None if it is abstract) and unit.
+
+    Attributes:
+        name: The name of the signal.
+        size: The number of its entries; None if it is abstract.
+        unit: Its unit.
+    """
 
     name: str
     size: int | None
@@ -70,6 +90,10 @@ class LoggedSignal(NamedTuple):
 
 class CycleLayout:
     """The layout of the data of a ``VTB_CYCLE`` event, which is the same for all cycles of a log.
+
+    Args:
+        sense: The sensor signals.
+        act: The actuator signals.
 
     Attributes:
         dtype: NumPy type of the data, with the fields of `lcmt_vtb_cycle` and its ``fingerprint``.
@@ -158,27 +182,40 @@ def installed_versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class LogHeader:
-    """The first event of a log: a description of the recorded loop, from which it can be built again."""
+    """The first event of a log: a description of the recorded loop, from which it can be built again.
 
-    version: int = VERSION  # version of the format
-    # text of the scenario as `Scenario.save` writes it; empty if it was built by hand or is not plain data
+    Attributes:
+        version: Version of the format.
+        scenario: Text of the scenario as `Scenario.save` writes it; empty if it was built by hand or is not plain data.
+        record: What identifies the scenario, see `Scenario.record`.
+        target: ``testbed``, or ``dps`` if the DPS was stepped alone.
+        sense, act, commands: The signals.
+        period: Period of the loop in seconds.
+        start_time: Time of the DPS in seconds from which its steps count.
+        steps: Number of steps before the first recorded cycle.
+        first_cycle: Number of the first recorded cycle.
+        initialized, idle: See `Runtime`.
+        pace: The sensor signal that began the cycles; None for the clock.
+        positions: Positions of a testbed's switches before the first recorded cycle.
+        versions: Versions of vtbdrake, drake and Python.
+    """
+
+    version: int = VERSION
     scenario: str
-    record: Mapping[str, Any]  # what identifies the scenario, see `Scenario.record`
-    target: str  # ``testbed``, or ``dps`` if the DPS was stepped alone
-    # sense, act, commands: the signals
+    record: Mapping[str, Any]
+    target: str
     sense: Sequence[LoggedSignal]
     act: Sequence[LoggedSignal]
     commands: Sequence[LoggedSignal]
-    period: float  # period of the loop in seconds
-    start_time: float  # time of the DPS in seconds from which its steps count
-    steps: int  # number of steps before the first recorded cycle
-    first_cycle: int  # number of the first recorded cycle
-    # initialized, idle: see `Runtime`
+    period: float
+    start_time: float
+    steps: int
+    first_cycle: int
     initialized: bool
     idle: bool
-    pace: str | None  # the sensor signal that began the cycles; None for the clock
-    positions: Mapping[str, Mapping[str, str]]  # positions of a testbed's switches before the first recorded cycle
-    versions: Mapping[str, str] = field(default_factory=installed_versions)  # versions of vtbdrake, drake and Python
+    pace: str | None
+    positions: Mapping[str, Mapping[str, str]]
+    versions: Mapping[str, str] = field(default_factory=installed_versions)
 
     def to_json(self) -> str:
         """Return the header as JSON."""
@@ -256,6 +293,8 @@ class LogHeader:
             scenario = scenario_of_text(name, self.scenario)
         except ScenarioError as error:
             raise LogError(f"the scenario of the log, {name}, cannot be loaded in this version: {error}") from error
+        # Older versions wrote the entries of dictionaries in alphabetical order.
+        scenario.take_order(self.record)
         self.check_scenario(scenario)
         return scenario
 
@@ -265,7 +304,10 @@ class LogHeader:
         Raises:
             LogError: Another one was recorded, or another version of it; the error lists the differences.
         """
-        if differing := record_differences(self.record, scenario_record(scenario), where="in the log"):
+        differing = record_differences(self.record, scenario_record(scenario), where="in the log")
+        if scenario is not None:
+            differing += scenario.order_differences(self.record, where="in the log")
+        if differing:
             raise LogError(f"the log is of another scenario, or of another version of it ({'; '.join(differing)})")
 
 
@@ -284,7 +326,13 @@ def scenario_record(scenario: Scenario | None) -> Any:
 
 
 def encode_changes(changes: Iterable[Change], number: int, utime: int) -> Iterator[lcmt_vtb_change]:
-    """Yield the messages of the changes before the step of cycle ``number``."""
+    """Yield the messages of the changes before the step of cycle ``number``.
+
+    Args:
+        changes: The changes before the step, each a kind and its values, in their order.
+        number: The number of the cycle.
+        utime: Time of day in microseconds since 1970.
+    """
     for index, (kind, values) in enumerate(changes):
         for address, name, value in _entries(values):
             array = np.ascontiguousarray(value)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import mmap
 import os
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from vtbdrake.control.stepping import Change
 from vtbdrake.lcm.maps import decode
@@ -38,6 +41,7 @@ from vtbdrake.recording.log_format import (
     STATE,
     CycleLayout,
     LogError,
+    LoggedSignal,
     LogHeader,
     change_value,
     decode_changes,
@@ -50,12 +54,19 @@ _log = logging.getLogger(__name__)
 CLOCK_JUMP = 0.1
 """Change of the time of day against the loop's clock between two cycles, in seconds, that is reported as a jump."""
 
+# Cycles that are read together.
+RECORDS_TOGETHER = 4096
 _NOT_CLOSED = "the recorder was not closed: later cycles may be missing"
 _NO_EVENTS = np.empty((0, 4), np.int64)
 
 
 class Damage(NamedTuple):
-    """Unreadable bytes of a file: their offset and the kind of damage."""
+    """Unreadable bytes of a file: their offset and the kind of damage.
+
+    Attributes:
+        offset: The offset of the first byte in the file.
+        description: The kind of the damage.
+    """
 
     offset: int
     description: str
@@ -65,7 +76,12 @@ class Damage(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """The first and the last of some cycles that are missing in a log."""
+    """The first and the last of some cycles that are missing in a log.
+
+    Attributes:
+        first: The number of the first missing cycle.
+        last: The number of the last missing cycle.
+    """
 
     first: int
     last: int
@@ -75,7 +91,14 @@ class Gap(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that came or went: number of its event, time in microseconds since 1970, channel and bytes."""
+    """A message that came or went: number of its event, time in microseconds since 1970, channel and bytes.
+
+    Attributes:
+        event: The number of its event.
+        utime: The time in microseconds since 1970.
+        channel: The LCM channel.
+        data: The bytes.
+    """
 
     event: int
     utime: int
@@ -102,6 +125,7 @@ class LogEvents:
             empty = file.seek(0, 2) == 0  # An empty file cannot be mapped.
             self.content: mmap.mmap | bytes = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         places_by_channel, self.damages = find_events(self.content)
+        self.release()
         self._places: dict[str, np.ndarray] = {}
         for channel, places in places_by_channel.items():
             name = channel.decode(errors="replace")
@@ -124,45 +148,259 @@ class LogEvents:
         return [(number, utime, begin, end) for number, utime, begin, end in self.places(channel).tolist()]
 
     def data(self, begin: int, end: int) -> bytes:
-        """Return a range of bytes of the file."""
+        """Return a range of bytes of the file.
+
+        Args:
+            begin: Offset of the first byte.
+            end: Offset behind the last byte.
+        """
         return bytes(self.content[begin:end])
+
+    def release(self) -> None:
+        """Give back the memory into which parts of the file were read; what is needed again is read again."""
+        if isinstance(self.content, mmap.mmap):
+            self.content.madvise(mmap.MADV_DONTNEED)
+
+
+class Cycles:
+    """The cycles of a log that are whole, in order. What they carry is read from the file when it is asked for.
+
+    Args:
+        events: The events of the log.
+
+    Attributes:
+        layout: The layout of a cycle.
+        numbers: The numbers of the cycles, shape (n,).
+        frames: Begin and end of the bytes of each cycle in the file, with the events before it, shape (n, 2).
+        damages: Offset and kind of the cycles that do not count, see `whole_cycles`.
+        clock_jumps: The indices of cycles whose time of day does not follow the loop's clock, or whose clock ran
+            backwards.
+        digest: The SHA-256 of their numbers and checksums.
+    """
+
+    def __init__(self, events: LogEvents, layout: CycleLayout) -> None:
+        self.layout = layout
+        self._events = events
+        self._bytes = np.frombuffer(events.content, np.uint8)
+        places, digest = events.places(CYCLE), hashlib.sha256()
+        numbers, frames, jumps = [], [], _ClockJumps()
+        self.damages: list[tuple[int, str]] = []
+        newest = -1
+        for begin in range(0, len(places), RECORDS_TOGETHER):
+            chunk = np.ascontiguousarray(places[begin : begin + RECORDS_TOGETHER])
+            records, chunk_frames, wrong = whole_cycles(events.content, chunk, layout.dtype)
+            if not layout.fits(records):
+                raise LogError("the cycles of the log have other signals than its header")
+            self.damages += wrong
+            late = records["number"] <= newest
+            self.damages += [
+                (int(end) - layout.dtype.itemsize, f"cycle {number} follows cycle {newest}")
+                for number, end in zip(records["number"][late].tolist(), chunk_frames[late, 1].tolist(), strict=True)
+            ]
+            records, chunk_frames = records[~late], chunk_frames[~late]
+            if len(records):
+                newest = int(records["number"][-1])
+                digest.update(records["number"].tobytes() + records["crc"].tobytes())
+                jumps.add(1e-6 * records["utime"] - records["now"], records["now"].astype(float))
+                numbers.append(records["number"].astype(int))
+                frames.append(chunk_frames)
+            events.release()
+        self.numbers = np.concatenate([np.empty(0, int), *numbers])
+        self.frames = np.concatenate([np.empty((0, 2), np.int64), *frames])
+        self.clock_jumps = jumps.indices()
+        self.digest = digest.digest()
+
+    def records(self, first: int, last: int) -> np.ndarray:
+        """Return the records of the cycles from ``first`` to below ``last``, of the type of the layout.
+
+        Args:
+            first: Index of the first cycle, from 0 on.
+            last: Index behind the last cycle.
+        """
+        size = self.layout.dtype.itemsize
+        begins = self.frames[first:last, 1] - size
+        if not len(begins):
+            return np.empty(0, self.layout.dtype)
+        return sliding_window_view(self._bytes, size)[begins].reshape(-1).view(self.layout.dtype)
+
+    def column(self, name: str, kind: type) -> np.ndarray:
+        """Return a field of all cycles as an array of its own, of a type of Python.
+
+        Args:
+            name: The name of a field of the layout's type.
+            kind: The type of the entries, such as float, to which the field is converted.
+        """
+        column = np.empty((len(self.numbers), *self.layout.dtype[name].shape), kind)
+        for first in range(0, len(column), RECORDS_TOGETHER):
+            column[first : first + RECORDS_TOGETHER] = self.records(first, first + RECORDS_TOGETHER)[name]
+            self._events.release()
+        return column
+
+    @staticmethod
+    def split(entries: np.ndarray, parts: Mapping[str, slice]) -> dict[str, np.ndarray]:
+        """Return the entries of each signal, an array of its own, from the entries of all.
+
+        Args:
+            entries: The entries of all signals in every cycle, shape (cycles, size).
+            parts: The slice of each signal among the entries, by its name.
+        """
+        return {name: np.ascontiguousarray(entries[:, part]) for name, part in parts.items()}
+
+
+class _ClockJumps:
+    """Finds the jumps of the time of day against the loop's clock, from part to part of a log.
+
+    A delayed cycle is recorded late once; a jump persists in the cycles after it.
+    """
+
+    def __init__(self) -> None:
+        self._indices: list[int] = []
+        # The last cycles so far, which have neighbours in the next part, and the index of the first of them.
+        self._offset, self._now, self._first = np.empty(0), np.empty(0), 0
+
+    def add(self, offset: np.ndarray, now: np.ndarray) -> None:
+        """Add the time of day less the clock's time, and the latter, of the next cycles, in seconds."""
+        self._offset, self._now = np.append(self._offset, offset), np.append(self._now, now)
+        # The step into a cycle is judged by the cycle behind it, too, which must have come.
+        self._look(len(self._offset) - 2)
+        keep = min(3, len(self._offset))
+        self._first += len(self._offset) - keep
+        self._offset, self._now = self._offset[-keep:], self._now[-keep:]
+
+    def indices(self) -> list[int]:
+        """Return the indices of the cycles with a jump, when all were added."""
+        self._look(len(self._offset) - 1)
+        return self._indices
+
+    def _look(self, last: int) -> None:
+        """Judge the steps into the cycles up to ``last`` that were not judged yet."""
+        for k in self._steps_that_jump(last):
+            if not self._indices or self._indices[-1] < self._first + k:
+                self._indices.append(self._first + k)
+
+    def _steps_that_jump(self, last: int) -> list[int]:
+        offset = self._offset
+        if len(offset) < 2:
+            return []
+        step = np.diff(offset)
+        ahead, behind = np.append(offset[2:], offset[-1]), np.insert(offset[:-2], 0, offset[0])
+        forward = (step > CLOCK_JUMP) & (ahead - offset[:-1] > CLOCK_JUMP)
+        backward = (step < -CLOCK_JUMP) & (offset[1:] - behind < -CLOCK_JUMP)
+        jumps = np.flatnonzero(forward | backward | (np.diff(self._now) < 0.0)) + 1
+        # Behind the first of the cycles that were kept: only then is its neighbour behind known.
+        return [k for k in jumps.tolist() if k <= last and (k > 1 or self._first == 0)]
 
 
 @dataclass(frozen=True, eq=False)
 class ControlLog:
-    """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read."""
+    """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read.
 
-    path: Path  # path of the file
-    header: LogHeader  # what was recorded
-    start: Snapshot  # state before the first recorded cycle
-    numbers: np.ndarray  # numbers of the cycles, shape (n,)
-    times: np.ndarray  # times of the DPS at the ends of the cycles, in seconds, (n,)
-    now: np.ndarray  # times on the loop's clock, in seconds, (n,)
-    utimes: np.ndarray  # times of day in microseconds since 1970, (n,)
-    ok: np.ndarray  # whether the DPS's actuator commands were sent, not those of the fallbacks, (n,)
-    fed: Mapping[str, np.ndarray]  # newest values by vector sensor signal, (n, size); NaN before the first
-    # by sensor signal, where a cycle had a new value, (n,): 0 for none, -1 for a vector, and for an abstract signal the
-    # number of the event with its message
-    sources: Mapping[str, np.ndarray]
-    # actuator commands of the DPS by vector signal, (n, size); NaN where there is none
-    actuation: Mapping[str, np.ndarray]
-    commanded: Mapping[str, np.ndarray]  # whether the DPS commanded, by actuator signal, (n,)
-    sent: Mapping[str, np.ndarray]  # actuator commands that were sent, after the guards, by vector signal, (n, size)
-    # changes of the target, each with the index of the cycle before whose step it happened
+    The columns (`numbers`, `times`, `fed` and so on) are read from the file when they are asked for, and kept then.
+
+    Attributes:
+        path: Path of the file.
+        header: What was recorded.
+        start: State before the first recorded cycle.
+        cycles: Where its cycles lie; their columns are read when they are asked for.
+        changes: Changes of the target, each with the index of the cycle before whose step it happened.
+        faults: Present faults, each with the index of the cycle from which on they hold; empty when all are over.
+        digests: Digests of the DPS's state, each with the index of the cycle after which it was taken.
+        damages: Damaged places of the file. Reading resumes at the next whole cycle.
+        gaps: Cycles that are missing, lost by the recorder or damaged.
+        clock_jumps: Indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards.
+        closed: Whether the recorder was closed. If not, later cycles may be missing.
+        events: All events of the file.
+        identity: A digest of what was recorded, which two different logs do not share.
+    """
+
+    path: Path
+    header: LogHeader
+    start: Snapshot
+    cycles: Cycles
     changes: Sequence[tuple[int, Change]]
-    # present faults, each with the index of the cycle from which on they hold; empty when all are over
     faults: Sequence[tuple[int, tuple[str, ...]]]
-    # digests of the DPS's state, each with the index of the cycle after which it was taken
     digests: Sequence[tuple[int, bytes]]
-    damages: Sequence[Damage]  # damaged places of the file. Reading resumes at the next whole cycle.
-    gaps: Sequence[Gap]  # cycles that are missing, lost by the recorder or damaged
-    # indices of cycles whose time of day does not follow the loop's clock, or whose clock ran backwards
+    damages: Sequence[Damage]
+    gaps: Sequence[Gap]
     clock_jumps: Sequence[int]
-    closed: bool  # whether the recorder was closed. If not, later cycles may be missing.
-    events: LogEvents  # all events of the file
+    closed: bool
+    events: LogEvents
+    identity: str
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.cycles.numbers)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Return the numbers of the cycles, shape (n,)."""
+        return self.cycles.numbers
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Return the times of the DPS at the ends of the cycles, in seconds, shape (n,)."""
+        return self.cycles.column("time", float)
+
+    @cached_property
+    def now(self) -> np.ndarray:
+        """Return the times on the loop's clock, in seconds, shape (n,)."""
+        return self.cycles.column("now", float)
+
+    @cached_property
+    def utimes(self) -> np.ndarray:
+        """Return the times of day in microseconds since 1970, shape (n,)."""
+        return self.cycles.column("utime", int)
+
+    @cached_property
+    def ok(self) -> np.ndarray:
+        """Return a mask (n,) of the cycles in which the DPS's actuator commands were sent, not the fallbacks'."""
+        return self.cycles.column("ok", bool)
+
+    @cached_property
+    def fed(self) -> Mapping[str, np.ndarray]:
+        """Return the newest values by vector sensor signal, (n, size); NaN before the first."""
+        return self.cycles.split(self.cycles.column("fed", float), self.cycles.layout.fed)
+
+    @cached_property
+    def sources(self) -> Mapping[str, np.ndarray]:
+        """Return by sensor signal where a cycle had a new value, shape (n,).
+
+        It is 0 for none, -1 for a vector, and for an abstract signal the number of the event with its message.
+        """
+        return _by_signal(self.header.sense, self.cycles.column("source", int))
+
+    @cached_property
+    def actuation(self) -> Mapping[str, np.ndarray]:
+        """Return the actuator commands of the DPS by vector signal, (n, size); NaN where there is none."""
+        return self._where("commands", COMMANDED)
+
+    @cached_property
+    def commanded(self) -> Mapping[str, np.ndarray]:
+        """Return whether the DPS commanded, by actuator signal, shape (n,)."""
+        return _by_signal(self.header.act, self.cycles.column("act", int) & COMMANDED != 0)
+
+    @cached_property
+    def sent(self) -> Mapping[str, np.ndarray]:
+        """Return the actuator commands that were sent, after the guards, by vector signal, (n, size)."""
+        return self._where("sent", SENT)
+
+    def _where(self, name: str, flag: int) -> dict[str, np.ndarray]:
+        """Return the columns of the vector actuator signals, NaN where a signal does not have the flag."""
+        columns = self.cycles.split(self.cycles.column(name, float), self.cycles.layout.actuation)
+        flags = _by_signal(self.header.act, self.cycles.column("act", int) & flag)
+        for signal, values in columns.items():
+            values[flags[signal] == 0] = np.nan
+        return columns
+
+    def fed_in(self, first: int, last: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Return `fed` and `sources` of the cycles from ``first`` to below ``last``, read from the file.
+
+        Args:
+            first: Index of the first cycle.
+            last: Index behind the last cycle.
+        """
+        records = self.cycles.records(first, last)
+        fed = self.cycles.split(records["fed"].astype(float), self.cycles.layout.fed)
+        return fed, _by_signal(self.header.sense, records["source"].astype(int))
 
     def __str__(self) -> str:
         lines = [
@@ -175,7 +413,7 @@ class ControlLog:
 
     @property
     def incomplete(self) -> str:
-        """Return what the log lacks of the recorded run; empty if it is whole."""
+        """Return a text about the parts of the recorded run that the log lacks; empty if it is whole."""
         if self.gaps:
             return f"the log lacks {self.gaps[0]}"
         if not self.closed:
@@ -245,40 +483,30 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
     path = Path(path)
     events = LogEvents(path)
     header, start = _read_start(path, events)
-    layout = CycleLayout(header.sense, header.act)
-    damages = [Damage(*damage) for damage in events.damages]
-    records, frames, wrong = whole_cycles(events.content, events.places(CYCLE), layout.dtype)
-    damages += [Damage(*damage) for damage in wrong]
-    if not layout.fits(records):
-        raise LogError("the cycles of the log have other signals than its header")
-    index = {number: i for i, number in enumerate(records["number"].tolist())}
+    cycles = Cycles(events, CycleLayout(header.sense, header.act))
+    damages = [Damage(*damage) for damage in (*events.damages, *cycles.damages)]
     changes, faults, digests = (
-        _of_cycles(events, channel, message_type, damages, frames, index)
+        _of_cycles(events, channel, message_type, damages, cycles)
         for channel, message_type in ((CHANGE, lcmt_vtb_change), (FAULT, lcmt_vtb_fault), (DIGEST, lcmt_vtb_digest))
     )
-    source, act = records["source"], records["act"]
+
+    def index(number: int) -> int:
+        return int(np.searchsorted(cycles.numbers, number))
+
     log = ControlLog(
         path=path,
         header=header,
         start=start,
-        numbers=records["number"].astype(int),
-        times=records["time"].astype(float),
-        now=records["now"].astype(float),
-        utimes=records["utime"].astype(int),
-        ok=records["ok"].copy(),
-        fed=_columns(records["fed"], layout.fed),
-        sources={signal.name: source[:, i].astype(int) for i, signal in enumerate(header.sense)},
-        actuation=_columns_where(records["commands"], layout, header, act & COMMANDED),
-        commanded={signal.name: act[:, i] & COMMANDED != 0 for i, signal in enumerate(header.act)},
-        sent=_columns_where(records["sent"], layout, header, act & SENT),
-        changes=[(index[number], change) for number, change in decode_changes(changes)],
-        faults=[(index[message.number], tuple(message.reasons)) for message in faults],
-        digests=[(index[message.number], message.digest) for message in digests],
+        cycles=cycles,
+        changes=[(index(number), change) for number, change in decode_changes(changes)],
+        faults=[(index(message.number), tuple(message.reasons)) for message in faults],
+        digests=[(index(message.number), message.digest) for message in digests],
         damages=damages,
-        gaps=_gaps(header, records["number"], _last_numbers(events, damages)),
-        clock_jumps=_clock_jumps(records),
-        closed=bool(events.on(END)),
+        gaps=_gaps(header, cycles.numbers, _last_numbers(events, damages)),
+        clock_jumps=cycles.clock_jumps,
+        closed=bool(len(events.places(END))),
         events=events,
+        identity=_identity(events, cycles),
     )
     damages.sort()
     if damages or log.gaps or log.clock_jumps or not log.closed:
@@ -309,20 +537,15 @@ def _read_start(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
         raise LogError(f"{path} cannot be used: its beginning is damaged ({error})") from error
 
 
-def _columns(entries: np.ndarray, parts: dict[str, slice]) -> dict[str, np.ndarray]:
-    native = entries.astype(float)
-    return {name: np.ascontiguousarray(native[:, part]) for name, part in parts.items()}
+def _identity(events: LogEvents, cycles: Cycles) -> str:
+    # The checksum of a cycle covers all its events.
+    parts = *(events.data(*events.on(channel)[0][2:]) for channel in (LOG, STATE)), cycles.digest
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
-def _columns_where(
-    entries: np.ndarray, layout: CycleLayout, header: LogHeader, flags: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return the columns of actuator signals, NaN where a signal has no flag."""
-    columns = _columns(entries, layout.actuation)
-    for i, signal in enumerate(header.act):
-        if signal.name in columns:
-            columns[signal.name][flags[:, i] == 0] = np.nan
-    return columns
+def _by_signal(signals: Sequence[LoggedSignal], entries: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the entry of each signal, an array of its own, from the entries of all."""
+    return {signal.name: np.ascontiguousarray(entries[:, i]) for i, signal in enumerate(signals)}
 
 
 def _of_cycles(
@@ -330,16 +553,16 @@ def _of_cycles(
     channel: str,
     message_type: Any,
     damages: list[Damage],
-    frames: np.ndarray,
-    numbers: Collection[int],
+    cycles: Cycles,
 ) -> list[Any]:
     """Return the messages of a channel that lie in whole cycles and name one of them."""
-    places = events.places(channel)
+    places, frames, numbers = events.places(channel), cycles.frames, cycles.numbers
     begins = np.append(frames[:, 0], np.iinfo(np.int64).max)
     within = places[places[:, 2] >= begins[np.searchsorted(frames[:, 1], places[:, 3])]]
     decoded = []
     for begin, message in _decoded(events, channel, message_type, damages, within):
-        if message.number in numbers:
+        at = np.searchsorted(numbers, message.number)
+        if at < len(numbers) and numbers[at] == message.number:
             decoded.append(message)
         else:
             damages.append(Damage(begin, f"an event on {channel} is of cycle {message.number}, which is missing"))
@@ -372,15 +595,3 @@ def _last_numbers(events: LogEvents, damages: list[Damage]) -> list[int]:
 def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
     present = np.concatenate([[header.first_cycle - 1], numbers, np.array(ends, int) + 1])
     return [Gap(int(present[i]) + 1, int(present[i + 1]) - 1) for i in np.flatnonzero(np.diff(present) > 1)]
-
-
-def _clock_jumps(records: np.ndarray) -> list[int]:
-    """Return the indices of jumps. A delayed cycle is recorded late once; a jump persists in the cycles after it."""
-    if len(records) < 2:
-        return []
-    offset = 1e-6 * records["utime"] - records["now"]
-    step = np.diff(offset)
-    ahead, behind = np.append(offset[2:], offset[-1]), np.insert(offset[:-2], 0, offset[0])
-    forward = (step > CLOCK_JUMP) & (ahead - offset[:-1] > CLOCK_JUMP)
-    backward = (step < -CLOCK_JUMP) & (offset[1:] - behind < -CLOCK_JUMP)
-    return [int(i) + 1 for i in np.flatnonzero(forward | backward | (np.diff(records["now"]) < 0.0))]

@@ -12,18 +12,19 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import ConstantValueSource, PassThrough, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
+from vtbdrake.common.settings import setting
 from vtbdrake.control.bridge import Bridge, BridgeError
 from vtbdrake.control.clock import Clock, SimulatedClock
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
-from vtbdrake.settings import setting
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 
-# Times are sums with rounding errors: what is due within this time in s is there, and a command this share of the
-# period before its time.
-_ROUNDING, _EARLY = 1e-9, 1e-3
+# Times are sums with rounding errors: what is due within this time is there, in s.
+_ROUNDING = 1e-9
+# A command is there this share of the period before its time, for the same reason.
+_EARLY = 1e-3
 
 
 class LogBridge(Bridge):
@@ -42,7 +43,7 @@ class LogBridge(Bridge):
         log: The log. It may lack signals, which then never arrive, but not all.
         interface: The signals of the DPS.
         clock: The clock of the loop.
-        start: The time of the log at which `open` begins, in s; by default that of its first sample.
+        start: The time of the log at which `open` begins, in s; by default the time of its first sample.
 
     Raises:
         LogError: A signal has another size than in the log, or the log has no signal of the DPS.
@@ -137,7 +138,7 @@ class DrivenScenario(Scenario):
     Attributes:
         scenario: The scenario whose world is driven.
         log: The log; it has all vector actuator signals.
-        start: The time of the log in s that is the time 0; None: that of its first command.
+        start: The time of the log in s that is the time 0; None: the time of its first command.
         period: Commands change at multiples of it (s), where integrators stop; None: the median period of the commands.
     """
 

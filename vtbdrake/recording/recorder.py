@@ -13,13 +13,13 @@ from typing import Any
 
 from pydrake.systems.framework import Context
 
-from vtbdrake.child_process import ProcessStartError
-from vtbdrake.closing import Closing
+from vtbdrake.common.child_process import ProcessStartError
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.interrupt import interrupts_postponed
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
-from vtbdrake.frames import FrameConnection
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
 from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
@@ -44,17 +44,18 @@ from vtbdrake.recording.log_format import (
     target_kind,
 )
 from vtbdrake.recording.log_reader import read_log
+from vtbdrake.recording.log_writer import write_log
 from vtbdrake.state import snapshot as snapshots
+from vtbdrake.state.archive import PRIVATE, new_file
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import read_group, stateful_leaves
 from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
-from vtbdrake.testbed.scenario_file import scenario_text
+from vtbdrake.testbed.scenario_text import scenario_text
 
 _log = logging.getLogger(__name__)
 
 _MAX_HASHED = 1 << 14  # bytes of an array in a digest
-_POLL_PERIOD = 0.02  # s; the socket buffers more than arrives meanwhile
 
 
 class RecordingError(RuntimeError):
@@ -76,6 +77,8 @@ class Recorder(Closing):
         overwrite: Whether to replace an existing file.
         digest_period: Period in seconds of the loop's cycles in which a digest of the DPS's state is recorded.
         backlog: Bytes that may wait for the worker process; cycles beyond that are lost.
+        mode: Permissions of the file, as far as the umask leaves them. By default only its owner reads it: it has what
+            a machine has measured and done.
 
     Attributes:
         path: Path of the file.
@@ -93,6 +96,7 @@ class Recorder(Closing):
         overwrite: bool = False,
         digest_period: float = 1.0,
         backlog: int = 1 << 26,
+        mode: int = PRIVATE,
     ) -> None:
         _check_recordable(runtime)
         if not digest_period >= runtime.period:
@@ -131,7 +135,7 @@ class Recorder(Closing):
             # A new file: processes that have mapped the old one keep it.
             self.path.unlink()
         try:
-            self.path.open("wb" if overwrite else "xb").close()
+            new_file(self.path, mode)
         except FileExistsError:
             raise FileExistsError(
                 f"{self.path} exists: record to another file, or remove it (Recorder(..., overwrite=True) does)"
@@ -191,6 +195,10 @@ class Recorder(Closing):
 
     def __call__(self, cycle: Cycle) -> None:
         """Record a cycle, as a watcher of the runtime."""
+        with self._runtime.uninterrupted:
+            self._record(cycle)
+
+    def _record(self, cycle: Cycle) -> None:
         utime = self._utime()
         if cycle.changes:
             for change in encode_changes(cycle.changes, cycle.number, utime):
@@ -241,10 +249,14 @@ class Recorder(Closing):
         """
         if self._closed:
             return
-        self._closed = True
-        self._runtime.unwatch(self)
-        if self._runtime.bridge.tap == self._tap:
-            self._runtime.bridge.tap = self._next_tap
+        with interrupts_postponed():  # Another Ctrl-C would lose the messages that were sent after the last cycle.
+            self._closed = True
+            self._runtime.unwatch(self)
+            if self._runtime.bridge.tap == self._tap:
+                self._runtime.bridge.tap = self._next_tap
+            if self._events:
+                self._worker.post_frame(*self._events)
+                self._events.clear()
         # A process that is still starting has not written anything; then this makes room for the last frame.
         self._worker.wait_until_ready()
         self._worker.drain()
@@ -252,8 +264,7 @@ class Recorder(Closing):
         message = lcmt_vtb_end()
         message.utime, message.number, message.lost = self._utime(), self._last, self.lost
         message.crc = _signed_crc(message.encode()[:-4])
-        self._worker.post_frame(*self._events, self._event(END, message.encode(), message.utime))
-        self._events.clear()
+        self._worker.post_frame(self._event(END, message.encode(), message.utime))
         code = self._worker.close()
         self._take_losses()
         if code or self.lost:
@@ -332,7 +343,11 @@ class StateDigest:
     """A BLAKE2b digest of the DPS's state: all its numeric groups, and its abstract states as their codecs give them.
 
     An array beyond 16 KiB, such as an image, enters by name and shape only, so that the loop need not wait for it. The
-    digest of the DPS alone and that of the DPS in its testbed are equal if their states are.
+    digest of the DPS alone and the digest of the DPS in its testbed are equal if their states are.
+
+    Args:
+        target: The testbed, or the DPS alone.
+        context: The root context whose state is digested.
     """
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:
@@ -361,43 +376,3 @@ class StateDigest:
 def _index_and_name(key: str) -> tuple[int, str]:
     index, _, name = key.partition("/")
     return int(index), name
-
-
-# -- in the worker process
-
-
-def write_log(connection: FrameConnection, path: str) -> None:
-    """Append every frame to an existing file, whole or not at all, and report the number of those that failed.
-
-    Args:
-        connection: Brings the frames, and takes reports: the number of failed frames, a space, and the reason.
-        path: Path of the file.
-    """
-    file = os.open(path, os.O_WRONLY | os.O_APPEND)
-    end, lost = os.fstat(file).st_size, 0
-    try:
-        while True:
-            frame = _next_frame(connection)
-            try:
-                view = memoryview(frame)
-                while view:
-                    view = view[os.write(file, view) :]
-                end += len(frame)
-            except OSError as error:
-                # Part of a frame would be damage, its absence is a gap. Once there is room again, the log goes on.
-                os.ftruncate(file, end)
-                lost += 1
-                connection.send_frame(f"{lost} {error.strerror or error}".encode())
-    except EOFError:
-        pass
-    finally:
-        os.close(file)
-
-
-def _next_frame(connection: FrameConnection) -> bytes:
-    # Polls: waking up a waiting process would cost the loop more than all the rest.
-    while True:
-        try:
-            return connection.receive_frame(0.0)
-        except TimeoutError:
-            time.sleep(_POLL_PERIOD)

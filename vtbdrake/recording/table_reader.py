@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.argument_checks import counted, suggestion
-from vtbdrake.arrays import Array
-from vtbdrake.lazy import extra_module
+from vtbdrake.common.argument_checks import counted, suggestion
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.extras import extra_module
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
 
@@ -50,8 +50,8 @@ def read_table(
         log = read_table("trajectory.csv", sense={"joint_position": ["pos_meas1", "pos_meas2"]},
                          act={"torque": ["tau_meas1", "tau_meas2"]}, units={"joint_position": "deg"})
 
-    A row in which an entry of a signal is NaN or empty is no sample of that signal. Of rows with the same time, the
-    last counts. What was left out is said in `Log.remarks`, gaps too.
+    A row in which an entry of a signal is NaN or empty is no sample of that signal. The last one of several rows with
+    the same time counts. What was left out is said in `Log.remarks`, gaps too.
 
     Args:
         source: A file: text (.csv, .dat, .txt; separated by commas, semicolons, tabs or blanks), .npz, .parquet, or
@@ -60,7 +60,8 @@ def read_table(
         sense: For each sensor signal, its column, or the columns of its entries. ``name[2]`` is the third entry of a
             column that has several.
         act: The same for the actuator signals.
-        time: The column of the times, in an .mcap that of each topic; or the period in s, if the table has no times.
+        time: The column of the times, in an .mcap the time of each topic; or the period in s, if the table has no
+            times.
         times: The column of the times of the signals that have others, by signal.
         units: Units that are none of SI (`UNITS`): of a signal by its name, of times by their column.
 

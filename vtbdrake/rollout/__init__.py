@@ -5,9 +5,8 @@ from vtbdrake.rollout.executor import (
     SerialExecutor,
     ThreadExecutor,
     WorkerError,
-    choose_executor,
-    make_executor,
 )
+from vtbdrake.rollout.executor_choice import choose_executor, make_executor
 from vtbdrake.rollout.futures import FuturesExecutor
 from vtbdrake.rollout.pruning import Cutoff, Pruning
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError

@@ -8,13 +8,13 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from math import inf, isfinite
 from typing import Any
 
-from vtbdrake.failures import error_text
-from vtbdrake.lru import LruDict
+from vtbdrake.common.failures import error_text
+from vtbdrake.common.lru import LruDict
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.futures import Call, FuturesExecutor
 from vtbdrake.rollout.pickled_task import PickledTask, answer, pack, unpack
@@ -36,10 +36,15 @@ _GONE = (OSError, ClosedClientError)
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 # The number of tasks that the workers keep.
 _TASKS = 16
-# A scheduler needs about 3 ms for a chunk, so a chunk needs so many seconds for each thread of the cluster; how long a
-# rollout is taken for that nobody has timed, in s, how much the newest one counts, and the most of a chunk.
-_TASK_TIME, _GUESS, _NEWEST, _LARGEST_CHUNK = 0.01, 1.0, 0.1, 256
-# A cluster without workers is reported after so many seconds, and again after as many.
+# Least duration of a chunk per thread of the cluster, in s: a scheduler needs about 3 ms for a chunk.
+_TASK_TIME = 0.01
+# Assumed duration of a rollout before any was timed, in s.
+_GUESS = 1.0
+# Weight of the newest rollout in the mean duration.
+_NEWEST = 0.1
+# Largest number of rollouts in a chunk.
+_LARGEST_CHUNK = 256
+# Seconds after which a cluster without workers is reported, again and again.
 NO_WORKERS = 30.0
 # The period in seconds at which the size of the cluster is read: it may grow while it works.
 _SIZE_PERIOD = 5.0
@@ -48,7 +53,15 @@ _SIZE_PERIOD = 5.0
 def run_on_dask(
     name: str, indices: Sequence[int], points: Sequence[bytes], starts: Sequence[bytes], time_limit: float
 ) -> list[bytes]:
-    """Run rollouts of the task called ``name`` on a Dask worker; return what `answer` returns for each."""
+    """Run rollouts of the task called ``name`` on a Dask worker; return what `answer` returns for each.
+
+    Args:
+        name: Name of the worker's plugin that holds the task.
+        indices: Index of the point of each rollout, for its answer.
+        points: The pickled points.
+        starts: The starts, see `pack_starts`.
+        time_limit: The longest wall time of one rollout, in seconds.
+    """
     plugin: Any = get_worker().plugins[name]
     rollouts = (
         partial(_roll, plugin.task, point, start, time_limit) for point, start in zip(points, starts, strict=True)
@@ -77,6 +90,9 @@ class DaskExecutor(FuturesExecutor):
             for none.
         in_flight: The number of chunks that the cluster has at a time; by default twice its threads.
 
+    Attributes:
+        client: The client of Dask that has the rollouts run; closed with the executor unless the user has given it.
+
     Raises:
         ValueError: No scheduler is given.
         WorkerError: The scheduler does not answer.
@@ -91,11 +107,11 @@ class DaskExecutor(FuturesExecutor):
     def __init__(
         self, client: Client | str | None = None, *, time_limit: float = TIME_LIMIT, in_flight: int | None = None
     ) -> None:
-        super().__init__(client, in_flight=in_flight)
         self._time_limit = checked_time_limit(time_limit)
         self._closes_client = not isinstance(client, Client)
-        self._client: Client = client if isinstance(client, Client) else _connected(client)
-        if self._client.asynchronous:
+        self.client: Client = client if isinstance(client, Client) else _connected(client)
+        super().__init__(self.client, in_flight=in_flight)
+        if self.client.asynchronous:
             raise ValueError("an asynchronous Dask client cannot be waited for: make it with asynchronous=False")
         self._threads = 0
         self._counted = -inf
@@ -107,14 +123,14 @@ class DaskExecutor(FuturesExecutor):
         self, call: Call, indices: Iterable[int], *, retrying: bool = False
     ) -> Iterator[tuple[int, RolloutResult]]:
         ended = threading.Event()
-        threading.Thread(target=_report_no_workers, args=(self._client, ended), daemon=True).start()
+        threading.Thread(target=_report_no_workers, args=(self.client, ended), daemon=True).start()
         try:
             yield from super()._run(call, indices, retrying=retrying)
         finally:
             ended.set()
 
     def _landed(self) -> Any:
-        return as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        return as_completed(loop=self.client.loop, with_results=True, raise_errors=False)
 
     def _outcomes(self, reply: Any) -> list[bytes] | BaseException:
         # The status of a future may change after its reply has arrived. An error is (class, error, traceback).
@@ -139,17 +155,15 @@ class DaskExecutor(FuturesExecutor):
     def _submit(self, call: Call, chunk: Sequence[int]) -> Any:
         name, key = self._send(call.task), f"rollouts-{uuid.uuid4().hex}"
         points, starts = [pack(call.points[i]) for i in chunk], [call.starts[i] for i in chunk]
-        try:
-            return self._client.submit(
+        with self._scheduler_asked():
+            return self.client.submit(
                 self._function, name, chunk, points, starts, self._time_limit, key=key, pure=False
             )
-        except _GONE as error:
-            raise _given_up(error) from error
 
     def _cancel(self, futures: Iterable[Any]) -> None:
         under_way = list(futures)
-        if under_way and self._client.status == "running":
-            self._client.cancel(under_way)
+        if under_way and self.client.status == "running":
+            self.client.cancel(under_way)
 
     def _retries(self) -> bool:
         return True
@@ -167,12 +181,11 @@ class DaskExecutor(FuturesExecutor):
             return name
         name = f"vtbdrake-{task.digest}-{uuid.uuid4().hex}"
         try:
-            self._client.register_plugin(TaskPlugin(task), name=name)
-        except _GONE as error:
-            raise _given_up(error) from error
+            with self._scheduler_asked():
+                self.client.register_plugin(TaskPlugin(task), name=name)
+        except WorkerError:
+            raise
         except Exception as error:
-            if self._client.status != "running":
-                raise _given_up(error) from error
             raise WorkerError(
                 f"the Dask workers cannot read the problem ({error_text(error)}): they need the same vtbdrake as this "
                 "process"
@@ -182,33 +195,43 @@ class DaskExecutor(FuturesExecutor):
             self._forget(dropped)
         return name
 
+    @contextmanager
+    def _scheduler_asked(self) -> Iterator[None]:
+        """Raise a WorkerError for whatever fails because the scheduler is gone, or the client closed for that."""
+        try:
+            yield
+        except _GONE as error:
+            raise _given_up(error) from error
+        except Exception as error:
+            if self.client.status == "running":
+                raise
+            raise _given_up(error) from error
+
     def _forget(self, name: str) -> None:
         """Remove a task from the workers; without a scheduler there are none.
 
         A worker that is being closed, such as at a restart of the cluster, has removed its tasks itself (KeyError).
         """
-        with suppress(*_GONE, KeyError):
-            self._client.unregister_worker_plugin(name)
+        with suppress(WorkerError, KeyError), self._scheduler_asked():
+            self.client.unregister_worker_plugin(name)
 
     def _room(self) -> int:
         if self._in_flight is not None:
             return self._in_flight
         if time.monotonic() >= self._counted + _SIZE_PERIOD:
-            try:
-                self._threads = sum(self._client.nthreads().values())
-            except _GONE as error:
-                raise _given_up(error) from error
+            with self._scheduler_asked():
+                self._threads = sum(self.client.nthreads().values())
             self._counted = time.monotonic()
         return max(2, 2 * self._threads)
 
     def close(self) -> None:
         """Remove the tasks from the workers; close the client, unless it belongs to the user."""
-        if self._client.status == "running":
+        if self.client.status == "running":
             for name in self._sent.values():
                 self._forget(name)
         self._sent.clear()
         if self._closes_client:
-            self._client.close()
+            self.client.close()
 
 
 def _connected(address: str | None) -> Client:

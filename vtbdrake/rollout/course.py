@@ -63,7 +63,12 @@ class Course:
         return self.driven(task, testbed=testbed).end()
 
     def driven(self, task: RolloutTask, *, testbed: VirtualTestbed | None = None) -> DrivenRollout:
-        """Compute the course again as `rollout` does, and return the rollout where it ends."""
+        """Compute the course again as `rollout` does, and return the rollout where it ends.
+
+        Args:
+            task: The task of the rollout.
+            testbed: A testbed of the task's scenario; None: a new one is built.
+        """
         driven = DrivenRollout(task, self.start, step=self.step, testbed=testbed)
         writes = dict(self.writes)
         while driven.result is None and driven.steps != self.steps:
@@ -141,7 +146,7 @@ class DrivenRollout:
 
     @property
     def course(self) -> Course:
-        """Return what has been set so far."""
+        """Return the course so far."""
         goes_on = self.result is None or self.result.message == BY_HAND
         return Course(self._start, self._step, tuple(self._writes), self.steps if goes_on else None)
 

@@ -11,11 +11,11 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator_
 from pydrake.systems.framework import Context
 
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.rollout.quality import READINGS, Quality
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.state.systems import leaves, read_group, stateful_leaves, write_group
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testbed.interrupt import Interruptible
 
 # Relative step of a parameter in the differences of the context's groups, which are mostly linear in it.
 _STEP = 1e-6
@@ -109,7 +109,7 @@ class DerivativeRunner:
         return context
 
     def _direction(self, parameters: Mapping[str, Any], address: str) -> dict[tuple[str, str, int], np.ndarray]:
-        """Return how writing a parameter changes the numeric groups: a central difference."""
+        """Return the change of the numeric groups by writing a parameter: a central difference."""
         variable = self.testbed.variables()[address]
         if variable.carried_by:
             raise DerivativeError(

@@ -10,35 +10,29 @@ import sys
 import threading
 import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from typing import Any, NoReturn
 
-from tqdm.auto import tqdm
-
-from vtbdrake.argument_checks import as_whole
-from vtbdrake.closing import Closing
+from vtbdrake.common.argument_checks import as_whole
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.interrupt import interrupt_taken
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
-from vtbdrake.rollout.task import RolloutResult, RolloutTask, quality_warning
+from vtbdrake.rollout.task import RolloutResult, RolloutTask, check_call, quality_warning
 from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testbed.interrupt import Interruptible
 
 Parameters = Mapping[str, Any]
 
 _log = logging.getLogger(__name__)
 
-# A thread whose rollout has not stopped after so many seconds is not waited for any more.
+# Longest wait for a thread whose rollout should stop, in s.
 GRACE = 10.0
-
-# Of so many rollouts, ``auto`` compiles their testbed, which takes some seconds.
-COMPILE_FROM = 200
-
-NAMES = ("auto", "serial", "threads", "processes", "dask", "compiled")
 
 
 class WorkerError(RuntimeError):
@@ -87,7 +81,12 @@ class Executor(Closing):
         """
 
     def warm_up(self, task: RolloutTask, rollouts: int) -> None:
-        """Build what so many rollouts of a task need at a time, so that the next ones need not wait for it."""
+        """Build what ``rollouts`` rollouts of a task need at a time, so that the next ones need not wait for it.
+
+        Args:
+            task: The task of the rollouts.
+            rollouts: Number of rollouts at a time.
+        """
         if self.cancels:
             # They are cancelled at their first sample.
             list(self.run(task, [{}] * rollouts, cutoff=Cutoff(deadline=-inf)))
@@ -114,6 +113,7 @@ class SerialExecutor(Executor):
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
+        check_call(task, points)
         starts = start_of_each(start, len(points))
         for index, (point, point_start) in enumerate(zip(points, starts, strict=True)):
             try:
@@ -128,7 +128,7 @@ class SerialExecutor(Executor):
 
 @dataclass(frozen=True)
 class _Job:
-    """One rollout for a thread. Its state is that of its future: pending, running, finished, or cancelled."""
+    """One rollout for a thread. Its state is its future's: pending, running, finished, or cancelled."""
 
     future: concurrent.futures.Future[RolloutResult]
     task: RolloutTask
@@ -162,6 +162,7 @@ class ThreadExecutor(Executor):
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
+        check_call(task, points)
         starts = start_of_each(start, len(points))
         if len(points) == 1:  # Without the cost of another thread.
             with suppress(CancelledError):
@@ -247,9 +248,18 @@ def run_rollouts(
     Ctrl-C ends the running rollouts and starts no more; a point without a result has None. The first failure of f that
     the task catches is logged.
 
+    Args:
+        executor: Runs the rollouts.
+        task: The data that all rollouts share.
+        points: One point per rollout, address -> value.
+        progress: Whether to show a progress bar in a terminal or a notebook.
+        description: The text before the progress bar.
+
     Raises:
         QualityError: f raises, is negative or NaN, and the task does not catch that.
     """
+    from tqdm.auto import tqdm  # Here, because worker processes need none: it takes a tenth of their start.
+
     results: list[RolloutResult | None] = [None] * len(points)
     warned = False
     with tqdm(total=len(points), desc=description, unit="rollout", disable=not (progress and watched())) as bar:
@@ -258,17 +268,25 @@ def run_rollouts(
             with Interruptible() as interruptible:
                 for index, result in rollouts:
                     results[index] = result
-                    if not warned and (warning := quality_warning(result.message)):
-                        warned = True
-                        _log.warning("%s", warning)
+                    warned = warned or _log_quality_warning(result.message)
                     bar.update()
                     interruptible.raise_interrupt()
         except KeyboardInterrupt:
             done = sum(result is not None for result in results)
             _log.warning("interrupted: %d of %d rollouts are finished and kept", done, len(points))
+            rollouts.close()  # type: ignore[attr-defined]
+            interrupt_taken()
         finally:
             rollouts.close()  # type: ignore[attr-defined]
     return results
+
+
+def _log_quality_warning(message: str) -> bool:
+    """Log that the quality function fails, if the message of a result says so; return whether it does."""
+    warning = quality_warning(message)
+    if warning:
+        _log.warning("%s", warning)
+    return bool(warning)
 
 
 def watched() -> bool:
@@ -277,111 +295,3 @@ def watched() -> bool:
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return sys.stderr.isatty() or hasattr(shell, "kernel")
-
-
-def choose_executor(testbed: VirtualTestbed) -> str:
-    """Return the executor that suits a testbed: threads, or processes where systems in Python have work to do."""
-    return "processes" if testbed.python_systems else "threads"
-
-
-def make_executor(
-    executor: str | Executor | concurrent.futures.Executor | Any,
-    *,
-    testbed: VirtualTestbed,
-    rollouts: int,
-    workers: int | None = None,
-    time_limit: float | None = None,
-) -> Executor:
-    """Return the requested executor. Closing it leaves a pool or client of the user open.
-
-    Args:
-        executor: ``auto``, ``serial``, ``threads``, ``processes``, ``dask`` or ``compiled``; an Executor of ours; any
-            `concurrent.futures.Executor`; or a `distributed.Client`. ``auto`` takes the compiled testbed for 200
-            rollouts and more, if it can be compiled (see `AutoExecutor`); else threads, processes where systems in
-            Python have work to do, or this thread alone for a single worker.
-        testbed: The testbed of the rollouts; serial rollouts and threads use it.
-        rollouts: The number of rollouts; a single one is run in this thread.
-        workers: The number of threads or processes; by default the number of cores.
-        time_limit: The longest wall time of one rollout, in seconds; only processes and Dask can end one, by default
-            after an hour.
-
-    Raises:
-        ValueError: The executor is unknown, or cannot use ``workers`` or ``time_limit``.
-    """
-    if executor == "auto":
-        alone = min(rollouts, checked_workers(workers)) <= 1
-        in_drake = "processes" if time_limit is not None else "serial" if alone else choose_executor(testbed)
-        of_drake = None if in_drake == "serial" else workers
-        if time_limit is None and rollouts >= COMPILE_FROM:
-            from vtbdrake.rollout.compiled import AutoExecutor
-
-            return AutoExecutor(testbed, _by_name(in_drake, testbed=testbed, workers=of_drake), workers=workers)
-        executor, workers = in_drake, of_drake
-    from vtbdrake.rollout.futures import FuturesExecutor
-    from vtbdrake.rollout.worker_processes import ProcessExecutor
-
-    if isinstance(executor, str):
-        made = _by_name(executor, testbed=testbed, workers=workers, time_limit=time_limit)
-        if isinstance(made, ProcessExecutor):
-            made.start_workers(rollouts)
-        return made
-    if isinstance(executor, Executor):
-        _refuse("an existing Executor", workers=workers, time_limit=time_limit)
-        return executor
-    if isinstance(executor, concurrent.futures.Executor):
-        _refuse("an existing pool", workers=workers, time_limit=time_limit)
-        return FuturesExecutor(executor)
-    # A client exists only if its package has been imported.
-    distributed = sys.modules.get("distributed")
-    if distributed is not None and isinstance(executor, distributed.Client):
-        return _dask(executor, workers=workers, time_limit=time_limit)
-    raise ValueError(_unknown(executor))
-
-
-def _by_name(name: str, *, testbed: VirtualTestbed, workers: int | None, time_limit: float | None = None) -> Executor:
-    from vtbdrake.rollout.worker_processes import TIME_LIMIT, ProcessExecutor
-
-    if name in ("serial", "threads", "compiled") and time_limit is not None:
-        raise ValueError(
-            f"executor={name!r} cannot keep a time limit of {time_limit:g} s, because a rollout in this process "
-            "cannot be ended: use 'processes' or 'dask'"
-        )
-    if name == "serial" and workers is not None:
-        raise ValueError(f"executor='serial' has no workers, but workers={workers} was given: use 'threads'")
-    makers: dict[str, Callable[[], Executor]] = {
-        "serial": lambda: SerialExecutor(testbed),
-        "threads": lambda: ThreadExecutor(workers, testbed=testbed),
-        "processes": lambda: ProcessExecutor(workers, time_limit=TIME_LIMIT if time_limit is None else time_limit),
-        "compiled": lambda: _compiled(testbed, workers),
-        "dask": lambda: _dask(None, workers=workers, time_limit=time_limit),
-    }
-    if name not in makers:
-        raise ValueError(_unknown(name))
-    return makers[name]()
-
-
-def _compiled(testbed: VirtualTestbed, workers: int | None) -> Executor:
-    from vtbdrake.rollout.compiled import CompiledExecutor
-
-    return CompiledExecutor(testbed, workers=workers)
-
-
-def _dask(client: Any, *, workers: int | None, time_limit: float | None) -> Executor:
-    from vtbdrake.rollout.cluster import DaskExecutor
-    from vtbdrake.rollout.worker_processes import TIME_LIMIT
-
-    _refuse("a Dask cluster", workers=workers)
-    return DaskExecutor(client, time_limit=TIME_LIMIT if time_limit is None else time_limit)
-
-
-def _refuse(executor: str, **options: float | None) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise ValueError(f"{executor} has its own settings: {name}={value} cannot be given with it")
-
-
-def _unknown(executor: object) -> str:
-    return (
-        f"an executor is one of {', '.join(NAMES)}, an Executor, a concurrent.futures.Executor or a Dask Client, not "
-        f"{executor!r}"
-    )

@@ -14,8 +14,9 @@ from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
-from vtbdrake.failures import error_text
-from vtbdrake.lru import LruDict
+from vtbdrake.common.argument_checks import as_whole
+from vtbdrake.common.failures import error_text
+from vtbdrake.common.lru import LruDict
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, cores
 from vtbdrake.rollout.pickled_task import (
     MAX_TASKS,
@@ -29,7 +30,7 @@ from vtbdrake.rollout.pickled_task import (
 )
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.start import Starts
-from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.task import RolloutResult, RolloutTask, check_call
 from vtbdrake.rollout.testbeds import Runners, Testbeds, failed
 from vtbdrake.rollout.worker_processes import ProcessExecutor
 
@@ -41,7 +42,13 @@ class _RefusedError(WorkerError):
 
 
 class Call(NamedTuple):
-    """The rollouts of one call of `FuturesExecutor.run`."""
+    """The rollouts of one call of `FuturesExecutor.run`.
+
+    Attributes:
+        task: The task, pickled.
+        points: The parameters of each rollout.
+        starts: The start of each rollout, see `pack_starts`.
+    """
 
     task: PickledTask
     points: Sequence[Parameters]
@@ -89,7 +96,9 @@ class FuturesExecutor(Executor):
     _loss_text = "the pool broke while it had this rollout"
 
     def __init__(self, pool: concurrent.futures.Executor | Any, *, in_flight: int | None = None) -> None:
-        if in_flight is not None and in_flight < 1:
+        if not callable(getattr(pool, "submit", None)):
+            raise ValueError(f"a pool of concurrent.futures has a method submit, unlike {pool!r}")
+        if in_flight is not None and as_whole("the number of rollouts in flight", in_flight) < 1:
             raise ValueError(f"at least one rollout must be in flight, not {in_flight}")
         self._in_flight = in_flight
         self._pool = pool
@@ -101,6 +110,7 @@ class FuturesExecutor(Executor):
     ) -> Iterator[tuple[int, RolloutResult]]:
         if cutoff is not None:
             raise ValueError(f"{self._name} cannot cancel rollouts: use executor='processes'")
+        check_call(task, points)
         call = Call(self._pickler.pickle(task), points, pack_starts(start, len(points)))
         yield from self._run(call, range(len(points)))
 
@@ -108,35 +118,42 @@ class FuturesExecutor(Executor):
         self, call: Call, indices: Iterable[int], *, retrying: bool = False
     ) -> Iterator[tuple[int, RolloutResult]]:
         """Submit rollouts, as many at a time as keep all workers busy, and yield (index, result) as they finish."""
-        waiting, flying, landed = deque(indices), dict[Any, Sequence[int]](), self._landed()
+        waiting, flying, landed = deque(indices), dict[Any, list[int]](), self._landed()
         lost: dict[int, BaseException] = {}
         refusal: _RefusedError | None = None
         try:
             while flying or (waiting and refusal is None):
-                try:
-                    while waiting and refusal is None and len(flying) < self._room():
-                        chunk = list(islice(waiting, self._chunk(call, len(waiting))))
-                        future = self._submit(call, chunk)
-                        flying[future] = chunk
-                        landed.add(future)
-                        for _ in chunk:
-                            waiting.popleft()
-                except _RefusedError as error:
-                    refusal = error  # Those under way come first.
-                if flying:
-                    future, reply = next(landed)
-                    landed_chunk, outcomes = flying.pop(future), self._outcomes(reply)
-                    if isinstance(outcomes, self._loss) and self._retries() and not retrying:
-                        lost.update(dict.fromkeys(landed_chunk, outcomes))
-                        continue
-                    for k, index in enumerate(landed_chunk):
-                        yield index, self._result(call, index, outcomes[k] if isinstance(outcomes, list) else outcomes)
+                if refusal is None:
+                    refusal = self._fill(call, waiting, flying, landed)
+                if not flying:
+                    continue
+                future, reply = next(landed)
+                chunk, outcomes = flying.pop(future), self._outcomes(reply)
+                if isinstance(outcomes, self._loss) and self._retries() and not retrying:
+                    lost.update(dict.fromkeys(chunk, outcomes))
+                    continue
+                for k, index in enumerate(chunk):
+                    yield index, self._result(call, index, outcomes[k] if isinstance(outcomes, list) else outcomes)
         finally:
             self._cancel(flying)
         if refusal is not None:
             raise refusal
         if lost:
             yield from self._retry(call, lost)
+
+    def _fill(self, call: Call, waiting: deque[int], flying: dict[Any, list[int]], landed: Any) -> _RefusedError | None:
+        """Submit rollouts that wait while there is room; return the refusal if the workers take no more."""
+        try:
+            while waiting and len(flying) < self._room():
+                chunk = list(islice(waiting, self._chunk(call, len(waiting))))
+                future = self._submit(call, chunk)
+                flying[future] = chunk
+                landed.add(future)
+                for _ in chunk:
+                    waiting.popleft()
+        except _RefusedError as error:
+            return error  # The rollouts under way come first.
+        return None
 
     def _result(self, call: Call, index: int, outcome: bytes | BaseException) -> RolloutResult:
         if isinstance(outcome, self._loss):
@@ -154,16 +171,16 @@ class FuturesExecutor(Executor):
         return _Landed()
 
     def _outcomes(self, reply: Any) -> list[bytes] | BaseException:
-        """Return what `answer` has returned in the worker for each rollout of a chunk, or an error of the workers."""
+        """Return the results of `answer` in the worker for the rollouts of a chunk, or an error of the workers."""
         outcomes: list[bytes] | BaseException = reply
         return outcomes
 
     def _room(self) -> int:
-        """Return how many chunks may be under way."""
+        """Return the largest number of chunks under way."""
         return self._in_flight or 2 * _workers(self._pool)
 
     def _chunk(self, call: Call, waiting: int) -> int:
-        """Return how many of the rollouts that wait travel together next."""
+        """Return the number of waiting rollouts that travel together next."""
         return 1
 
     def _submit(self, call: Call, chunk: Sequence[int]) -> Any:
@@ -210,7 +227,7 @@ def _workers(pool: concurrent.futures.Executor) -> int:
     return int(getattr(pool, "num_workers", None) or getattr(pool, "_max_workers", None) or cores())
 
 
-class _Worker:
+class _PoolWorker:
     """The state of a process of the pool: the tasks used last, by digest, and their runners."""
 
     def __init__(self) -> None:
@@ -227,12 +244,19 @@ class _Worker:
         return self._runners.run(task, unpack(point), start=unpack_start(start))
 
 
-_worker = _Worker()
+_worker = _PoolWorker()
 
 
 def run_in_pool(
     task: PickledTask, indices: Sequence[int], points: Sequence[bytes], starts: Sequence[bytes]
 ) -> list[bytes]:
-    """Run rollouts in a worker of the pool; return what `answer` returns for each."""
+    """Run rollouts in a worker of the pool; return what `answer` returns for each.
+
+    Args:
+        task: The task; a worker keeps its testbeds from call to call.
+        indices: Index of the point of each rollout, for its answer.
+        points: The pickled points.
+        starts: The starts, see `pack_starts`.
+    """
     rollouts = (partial(_worker.run, task, point, start) for point, start in zip(points, starts, strict=True))
     return [answer(index, rollout) for index, rollout in zip(indices, rollouts, strict=True)]

@@ -57,7 +57,12 @@ def named_function(text: str) -> Callable[..., Any]:
 
 
 def is_named(text: str, function: Callable[..., Any]) -> bool:
-    """Return whether other processes find a function under the name ``module:function``."""
+    """Return whether other processes find a function under the name ``module:function``.
+
+    Args:
+        text: The name, ``module:function``.
+        function: The function that other processes are to find.
+    """
     module_name, _, name = text.partition(":")
     module = sys.modules.get(module_name) if module_name != "__main__" and FUNCTION.fullmatch(text) else None
     return getattr(module, name, None) is function

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.lru import LruDict
-from vtbdrake.pickling import dumps
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.common.lru import LruDict
+from vtbdrake.common.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
 from vtbdrake.rollout.task import RolloutResult, RolloutTask
@@ -88,6 +88,10 @@ def pack_starts(start: Starts, count: int) -> list[bytes]:
 
     A start that several rollouts share is the same object for all of them.
 
+    Args:
+        start: One start for all rollouts, one for each, or None for the task's own s0.
+        count: Number of rollouts.
+
     Raises:
         StartError: It is no start, or there are too many or too few.
     """
@@ -121,6 +125,10 @@ def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
     """Run a rollout and return the pickled pair of its index and its result, or the exception that it raised.
 
     What cannot be pickled, or not be read again, becomes an exception that says so.
+
+    Args:
+        index: Index of the rollout's point in the call of the executor.
+        rollout: Runs the rollout.
     """
     outcome: RolloutResult | BaseException
     try:
@@ -144,5 +152,5 @@ def answer(index: int, rollout: Callable[[], RolloutResult]) -> bytes:
 def _dumps(reply: tuple[int, Any]) -> bytes:
     try:
         return pickle.dumps(reply)
-    except Exception:  # Of a class that the main program defines.
+    except Exception:  # The main program defines the class.
         return dumps(reply)

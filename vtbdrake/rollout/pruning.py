@@ -7,12 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, isnan, nan
 
-from vtbdrake.argument_checks import as_addresses, as_number
-from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.common.argument_checks import as_addresses, as_number, check_takes
+from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.rollout.quality import Constraint, Measure, Quality, QualityError
 
-# How a rollout ends: it cannot win any more; its quality has not improved for too long.
-PRUNED, STALLED = "pruned", "stalled"
+# How a rollout ends that cannot win any more.
+PRUNED = "pruned"
+# How a rollout ends whose quality has not improved for too long.
+STALLED = "stalled"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +68,8 @@ class Pruning:
             object.__setattr__(self, name, as_number(f"the {name} of a pruning", getattr(self, name)))
         if self.bound is None and self.of:
             raise ValueError("a pruning has addresses (of=), but no bound that is a function of them: give bound=")
-        if self.bound is not None and not callable(self.bound):
-            raise ValueError(f"a bound is a function (remaining time, values...) -> number, not {self.bound!r}")
+        if self.bound is not None:
+            check_takes(self.bound, ["the remaining time", *self.of], name="the bound of a pruning")
         if not self.patience > 0.0:
             raise ValueError(f"patience is a time in seconds, above 0, not {self.patience}")
         if not self.gain >= 0.0:
@@ -107,7 +109,7 @@ class Prospect:
         self.reachable = nan
 
     def update(self, t: float, samples: Sequence[float], values: Sequence[object]) -> tuple[str, str] | None:
-        """Return how and why the rollout ends early at these samples; None if it goes on, or ends at its horizon.
+        """Return the end of the rollout and its reason at these samples; None if it goes on, or ends at its horizon.
 
         Args:
             t: Time of the sample in seconds from t0.

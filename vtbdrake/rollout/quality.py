@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_addresses, as_flag, as_number
-from vtbdrake.failures import FAILURES, error_text, safe_text
+from vtbdrake.common.argument_checks import as_addresses, as_flag, as_number, check_takes
+from vtbdrake.common.failures import FAILURES, error_text, safe_text
 
 # (times, samples, True if larger samples are better) -> (time, number): of samples of shape (..., n) at times of shape
 # (n,), each of shape (...), so that many rollouts are read at once.
@@ -49,7 +49,7 @@ def check_reading(reading: str) -> str:
     Raises:
         ValueError: It is unknown.
     """
-    if reading not in READINGS:
+    if not isinstance(reading, str) or reading not in READINGS:
         raise ValueError(f"a quality over time is read as one of {', '.join(READINGS)}, not {reading!r}")
     return reading
 
@@ -86,6 +86,10 @@ class Measure:
         object.__setattr__(self, "of", as_addresses("what a quality is a function of", self.of))
         if not self.of:
             raise QualityError("a quality needs at least one quality variable: give of=[address, ...]")
+        try:
+            check_takes(self.f, self.of, name=f"the {self.role} function {self.name}")
+        except ValueError as error:
+            raise QualityError(str(error)) from None
         check_reading(self.reading)
 
     def __repr__(self) -> str:
@@ -125,7 +129,7 @@ class Measure:
             raise QualityError(f"{where()} is {sample}, but it must be finite")
 
     def accepts(self, samples: np.ndarray) -> np.ndarray:
-        """Return which samples of f are valid: finite."""
+        """Return a mask of the valid samples of f: finite."""
         return np.isfinite(samples)
 
     def _at(self, values: Sequence[Any], time: float) -> str:
@@ -134,7 +138,12 @@ class Measure:
 
     @abstractmethod
     def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
-        """Return the reading, shape (...), of the samples, shape (..., n), at ``times``, shape (n,)."""
+        """Return the reading, shape (...), of the samples, shape (..., n), at ``times``, shape (n,).
+
+        Args:
+            times: Sample times in s, shape (n,).
+            samples: Values of f, shape (..., n).
+        """
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,7 +189,7 @@ class Quality(Measure):
             raise QualityError(f"{where()} is {sample}, more than its stated upper end of {self.upper:g}")
 
     def accepts(self, samples: np.ndarray) -> np.ndarray:
-        """Return which samples of f are valid: finite, not negative, and at most ``upper``."""
+        """Return a mask of the valid samples of f: finite, not negative, and at most ``upper``."""
         valid: np.ndarray = (samples >= 0.0) & (samples <= min(self.upper, np.finfo(float).max))
         return valid
 
@@ -222,7 +231,12 @@ class Constraint(Measure):
             raise QualityError(f"a constraint takes at_most, at_least or both, in this order, not {limits}")
 
     def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
-        """Return the violation: at most 0 where the constraint holds."""
+        """Return the violation: at most 0 where the constraint holds.
+
+        Args:
+            times: Sample times in s, shape (n,).
+            samples: Values of f, shape (..., n).
+        """
         violations = []
         if self.at_most < inf:
             violations.append(READINGS[self.reading](times, samples, False)[1] - self.at_most)
@@ -232,9 +246,14 @@ class Constraint(Measure):
 
 
 def exceeds(samples: np.ndarray, threshold: float | None, *, minimize: bool = False) -> np.ndarray:
-    """Return which samples exceed the threshold, strictly: f above it or, with ``minimize``, the cost below it.
+    """Return a mask of the samples that strictly exceed the threshold: f above it, or, to ``minimize``, below it.
 
     Costs are compared directly: 1 / (1 + cost) rounds different small costs to the same number.
+
+    Args:
+        samples: Samples of f or of the cost, any shape.
+        threshold: The threshold, in their unit; None: no sample exceeds it.
+        minimize: Whether the samples are costs, which exceed the threshold where they are below it.
     """
     samples = np.asarray(samples, dtype=float)
     if threshold is None:
@@ -246,6 +265,11 @@ def best_sample(samples: np.ndarray, *, threshold: float | None = None, minimize
     """Return the index of the sample at t*, shape (...), equations (14) to (16), of samples of shape (..., n).
 
     It is the first sample that exceeds ``threshold``; if none does, the first of the best.
+
+    Args:
+        samples: Samples of f or of the cost, shape (..., n), n at least 1.
+        threshold: The threshold, in their unit; None: none.
+        minimize: Whether the samples are costs, which exceed the threshold where they are below it.
     """
     best = samples.argmin(axis=-1) if minimize else samples.argmax(axis=-1)
     exceeding = exceeds(samples, threshold, minimize=minimize)
@@ -258,6 +282,12 @@ def read_quality(
     """Return (t*, f or the cost there), equations (14) to (17); for other readings than ``best``, time and number.
 
     Both have the shape (...) for samples of shape (..., n) at times of shape (n,).
+
+    Args:
+        f: The quality, which tells how it is read and whether it is a cost.
+        times: The sample times, shape (n,), in seconds.
+        samples: Samples of f or of the cost, shape (..., n).
+        threshold: The threshold, in their unit, for ``best`` only; None: none.
     """
     if f.reading != "best":
         return READINGS[f.reading](times, samples, not f.minimize)

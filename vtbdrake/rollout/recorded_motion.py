@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.common.argument_checks import as_addresses, as_number
 from vtbdrake.state.layout import FlatState, StateLayout
 from vtbdrake.state.systems import is_plant, leaves
 from vtbdrake.state.variables import A
@@ -35,9 +35,9 @@ class RecordedMotion:
     For example, the pose of a camera that observes, or the parameters of a detector of its images, are varied. The
     motion is simulated once, and recorded. Each candidate is then simulated only in a window of ``memory`` seconds
     before each sample of f, from the recorded state. The systems that depend on the varied variables are called
-    followers. If their state does not depend on anything more than ``memory`` seconds ago, the result equals that of
-    the whole rollout, to the last bit. So images that nothing reads are not rendered, and the world between the samples
-    is not simulated. A candidate takes about memory / sample period of the time of a whole rollout.
+    followers. If their state does not depend on anything more than ``memory`` seconds ago, the result equals the whole
+    rollout's, to the last bit. So images that nothing reads are not rendered, and the world between the samples is not
+    simulated. A candidate takes about memory / sample period of the time of a whole rollout.
 
     The followers are found from the connections of the Diagram. If the plant or an actuator is one, the motion is
     refused. At each sample, the state of all other systems is compared with the recorded one.
@@ -50,8 +50,8 @@ class RecordedMotion:
         memory: Memory of the followers in seconds. For a camera of period T and a detector of latency D that samples
             its images s seconds after they were taken, it is T + s + D at most, and less if f is sampled right after a
             result. The memory of a filter is infinite: f must use its input.
-        varied: Addresses of the varied variables, which are parameters of followers; a `Problem` sets them to those of
-            its parameters.
+        varied: Addresses of the varied variables, which are parameters of followers; a `Problem` sets them to its
+            parameters' addresses.
 
     Raises:
         ValueError: The memory is not a positive time.
@@ -154,7 +154,7 @@ class MotionPlayer:
         }
 
     def window_starts(self, instants: np.ndarray) -> list[float | None]:
-        """Return when the window of each sample begins, in seconds; None if that is before the previous sample.
+        """Return the begin of each sample's window, in seconds; None if that is before the previous sample.
 
         Args:
             instants: The simulator's time at each sample, shape (n,).
@@ -187,12 +187,22 @@ class MotionPlayer:
         return self._world_layout.take(context).numbers
 
     def put(self, context: Context, time: float, start: FlatState) -> None:
-        """Set time and state of ``context`` to a recorded one; its parameters stay."""
+        """Set time and state of ``context`` to a recorded one; its parameters stay.
+
+        Args:
+            context: A root context of the testbed, which is changed.
+            time: The time of the recorded state, in seconds.
+            start: The recorded state.
+        """
         context.SetTime(time)
         self._state_layout.put(context, start)
 
     def compare(self, context: Context, recorded: np.ndarray) -> None:
         """Compare the systems that are not followers with the recorded numbers.
+
+        Args:
+            context: A root context of the testbed.
+            recorded: The recorded numbers of these systems, shape (n,), in the order of their layout.
 
         Raises:
             MotionError: They differ.

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, ContextBase
 
-from vtbdrake.failures import error_text
-from vtbdrake.pickling import dumps
+from vtbdrake.common.failures import error_text
+from vtbdrake.common.pickling import dumps
 from vtbdrake.rollout.executor import WorkerError
 from vtbdrake.rollout.quality import QualityError
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
@@ -28,7 +28,7 @@ from vtbdrake.testbed import VirtualTestbed
 _BUDGET = 0.1
 
 Sample = Mapping[str, tuple[Any, ...]]
-"""The numbers of each system at a sample time, by path; under "" those of f and the other measures."""
+"""The numbers of each system at a sample time, by path; under "" the numbers of f and the other measures."""
 
 Trace = Sequence[tuple[float, Sample]]
 """Sample times in seconds from t0, and the samples there."""
@@ -101,7 +101,12 @@ def check_rollouts(task: RolloutTask, testbed: VirtualTestbed, points: Sequence[
 
 
 class Numbers:
-    """Reads the numbers of all systems of a testbed: numeric groups, and abstract states through their codecs."""
+    """Reads the numbers of all systems of a testbed: numeric groups, and abstract states through their codecs.
+
+    Args:
+        testbed: The testbed.
+        context: A root context, which tells what the abstract states are.
+    """
 
     def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
         self._systems = [
@@ -139,7 +144,12 @@ def trace(runner: RolloutRunner, point: Mapping[str, Any]) -> Generator[tuple[fl
 
 
 def within(budget: float, samples: Iterator[tuple[float, Sample]]) -> Iterator[tuple[float, Sample]]:
-    """Yield at least three samples, and as many as take ``budget`` seconds of processor time."""
+    """Yield at least three samples, and as many as take ``budget`` seconds of processor time.
+
+    Args:
+        budget: Processor time of this thread, in seconds.
+        samples: Sample time in seconds and sample, of a rollout that runs as they are taken.
+    """
     end = time.thread_time() + budget
     for count, sample in enumerate(samples):
         yield sample
@@ -148,20 +158,35 @@ def within(budget: float, samples: Iterator[tuple[float, Sample]]) -> Iterator[t
 
 
 def first(samples: Iterator[tuple[float, Sample]], *, count: int) -> Trace:
-    """Return the first samples, at most ``count``."""
+    """Return the first samples, at most ``count``.
+
+    Args:
+        samples: Sample time in seconds and sample, of a rollout that runs as they are taken.
+        count: The largest number of samples.
+    """
     return [sample for _, sample in zip(range(count), samples, strict=False)]
 
 
 def side_by_side(
     samples: Iterator[tuple[float, Sample]], neighbour: Iterator[object]
 ) -> Iterator[tuple[float, Sample]]:
-    """Yield the samples of one rollout, while another one takes its steps in turn."""
+    """Yield the samples of one rollout, while another one takes its steps in turn.
+
+    Args:
+        samples: The samples of the rollout that is looked at.
+        neighbour: The samples of the other rollout, which takes its step first.
+    """
     pairs = zip_longest(neighbour, samples)
     return (sample for _, sample in pairs if sample is not None)
 
 
 def first_difference(reference: Trace, repeated: Trace) -> tuple[float, list[str]] | None:
-    """Return where two rollouts differ first: the sample time, and the paths of what differs; None if they do not."""
+    """Return the first difference of two rollouts: sample time and paths of what differs; None if there is none.
+
+    Args:
+        reference: The samples of the first rollout.
+        repeated: The samples of the same rollout, made again.
+    """
     for (t, expected), (_, actual) in zip_longest(reference, repeated, fillvalue=(np.nan, {})):
         parted = [path for path in {**expected, **actual} if not _same(expected.get(path), actual.get(path))]
         if parted:
@@ -256,7 +281,14 @@ def _unsendable(task: RolloutTask) -> Iterator[str]:
 def elsewhere(
     task: RolloutTask, runner: RolloutRunner, point: Mapping[str, Any], *, alone: bool = True
 ) -> Iterator[str]:
-    """Yield a finding if a rollout in another process differs; ``alone`` says whether rollouts agree in this one."""
+    """Yield a finding if a rollout in another process differs; ``alone`` says whether rollouts agree in this one.
+
+    Args:
+        task: The task of the rollouts.
+        runner: Runs the rollout in this process.
+        point: The point, address -> value.
+        alone: Whether rollouts agree in this process; if not, only an error of the worker is a finding.
+    """
     here = _run(lambda: runner.run(point))
     with ProcessExecutor(1) as executor:
         there = _run(lambda: next(iter(executor.run(task, [point])))[1])

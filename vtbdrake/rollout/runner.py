@@ -13,17 +13,17 @@ import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
+from vtbdrake.drake_workarounds.making import making
+from vtbdrake.drake_workarounds.step_watch import NoProgressError
 from vtbdrake.rollout.pruning import PRUNED, Cutoff, Prospect
 from vtbdrake.rollout.quality import READINGS, Measure, QualityError, exceeds, read_quality
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testbed.addressed import making
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
-from vtbdrake.testbed.interrupt import Interruptible
-from vtbdrake.testbed.step_watch import NoProgressError
 
 # Message of a rollout that somebody has ended.
 BY_HAND = "ended by hand"
@@ -81,7 +81,8 @@ class RolloutRunner:
         self._copier = self.testbed.copier_from(self.testbed)
         self._start_context = StartContext(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
-        self._timed = False  # Whether the times are those of the present start.
+        self._initialized: SimulatorStatus | None = None  # what the systems said at the begin of the rollout
+        self._timed = False  # Whether the times belong to the present start.
         self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
         self._changed: set[str] | None = None
@@ -345,6 +346,7 @@ class RolloutRunner:
 
     def _advance(self, t: float, instant: float) -> SimulatorStatus:
         if t == 0.0:
+            assert self._initialized is not None, "a rollout is reset before it advances"
             return self._initialized  # A system may ask for the end there already.
         try:
             with _failures_as_outcomes, self._step_watch:
@@ -377,7 +379,7 @@ class RolloutRunner:
 
     @property
     def steps(self) -> int:
-        """Return how many steps the integrator took in the last rollout."""
+        """Return the number of the integrator's steps in the last rollout."""
         return int(self._simulator.get_num_steps_taken())
 
     @property
@@ -387,7 +389,12 @@ class RolloutRunner:
 
 
 def same_scenario(testbed: VirtualTestbed, task: RolloutTask) -> bool:
-    """Return whether the testbed was built from the scenario of the task."""
+    """Return whether the testbed was built from the scenario of the task.
+
+    Args:
+        testbed: The testbed.
+        task: The task, whose scenario is compared by its record.
+    """
     return testbed.scenario is not None and testbed.scenario.record() == task.scenario.record()
 
 

@@ -56,6 +56,10 @@ class Start:
 
         The future of a running simulation equals a rollout from it as described at `AddressedDiagram.fork`.
 
+        Args:
+            testbed: The testbed.
+            context: Its root context.
+
         Raises:
             ValueError: The context belongs to another testbed.
         """
@@ -135,7 +139,7 @@ class StartContext:
                 return layout
         nearest = min(layouts, key=lambda layout: len(set(layout.names) ^ set(contents.names)))
         raise StartError(
-            f"the start is of another testbed than that of {testbed.scenario!r}, in which it is to begin: "
+            f"the start is of another testbed than {testbed.scenario!r}, in which it is to begin: "
             f"{difference(contents.names, nearest.names)}"
         )
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from vtbdrake.argument_checks import as_addresses, as_number
+from vtbdrake.common.argument_checks import as_addresses, as_number
 from vtbdrake.rollout.pruning import Pruning
 from vtbdrake.rollout.quality import Measure, Quality
 from vtbdrake.rollout.recorded_motion import RecordedMotion
@@ -41,7 +41,7 @@ def catches(on_error: str) -> bool:
 
 
 def quality_warning(message: str) -> str:
-    """Return what to log of a rollout's message if f failed, which may be wrong and the run useless; else nothing."""
+    """Return a warning if a rollout's message says that f failed, as f itself may be wrong; else an empty text."""
     if not message.startswith(QUALITY_FAILED):
         return ""
     text = message.removeprefix(QUALITY_FAILED)
@@ -124,6 +124,22 @@ class RolloutResult:
         )
 
 
+def check_call(task: Any, points: Any) -> None:
+    """Refuse what no executor can run.
+
+    Args:
+        task: What the user gives as the task.
+        points: What the user gives as the points.
+
+    Raises:
+        ValueError: It is no task, or the points are no list of mappings.
+    """
+    if not isinstance(task, RolloutTask):
+        raise ValueError(f"an executor runs a RolloutTask, such as problem.task, not {task!r}")
+    if not isinstance(points, Sequence) or not all(isinstance(point, Mapping) for point in points):
+        raise ValueError(f"an executor runs a list of points, {{address: value, ...}} each, not {points!r}")
+
+
 def _same(a: Any, b: Any) -> bool:
     if isinstance(a, list):
         return isinstance(b, list) and len(a) == len(b) and all(map(_same, a, b))
@@ -178,6 +194,8 @@ class RolloutTask:
 
     def __post_init__(self) -> None:
         check_is_scenario(self.scenario)
+        if not isinstance(self.quality, Quality | None):
+            raise ValueError(f"the quality of a rollout is a Quality(f, of=[address, ...]), not {self.quality!r}")
         if not isinstance(self.start, Snapshot | None):
             raise ValueError(f"the start of rollouts is a Snapshot, such as Snapshot.load(file), not {self.start!r}")
         for name, description in {"horizon": "the horizon t_m", "sample_period": "the sample period"}.items():

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.lru import LruDict
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.common.lru import LruDict
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
+from vtbdrake.drake_workarounds.making import making
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import RolloutRunner, values_key
 from vtbdrake.rollout.start import Start
 from vtbdrake.rollout.task import FAILED, RolloutResult, RolloutTask
 from vtbdrake.testbed import Scenario, ScenarioError, VirtualTestbed
-from vtbdrake.testbed.addressed import making
-from vtbdrake.testbed.interrupt import Interruptible
 
 FIELD = "scenario."
 # The number of testbeds that are kept besides the permanent one.
@@ -37,14 +37,19 @@ def split(point: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def failed(point: Mapping[str, Any], message: str) -> RolloutResult:
-    """Return the result of a rollout that could not be run."""
+    """Return the result of a rollout that could not be run.
+
+    Args:
+        point: The point of the rollout, address -> value.
+        message: Why it could not be run.
+    """
     return RolloutResult(parameters=dict(point), end=FAILED, message=message, times=np.array([]), quality=np.array([]))
 
 
 class Testbeds:
     """The testbeds last used, built once per distinct scenario and shared by threads.
 
-    One testbed is built at a time: CasADi's expressions, of which a scenario may make its DPS, count their references
+    One testbed is built at a time: CasADi's expressions, which may be parts of a DPS, count their references
     without atomics, and its Python package gives up the interpreter lock.
 
     Args:
@@ -53,6 +58,8 @@ class Testbeds:
     """
 
     def __init__(self, permanent: VirtualTestbed | None = None, *, max_testbeds: int = MAX_TESTBEDS) -> None:
+        if not isinstance(permanent, VirtualTestbed | None):
+            raise ValueError(f"rollouts run in a testbed, scenario.build(), not in {permanent!r}")
         if max_testbeds < 1:
             raise ValueError(f"at least one testbed must be kept, not {max_testbeds}")
         self.max_testbeds = max_testbeds
@@ -107,6 +114,10 @@ class Runners:
 
     def get(self, task: RolloutTask, fields: Mapping[str, Any]) -> RolloutRunner:
         """Return this thread's runner of ``task``, with ``fields`` (name -> value) set in its scenario.
+
+        Args:
+            task: The task, which is known again by its identity.
+            fields: Values of fields of the task's scenario, by their names; empty: the scenario as it is.
 
         Raises:
             ScenarioError: There is no such field, or the scenario refuses its value.

@@ -12,20 +12,21 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import islice
 from math import ceil, inf
 from typing import Any, NamedTuple
 
-from vtbdrake.argument_checks import as_number
-from vtbdrake.child_process import ChildProcess, ProcessStartError, report_ready
-from vtbdrake.frames import FrameConnection
+from vtbdrake.common.argument_checks import as_number
+from vtbdrake.common.child_process import ChildProcess, ProcessStartError, report_ready
+from vtbdrake.common.frames import FrameConnection
 from vtbdrake.rollout.executor import Executor, Parameters, WorkerError, checked_workers
 from vtbdrake.rollout.pickled_task import PickledTask, TaskPickler, answer, pack, pack_starts, unpack, unpack_start
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Starts
-from vtbdrake.rollout.task import RolloutResult, RolloutTask
+from vtbdrake.rollout.task import RolloutResult, RolloutTask, check_call
 from vtbdrake.rollout.testbeds import MAX_TESTBEDS, Runners, Testbeds, failed, split
 
 _log = logging.getLogger(__name__)
@@ -33,16 +34,18 @@ _log = logging.getLogger(__name__)
 # A worker whose last rollout took less than this, in seconds, gets the next ones ahead, so that it need not wait for
 # them: about as many in one message as take so long. Longer rollouts gain nothing from it, and one that waits behind a
 # very long one would come late.
-_BRIEF = 0.1
-# A message of at most so many bytes fits into the buffer of a socket: sending it does not wait for the worker.
+BRIEF = 0.1
+# Largest message in bytes that fits into the buffer of a socket: sending it does not wait for the worker.
 _SMALL = 1 << 16
-# A rollout stops at its first sample after a cutoff's deadline. If it does not, after so many seconds, it hangs.
-_GRACE = 0.5
-# A rollout that takes longer than so many seconds hangs, unless the user says otherwise.
+# Time in s after a cutoff's deadline in which a rollout comes to its next sample and stops; else it hangs.
+GRACE = 0.5
+# Longest time of a rollout in s, unless the user says otherwise; after it the rollout hangs.
 TIME_LIMIT = 3600.0
-# What a worker sends besides its answers: the rollout with a time limit begins; its memory has grown too much.
-_BEGUN, _GROWN = b"B", b"G"
-# In bytes.
+# What a worker sends when a rollout with a time limit begins.
+_BEGUN = b"B"
+# What a worker sends when its memory has grown too much.
+_GROWN = b"G"
+# Size of a page of memory, in bytes.
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -85,8 +88,13 @@ class ProcessExecutor(Executor):
         self._running = False
         self._launches_lost = 0  # The number of workers in a row that were killed before they were ready.
 
+    @property
+    def rollouts_of_workers(self) -> tuple[int, ...]:
+        """Return the number of rollouts that each worker has: the one that it runs, and those given ahead."""
+        return tuple(len(worker.jobs) for worker in self._workers)
+
     def start_workers(self, rollouts: int) -> None:
-        """Start the workers that so many rollouts need, without waiting until they are ready, which takes a second.
+        """Start the workers that ``rollouts`` rollouts need, without waiting until they are ready (a second).
 
         `run` starts those that are missing.
         """
@@ -96,6 +104,7 @@ class ProcessExecutor(Executor):
     def run(
         self, task: RolloutTask, points: Sequence[Parameters], *, start: Starts = None, cutoff: Cutoff | None = None
     ) -> Iterator[tuple[int, RolloutResult]]:
+        check_call(task, points)
         starts = pack_starts(start, len(points))
         yield from self.run_pickled(self._pickler.pickle(task), points, starts, cutoff=cutoff)
 
@@ -107,7 +116,14 @@ class ProcessExecutor(Executor):
         *,
         cutoff: Cutoff | None = None,
     ) -> Iterator[tuple[int, RolloutResult]]:
-        """Run one rollout per point, of a task and with starts that are pickled already; see `run`."""
+        """Run one rollout per point, of a task and with starts that are pickled already; see `run`.
+
+        Args:
+            task: The pickled task.
+            points: One point per rollout, address -> value.
+            starts: The start of each rollout, see `pack_starts`.
+            cutoff: When to end rollouts early; what its deadline cancels is not yielded.
+        """
         if self._running:
             raise WorkerError(
                 "the executor has rollouts of another call to run: finish or close what that call returned, or use a "
@@ -115,56 +131,48 @@ class ProcessExecutor(Executor):
             )
         self._running = True
         try:
-            yield from self._run(_Call(task.content, points, starts, cutoff, deque(range(len(points)))))
+            yield from self._run(_Call(task.content, points, starts, cutoff))
         finally:
             self._running = False
 
     def _run(self, call: _Call) -> Iterator[tuple[int, RolloutResult]]:
-        points, cutoff, waiting = call.points, call.cutoff, call.waiting
-        losses: dict[int, str] = {}
-        error: BaseException | None = None
-        self.start_workers(len(points))
+        self.start_workers(len(call.points))
         try:
             self._hand_out(call)
-            left = len(points)
-            while left:
-                finished: list[tuple[int, RolloutResult]] = []
+            while call.left:
                 replies = self._replies(call)
                 self._check_open()
-                for worker, index, reply in replies:
-                    if isinstance(reply, RolloutResult):
-                        finished.append((index, reply))
-                    elif isinstance(reply, CancelledError):
-                        left -= 1
-                    elif isinstance(reply, str):
-                        # The rollout that it had not begun is not at fault.
-                        waiting.extendleft(job for job in reversed(worker.jobs) if job != index)
-                        self._replace(worker, call)
-                        if cutoff is not None and cutoff.is_over:
-                            left -= 1
-                        elif index in losses:
-                            finished.append((index, failed(points[index], f"{losses[index]}; then {reply}")))
-                        else:
-                            _log.warning("rollout %d is tried again: %s", index, reply)
-                            losses[index] = reply
-                            waiting.append(index)
-                    else:
-                        error = error or reply
-                if cutoff is not None and cutoff.is_over:
-                    left -= len(waiting)
-                    waiting.clear()
-                if error is None:
+                finished = [result for reply in replies if (result := self._note(reply, call)) is not None]
+                if call.is_over:
+                    call.drop_waiting()
+                if call.error is None:
                     # Workers go on while the caller uses the finished results.
                     self._hand_out(call)
-                left -= len(finished)
+                call.left -= len(finished)
                 yield from finished
-                if error is not None:
-                    raise error
+                if call.error is not None:
+                    raise call.error
         finally:
             # After an error or an interruption, the rollouts under way are not needed.
             for worker in [worker for worker in self._workers if worker.jobs]:
                 self._workers.remove(worker)
                 worker.kill()
+
+    def _note(self, reply: _Reply, call: _Call) -> tuple[int, RolloutResult] | None:
+        """Note what became of a rollout, and replace a lost worker; return the index and the result, if any."""
+        match reply:
+            case _Finished(index, result):
+                return index, result
+            case _Cancelled():
+                call.left -= 1
+            case _Raised(error):
+                call.error = call.error or error
+            case _Lost(worker, index, reason):
+                # The rollouts that it had not begun are not at fault.
+                call.waiting.extendleft(job for job in reversed(worker.jobs) if job != index)
+                self._replace(worker, call)
+                return call.note_loss(index, reason)
+        return None
 
     def _hand_out(self, call: _Call) -> None:
         """Give rollouts to every idle worker; then, as long as there are enough for all, the next ones ahead."""
@@ -221,44 +229,45 @@ class ProcessExecutor(Executor):
         if worker.has_testbed(call, worker.jobs[0]):
             worker.limit_time(self.time_limit, call.cutoff)
 
-    def _replies(self, call: _Call) -> list[tuple[_Worker, int, Any]]:
-        """Return what arrived: worker, index, and a result, an error to raise, or a string: how the worker was lost."""
-        cutoff = call.cutoff
-        busy = {worker.connection: worker for worker in self._workers if worker.jobs and worker.connection}
+    def _replies(self, call: _Call) -> list[_Reply]:
+        """Wait until something has arrived, or a worker has run out of time, and return the replies."""
+        busy = [worker for worker in self._workers if worker.jobs and worker.connection]
         preparing = [worker for worker in self._workers if call.waiting and worker.is_preparing]
         if not busy and not preparing:
             return []
-        first = min(worker.deadline for worker in busy.values()) if busy else cutoff.deadline if cutoff else inf
-        poll = select.poll()
-        for connection in busy:
-            poll.register(connection, select.POLLIN)
-        for worker in preparing:
-            poll.register(worker.child.connection, select.POLLIN)
-        timeout = None if first == inf else ceil(1e3 * max(0.0, first - time.monotonic()))  # In milliseconds.
-        ready = {descriptor for descriptor, _ in poll.poll(timeout)}
-        replies: list[tuple[_Worker, int, Any]] = []
-        for connection, worker in busy.items():
-            if connection.fileno() in ready:
-                try:
-                    for frame in connection.pop_frames():
-                        if frame == _BEGUN:
-                            worker.limit_time(self.time_limit, cutoff)
-                        elif frame == _GROWN:
-                            worker.grown = True
-                        else:
-                            index, outcome = pickle.loads(frame)
-                            worker.finish(index, outcome)
-                            if worker.jobs:
-                                self._expect(worker, call)
-                            replies.append((worker, index, outcome))
-                except (EOFError, OSError):
-                    code = worker.child.wait()
-                    replies.append((worker, worker.jobs[0], f"its worker process died (exit code {code})"))
+        ready = _ready(busy, preparing, call.cutoff)
+        replies: list[_Reply] = []
+        for worker in busy:
+            assert worker.connection is not None
+            if worker.connection.fileno() in ready:
+                replies += self._received(worker, worker.connection, call)
             elif time.monotonic() >= worker.deadline:
-                hung = cutoff is not None and cutoff.is_over
-                reason = "it did not stop" if hung else f"it took longer than its time limit of {self.time_limit:g} s"
-                replies.append((worker, worker.jobs[0], reason))
+                time_out = f"it took longer than its time limit of {self.time_limit:g} s"
+                replies.append(_Lost(worker, worker.jobs[0], "it did not stop" if call.is_over else time_out))
         return replies
+
+    def _received(self, worker: _Worker, connection: FrameConnection, call: _Call) -> Iterator[_Reply]:
+        """Yield the replies of a worker that have arrived; the last one says if it has died."""
+        try:
+            for frame in connection.pop_frames():
+                if frame == _BEGUN:
+                    worker.limit_time(self.time_limit, call.cutoff)
+                elif frame == _GROWN:
+                    worker.grown = True
+                else:
+                    yield self._finish(worker, frame, call)
+        except (EOFError, OSError):
+            yield _Lost(worker, worker.jobs[0], f"its worker process died (exit code {worker.child.wait()})")
+
+    def _finish(self, worker: _Worker, frame: bytes, call: _Call) -> _Reply:
+        """Return the outcome of a worker's rollout; it goes on with the next one that it was given."""
+        index, outcome = pickle.loads(frame)
+        worker.finish(index, outcome)
+        if worker.jobs:
+            self._expect(worker, call)
+        if isinstance(outcome, RolloutResult):
+            return _Finished(index, outcome)
+        return _Cancelled() if isinstance(outcome, CancelledError) else _Raised(outcome)
 
     def _replace(self, worker: _Worker, call: _Call) -> _Worker:
         self._check_open()
@@ -279,14 +288,79 @@ class ProcessExecutor(Executor):
             worker.kill()
 
 
-class _Call(NamedTuple):
-    """The rollouts of one call of `ProcessExecutor.run`."""
+@dataclass
+class _Call:
+    """The rollouts of one call of `ProcessExecutor.run`, and how far they are.
+
+    Attributes:
+        waiting: Indices of the points that no worker has got.
+        left: Number of rollouts without an outcome.
+        losses: Why a worker was lost, by the index of its rollout, which is tried once more.
+        error: The error to be raised; no more rollouts are handed out then.
+    """
 
     task: bytes
     points: Sequence[Parameters]
     starts: Sequence[bytes]
     cutoff: Cutoff | None
-    waiting: deque[int]  # indices of the points that no worker has got
+    waiting: deque[int] = field(init=False)
+    left: int = field(init=False)
+    losses: dict[int, str] = field(default_factory=dict, init=False)
+    error: BaseException | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.left = len(self.points)
+        self.waiting = deque(range(self.left))
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the rollouts are cut off by now."""
+        return self.cutoff is not None and self.cutoff.is_over
+
+    def drop_waiting(self) -> None:
+        """Cancel the rollouts that no worker has got."""
+        self.left -= len(self.waiting)
+        self.waiting.clear()
+
+    def note_loss(self, index: int, reason: str) -> tuple[int, RolloutResult] | None:
+        """Note that the worker of a rollout was lost; return the rollout as failed if that was its second."""
+        if self.is_over:
+            self.left -= 1
+            return None
+        if index in self.losses:
+            return index, failed(self.points[index], f"{self.losses[index]}; then {reason}")
+        _log.warning("rollout %d is tried again: %s", index, reason)
+        self.losses[index] = reason
+        self.waiting.append(index)
+        return None
+
+
+class _Finished(NamedTuple):
+    """A rollout has a result."""
+
+    number: int
+    result: RolloutResult
+
+
+class _Cancelled(NamedTuple):
+    """A rollout was cancelled by its cutoff's deadline."""
+
+
+class _Raised(NamedTuple):
+    """A rollout raised an error that ends the others."""
+
+    error: BaseException
+
+
+class _Lost(NamedTuple):
+    """A worker died, or does not stop."""
+
+    worker: _Worker
+    number: int  # of the rollout that it had begun
+    reason: str
+
+
+_Reply = _Finished | _Cancelled | _Raised | _Lost
 
 
 class _Rollout(NamedTuple):
@@ -294,7 +368,7 @@ class _Rollout(NamedTuple):
 
     number: int
     point: bytes
-    start: bytes | None  # None: that of the last one
+    start: bytes | None  # None: the last one's
     announced: bool  # Whether the worker tells when its testbed is built.
 
 
@@ -312,11 +386,11 @@ class _Worker:
         self.child = ChildProcess(_run_worker, max_testbeds, growth, task, name="a worker process", grace=0.0)
         self.connection: FrameConnection | None = None  # None until the worker is known to be ready.
         self._task = task
-        self.start = b""  # Of the last rollout that it was given; empty if that begins at the task's own s0.
+        self.start = b""  # Start of the last rollout that it got; empty if that begins at the task's s0.
         self.jobs: deque[int] = deque()  # The rollout that it runs, and those that were given ahead.
         self.deadline = inf
         self.warm = task is not None  # True after the first rollout of a task, too: it has the testbed.
-        self.duration = inf  # Of its last rollout, in seconds.
+        self.duration = inf  # Duration of its last rollout, in seconds.
         self.grown = False  # True when its memory has grown so much that it must be replaced.
 
     @property
@@ -327,18 +401,18 @@ class _Worker:
     @property
     def is_brief(self) -> bool:
         """Return whether the last rollout was short."""
-        return self.duration < _BRIEF
+        return self.duration < BRIEF
 
     def share(self, most: int) -> int:
-        """Return how many rollouts the worker gets at a time, at least one and at most ``most``."""
-        return max(1, int(min(most, _BRIEF / max(self.duration, 1e-6)))) if self.is_brief else 1
+        """Return the number of rollouts that the worker gets at a time, at least one and at most ``most``."""
+        return max(1, int(min(most, BRIEF / max(self.duration, 1e-6)))) if self.is_brief else 1
 
     def has_testbed(self, call: _Call, index: int) -> bool:
         """Return whether the worker need not build a testbed for a rollout."""
         return self.warm and self._task == call.task and not split(call.points[index])[0]
 
     def give(self, task: bytes, start: bytes, rollouts: Sequence[_Rollout], cutoff: Cutoff | None) -> None:
-        """Send rollouts, of which the last one begins at ``start``, and the task if the worker does not have it."""
+        """Send rollouts, whose last one begins at ``start``, and the task if the worker does not have it."""
         # Before anything is sent: a worker that was interrupted here must not count as idle.
         self.jobs += [rollout.number for rollout in rollouts]
         if self.connection is None:
@@ -355,7 +429,7 @@ class _Worker:
         now = time.monotonic()
         self.deadline = now + time_limit
         if cutoff is not None:
-            self.deadline = min(self.deadline, max(now, cutoff.deadline) + _GRACE)
+            self.deadline = min(self.deadline, max(now, cutoff.deadline) + GRACE)
 
     def finish(self, index: int, outcome: Any) -> None:
         """Remove the rollout that is done; the worker goes on with the one that was given ahead."""
@@ -368,6 +442,19 @@ class _Worker:
     def kill(self) -> None:
         self.child.kill()
         self.child.close()
+
+
+def _ready(busy: Sequence[_Worker], preparing: Sequence[_Worker], cutoff: Cutoff | None) -> set[int]:
+    """Wait for workers, until the first deadline at most; return the descriptors that have something to read."""
+    first = min((worker.deadline for worker in busy), default=cutoff.deadline if cutoff else inf)
+    poll = select.poll()
+    for worker in busy:
+        assert worker.connection is not None
+        poll.register(worker.connection, select.POLLIN)
+    for worker in preparing:
+        poll.register(worker.child.connection, select.POLLIN)
+    timeout = None if first == inf else ceil(1e3 * max(0.0, first - time.monotonic()))  # In milliseconds.
+    return {descriptor for descriptor, _ in poll.poll(timeout)}
 
 
 def _readable(connection: socket.socket) -> bool:
@@ -461,7 +548,7 @@ def _statm() -> int | None:
 
 
 def _memory() -> float:
-    """Return how much memory this process holds, in bytes; without /proc, the most that it ever held."""
+    """Return the memory that this process holds, in bytes; without /proc, the most that it ever held."""
     statm = _statm()
     if statm is None:
         # Not used on Linux, where a process inherits the maximum of the one that started it.

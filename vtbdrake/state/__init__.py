@@ -2,7 +2,7 @@
 
 from importlib.metadata import version
 
-from vtbdrake.drake_version import warn_if_untested
+from vtbdrake.common.drake_version import warn_if_untested
 from vtbdrake.state.archive import ArchiveError
 from vtbdrake.state.codecs import SnapshotError
 from vtbdrake.state.declarations import (

@@ -2,39 +2,67 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from vtbdrake.failures import one_line
+from vtbdrake.common.failures import one_line
 
 _HEADER = "header.json"
 _ARRAY = ".npy"
 # Every file may unpack to this many bytes.
 LARGEST = 1 << 30
+PRIVATE = 0o600
+"""Permissions of a file that only its owner reads: what a machine has measured and done."""
 T = TypeVar("T")
+_NOT_WRITABLE = "check the permissions of the folder, or write to another one"
+_FULL = "free space on its disk, or write to another one"
+# What to do, by the error of the system.
+_REMEDIES = {
+    errno.EROFS: _NOT_WRITABLE,
+    errno.EACCES: _NOT_WRITABLE,
+    errno.EPERM: _NOT_WRITABLE,
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.ENOENT: "make its folder first",
+    errno.EISDIR: "it is a folder: give the name of a file in it",
+    errno.ENOTDIR: "a part of its path is a file: give another path",
+}
 
 
 class ArchiveError(ValueError):
     """A file is damaged, or of another kind."""
 
 
-def write_archive(path: str | os.PathLike[str], **parts: Any) -> None:
-    """Write a file, whole or not at all; ``parts`` are the arguments of `archive_bytes`."""
-    with whole_file(path) as partial:
+def write_archive(path: str | os.PathLike[str], *, mode: int | None = None, **parts: Any) -> None:
+    """Write a file, whole or not at all.
+
+    Args:
+        path: The file.
+        mode: Its permissions, see `whole_file`.
+        **parts: The arguments of `archive_bytes`.
+    """
+    with whole_file(path, mode=mode) as partial:
         partial.write_bytes(archive_bytes(**parts))
 
 
 def archive_bytes(*, kind: str, version: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return an archive of ``kind`` with ``arrays`` and ``header`` (plain data).
+
+    Args:
+        kind: The kind of the archive, which `read_archive` compares with the one that it expects.
+        version: The version of the layout of this kind, compared likewise.
+        header: Plain data for JSON; the keys ``kind``, ``version`` and ``arrays`` are added.
+        arrays: The arrays by name, of any shape and of a type that needs no pickle.
 
     Raises:
         ValueError: The archive would be rejected when it is read, see `read_archive`.
@@ -75,10 +103,13 @@ def read_archive(
         make: Function of the header and the arrays. An exception that it raises is reported as damage of the file.
 
     Raises:
+        TypeError: The source is no path and no bytes.
         FileNotFoundError: There is no such file.
         ArchiveError: The file is damaged, of another kind or version, or it would unpack to more than 1 GiB and more
             than a hundred times its size.
     """
+    if not isinstance(source, bytes):
+        source = os.fspath(source)  # A number would be a file descriptor.
     path = f"an archive of {len(source)} bytes" if isinstance(source, bytes) else source
     if not isinstance(source, bytes) and os.path.exists(source) and not os.path.isfile(source):
         raise ArchiveError(f"{path} is not a {kind}: it is a folder, a device or a pipe, not a file")
@@ -134,20 +165,45 @@ def _array(data: bytes) -> np.ndarray:
     return np.frombuffer(data, dtype, offset=file.tell()).reshape(shape, order="F" if fortran_order else "C").copy()
 
 
+def new_file(path: Path, mode: int) -> None:
+    """Make an empty file with these permissions, as far as the umask leaves them.
+
+    Args:
+        path: Path of the file, in a folder that exists.
+        mode: The permissions, such as `PRIVATE`; the umask may take some away.
+
+    Raises:
+        FileExistsError: There is one already.
+    """
+    os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
+
+
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike[str], *, mode: int | None = None) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to, and replace ``path`` by that file at the end.
 
-    After an exception ``path`` is unchanged. An OSError without a file name gets this one.
+    After an exception ``path`` is unchanged.
+
+    Args:
+        path: The file.
+        mode: Its permissions, such as `PRIVATE`, as far as the umask leaves them; by default what the umask leaves.
+
+    Raises:
+        OSError: The file cannot be written; the error names ``path``, and what to do.
     """
     target = Path(path)
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     try:
+        if mode is not None:
+            partial.unlink(missing_ok=True)
+            new_file(partial, mode)
         yield partial
         partial.replace(target)
     except OSError as error:
-        if error.errno is not None and error.filename is None:  # A full disk, say.
-            error.filename = os.fspath(path)
-        raise
+        if error.errno is None or error.filename not in (None, partial, os.fspath(partial)):
+            raise
+        remedy = _REMEDIES.get(error.errno, "write it to another folder")
+        raise OSError(error.errno, f"{error.strerror}, nothing was written: {remedy}", os.fspath(path)) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # Where nothing can be written, there is nothing to remove.
+            partial.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, System
 from pydrake.systems.primitives import DiscreteTimeDelay
 
-from vtbdrake.failures import error_text
+from vtbdrake.common.failures import error_text
 from vtbdrake.state.declarations import Codec
 from vtbdrake.state.systems import class_name, is_camera, is_plant, is_scene_graph
 
@@ -54,7 +54,12 @@ def codec_of(model: Any, *, varying: bool = False) -> Codec:
 
 
 def array_codec(shape: tuple[int, ...], dtype: Any = float) -> Codec:
-    """Return the codec for arrays of one shape and type."""
+    """Return the codec for arrays of one shape and type.
+
+    Args:
+        shape: The shape of every array; others are refused when they are encoded.
+        dtype: The type of the entries, to which values are converted.
+    """
 
     def encode(value: Any) -> dict[str, np.ndarray]:
         array = np.asarray(value, dtype=dtype)
@@ -186,6 +191,11 @@ class AbstractState:
 
     The codecs come from the system's attribute ``codecs``, or else from `codec_of` of the present value of the state.
 
+    Args:
+        path: The path of the system, for messages.
+        system: The leaf system.
+        context: Its own Context.
+
     Raises:
         SnapshotError: The system keeps an abstract value that no codec can carry.
     """
@@ -311,6 +321,12 @@ class DelayState(AbstractState):
 
 def abstract_state(path: str, system: System, context: Context) -> AbstractState:
     """Return the reader and writer of the abstract state of the leaf system at ``path``.
+
+    Args:
+        path: Dotted path of the system, for error messages.
+        system: The leaf system.
+        context: A context of the system; its present abstract values choose the codecs that the system does not
+            declare.
 
     Raises:
         SnapshotError: The system keeps an abstract value that no codec can carry.

@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from vtbdrake.argument_checks import suggestion
+from vtbdrake.common.argument_checks import suggestion
 
 CONTINUOUS = "continuous"
 DISCRETE = "discrete"
@@ -32,20 +32,35 @@ PARAMETER = "parameter"
 
 @dataclass(frozen=True)
 class Element:
-    """One named piece of a numeric group of a LeafSystem's context."""
+    """One named piece of a numeric group of a LeafSystem's context.
 
-    name: str  # last part of the address
-    group: str  # ``continuous``, ``discrete`` or ``parameter``
-    index: int  # number of the group
-    shape: tuple[int, ...] = ()  # ``()`` is a scalar; arrays lie in C order
-    start: int = 0  # first entry in the group
-    unit: str = "1"  # SI unit; ``"1"`` if it has none
-    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for every entry
+    Attributes:
+        name: Last part of the address.
+        group: ``continuous``, ``discrete`` or ``parameter``.
+        index: Number of the group.
+        shape: ``()`` is a scalar; arrays lie in C order.
+        start: First entry in the group.
+        unit: SI unit; ``"1"`` if it has none.
+        bounds: Closed interval, for every entry.
+    """
+
+    name: str
+    group: str
+    index: int
+    shape: tuple[int, ...] = ()
+    start: int = 0
+    unit: str = "1"
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
 
 
 @dataclass(frozen=True)
 class Codec:
-    """A pair of functions that turn an abstract state into named arrays and back."""
+    """A pair of functions that turn an abstract state into named arrays and back.
+
+    Attributes:
+        encode: Returns the arrays of a value, by name.
+        decode: Returns the value of such arrays.
+    """
 
     encode: Callable[[Any], Mapping[str, np.ndarray]]
     decode: Callable[[Mapping[str, np.ndarray]], Any]
@@ -53,12 +68,19 @@ class Codec:
 
 @dataclass(frozen=True)
 class Quantity:
-    """The declaration of one piece of state or of parameters; its name is the last part of its address."""
+    """The declaration of one piece of state or of parameters; its name is the last part of its address.
 
-    default: ArrayLike = 0.0  # a number, or an array of the shape of the quantity
-    unit: str = "1"  # SI unit; ``"1"`` if it has none
-    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for every entry
-    addressed: bool = True  # whether it is a variable of the Diagram
+    Attributes:
+        default: A number, or an array of the shape of the quantity.
+        unit: SI unit; ``"1"`` if it has none.
+        bounds: Closed interval, for every entry.
+        addressed: Whether it is a variable of the Diagram.
+    """
+
+    default: ArrayLike = 0.0
+    unit: str = "1"
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
+    addressed: bool = True
 
 
 class NamedView:
@@ -124,11 +146,16 @@ class NamedVector:
         return array
 
     def slice_of(self, name: str) -> slice:
-        """Return where the entries of a quantity lie."""
+        """Return the slice of the entries of a quantity."""
         return slice(self._starts[name], self._starts[name] + self._defaults[name].size)
 
     def elements(self, group: str, index: int) -> Iterator[Element]:
-        """Yield the pieces of the numeric group ``index`` that this vector describes."""
+        """Yield the pieces of the numeric group ``index`` that this vector describes.
+
+        Args:
+            group: Kind of the group: `CONTINUOUS`, `DISCRETE` or `PARAMETER`.
+            index: Number of the group among the system's groups of this kind.
+        """
         for name, quantity in self.quantities.items():
             if quantity.addressed:
                 shape, start = self._defaults[name].shape, self._starts[name]
@@ -175,6 +202,9 @@ class _Group:
 class ParameterGroup(_Group):
     """The parameters that `AddressedSystem.declare_parameters` has declared.
 
+    Args:
+        number: Drake's number of the group.
+
     Attributes:
         vector: Names, defaults and layout.
         index: Drake's index of the group.
@@ -200,6 +230,9 @@ class ParameterGroup(_Group):
 
 class DiscreteGroup(_Group):
     """The discrete state that `AddressedSystem.declare_discrete_state` has declared.
+
+    Args:
+        number: Drake's number of the group.
 
     Attributes:
         vector: Names, defaults and layout.
@@ -237,6 +270,9 @@ class DiscreteGroup(_Group):
 class ContinuousGroup(_Group):
     """The continuous state that `AddressedSystem.declare_continuous_state` has declared.
 
+    Args:
+        number: Drake's number of the group.
+
     Attributes:
         vector: Names, defaults and layout; ``derivatives.SetFromVector(group.vector.array(...))`` sets derivatives.
         index: Drake's index of the group.
@@ -257,6 +293,10 @@ def weakly(owner: Any, method: Callable[..., Any]) -> Callable[..., Any]:
     Drake keeps the functions of output ports and cache entries in C++, where Python's garbage collector cannot follow
     references. A bound method there holds its system, which holds the method: neither would ever be freed, nor the
     Diagram around.
+
+    Args:
+        owner: The object to which a weak reference is kept.
+        method: The function to call with the owner before all other arguments.
     """
     reference = weakref.ref(owner)
 
@@ -267,8 +307,8 @@ def weakly(owner: Any, method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# The ``__slots__`` of every class that derives from LeafSystem. With an instance dict beside that of Drake's class, the
-# collector visits it twice (drake 1.51) and considers it referenced from outside. Attributes go into Drake's dict.
+# The ``__slots__`` of every class that derives from LeafSystem. With an instance dict beside the one of Drake's class,
+# the collector visits it twice (drake 1.51) and considers it referenced from outside. Attributes go into Drake's dict.
 NO_DICT: tuple[str, ...] = ()
 
 if TYPE_CHECKING:
@@ -299,11 +339,14 @@ class AddressedSystem(_LeafSystem):
     Attributes:
         variables: What has an address: all declared quantities, in the order of their declaration. A system without
             this attribute has its groups as variables. Subclasses may change it.
+        entry_names: The names of the entries of all its variables of shape (len(entry_names),), such as names of its
+            joints; empty if they have none.
     """
 
     __slots__ = NO_DICT
 
     variables: tuple[Element, ...]
+    entry_names: tuple[str, ...] = ()
 
     def declare_parameters(self, **quantities: Quantity) -> ParameterGroup:
         """Declare a group of parameters, part of a in s = [x, a]."""
@@ -353,12 +396,22 @@ class AddressedSystem(_LeafSystem):
     if not TYPE_CHECKING:
 
         def DeclareVectorOutputPort(self, *arguments: Any, **options: Any) -> Any:
-            """Declare a vector output port, as Drake does; its function may be a method of this system."""
+            """Declare a vector output port, as Drake does; its function may be a method of this system.
+
+            Args:
+                arguments: Positional arguments of Drake's method.
+                options: Keyword arguments of Drake's method.
+            """
             arguments, options = self._not_holding_any(arguments, options)
             return super().DeclareVectorOutputPort(*arguments, **options)
 
         def DeclareAbstractOutputPort(self, *arguments: Any, **options: Any) -> Any:
-            """Declare an abstract output port, as Drake does; its functions may be methods of this system."""
+            """Declare an abstract output port, as Drake does; its functions may be methods of this system.
+
+            Args:
+                arguments: Positional arguments of Drake's method.
+                options: Keyword arguments of Drake's method.
+            """
             arguments, options = self._not_holding_any(arguments, options)
             return super().DeclareAbstractOutputPort(*arguments, **options)
 

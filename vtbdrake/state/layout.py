@@ -92,7 +92,13 @@ class StateLayout:
         return slice(start, start + int(np.prod(variable.shape, dtype=int)))
 
     def slice_of_group(self, system: System, group: str, index: int) -> slice | None:
-        """Return the slice of the numbers with a numeric group of a leaf system; None if it is not among them."""
+        """Return the slice of the numbers with a numeric group of a leaf system; None if it is not among them.
+
+        Args:
+            system: The leaf system.
+            group: Kind of the group: `CONTINUOUS`, `DISCRETE` or `PARAMETER`.
+            index: Number of the group among the system's groups of this kind.
+        """
         groups = next((groups for each, groups in self._groups if each is system), [])
         return next((place for kind, number, place in groups if (kind, number) == (group, index)), None)
 
@@ -123,6 +129,10 @@ class StateLayout:
     def put(self, context: Context, contents: FlatState) -> None:
         """Set the contents of a root context.
 
+        Args:
+            context: A root context of the Diagram, which is changed.
+            contents: What `take` of a layout with the same names has returned.
+
         Raises:
             LayoutError: The contents are of another layout; nothing has been set.
             SnapshotError: The arrays of an abstract state do not fit.
@@ -149,7 +159,12 @@ class StateLayout:
 
 
 def difference(names: tuple[str, ...], expected: tuple[str, ...]) -> str:
-    """Return the first differences between the names of two layouts as text; empty if there are none."""
+    """Return the first differences between the names of two layouts as text; empty if there are none.
+
+    Args:
+        names: The names of the layout that is judged, see `StateLayout`.
+        expected: The names of the layout with which it is compared.
+    """
     missing = [name for name in expected if name not in names]
     foreign = [name for name in names if name not in expected]
     parts = [f"it lacks {missing[0]}"] if missing else []

@@ -27,13 +27,24 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from vtbdrake.state.declarations import CONTINUOUS, DISCRETE
-from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
+from vtbdrake.state.systems import POSE_NAMES, POSE_UNIT, pose_from_array, pose_to_array
 from vtbdrake.state.variables import A, Place, Variable, VariableError, X
 
 # Name of a model instance -> the dotted prefix of the addresses of its variables.
 Prefix = Callable[[str], str]
 
-_JOINT_UNITS = {"revolute": ("rad", "rad/s", "N m s/rad"), "prismatic": ("m", "m/s", "N s/m")}
+# The units of a joint's positions, velocities and damping, by Drake's name of its type.
+_TURNING = ("rad", "rad/s", "N m s/rad")
+_JOINT_UNITS = {
+    "revolute": _TURNING,
+    "screw": _TURNING,
+    "universal": _TURNING,
+    "ball_rpy": _TURNING,
+    "prismatic": ("m", "m/s", "N s/m"),
+    "planar": ("m, m, rad", "m/s, m/s, rad/s", "N s/m, N s/m, N m s/rad"),
+    # A unit quaternion, which has no unit, and a position.
+    "quaternion_floating": ("1, m", "rad/s, m/s", "N m s/rad, N s/m"),
+}
 _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
 # What is derived from the pose of a body, with its units: the entries of [x, y, z, roll, pitch, yaw].
 POSE_ENTRIES = {"x": "m", "y": "m", "height": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
@@ -45,7 +56,13 @@ def _within_plant(instance: str) -> str:
 
 
 def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix = _within_plant) -> Iterator[Variable]:
-    """Yield every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of floating bases only."""
+    """Yield every variable of ``plant``; derived ones (roll, pitch, yaw, height, x, y) of floating bases only.
+
+    Args:
+        plant: The plant, finalized.
+        prefix: Name of a model instance -> dotted prefix of its addresses; by default none, so that they are within the
+            plant.
+    """
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         if joint.num_velocities() > 0:
@@ -69,7 +86,12 @@ def multibody_variables(plant: MultibodyPlant, *, prefix: Prefix = _within_plant
 
 
 def pose_entries_by_demand(plant: MultibodyPlant, *, prefix: Prefix) -> dict[str, Callable[[], Variable]]:
-    """Return makers of the derived pose entries of every body that is not a floating base, by address."""
+    """Return makers of the derived pose entries of every body that is not a floating base, by address.
+
+    Args:
+        plant: The plant, finalized.
+        prefix: Name of a model instance -> dotted prefix of its addresses.
+    """
 
     def demand(body: RigidBody, address: str, entry: str) -> Callable[[], Variable]:
         return lambda: _pose_entry(plant, body, address, entry)
@@ -99,6 +121,11 @@ def element_address(
 
     Without a prefix, it is the address within the plant. If an element has the name of its model instance, the name
     occurs once.
+
+    Args:
+        plant: The plant to which the element belongs.
+        element: A body, joint, fixed frame or actuator.
+        prefix: Name of a model instance -> dotted prefix of its addresses; by default none.
     """
     instance = plant.GetModelInstanceName(element.model_instance())
     named = element.model_instance() not in (world_model_instance(), default_model_instance())
@@ -133,12 +160,17 @@ def _joint_variables(plant: MultibodyPlant, joint: Joint, address: str) -> Itera
     if nq == 1:
         bounds = (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
     variable = partial(_variable, plant)
+    # Drake's suffixes, such as "qw" and "vx".
+    q_names = tuple(map(joint.position_suffix, range(nq))) if nq > 1 else ()
+    v_names = tuple(map(joint.velocity_suffix, range(nv))) if nv > 1 else ()
     yield variable(f"{address}.position", X, shapes[0], units[0], lambda context: plant.GetPositions(context)[q],
-                   set_positions, bounds=bounds, place=Place(plant, group, 0, q.start))  # fmt: skip
+                   set_positions, bounds=bounds, place=Place(plant, group, 0, q.start),
+                   entry_names=q_names)  # fmt: skip
     yield variable(f"{address}.velocity", X, shapes[1], units[1], lambda context: plant.GetVelocities(context)[v],
-                   set_velocities, place=Place(plant, group, 0, plant.num_positions() + v.start))  # fmt: skip
+                   set_velocities, place=Place(plant, group, 0, plant.num_positions() + v.start),
+                   entry_names=v_names)  # fmt: skip
     yield variable(f"{address}.damping", A, shapes[1], units[2], joint.GetDampingVector, set_damping,
-                   bounds=(0.0, inf))  # fmt: skip
+                   bounds=(0.0, inf), entry_names=v_names)  # fmt: skip
     if plant.time_step() > 0.0:  # Every supported Drake version locks the joints of discrete plants.
         yield _joint_lock(plant, joint, f"{address}.locked")
 
@@ -209,7 +241,7 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise VariableError(
-                f"{address}.inertia {value.tolist()} is not that of any rigid body: its principal moments must be "
+                f"{address}.inertia {value.tolist()} belongs to no rigid body: its principal moments must be "
                 f"positive and none larger than the sum of the others ({reason})"
             ) from None
 
@@ -217,9 +249,10 @@ def _body_variables(plant: MultibodyPlant, body: RigidBody, address: str) -> Ite
     yield variable(f"{address}.mass", A, (), "kg", body.get_mass, lambda context, m: body.SetMass(context, float(m)),
                    bounds=(0.0, inf), order=-3)  # fmt: skip
     yield variable(f"{address}.center_of_mass", A, (3,), "m", lambda context: inertia(context).get_com(), write_com,
-                   order=-2)  # fmt: skip
+                   order=-2, entry_names=("x", "y", "z"))  # fmt: skip
     yield variable(f"{address}.inertia", A, (6,), "kg m^2", read_inertia, write_inertia, order=-1,
-                   refuse=lambda value: make_inertia(1.0, np.zeros(3), value))  # fmt: skip
+                   refuse=lambda value: make_inertia(1.0, np.zeros(3), value),
+                   entry_names=("xx", "yy", "zz", "xy", "xz", "yz"))  # fmt: skip
 
 
 def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Variable:
@@ -229,7 +262,7 @@ def _floating_pose(plant: MultibodyPlant, body: RigidBody, address: str) -> Vari
     def write(context: Context, value: np.ndarray) -> None:
         plant.SetFreeBodyPose(context, body, pose_from_array(value))
 
-    return _variable(plant, f"{address}.pose", X, (6,), POSE_UNIT, read, write)
+    return _variable(plant, f"{address}.pose", X, (6,), POSE_UNIT, read, write, entry_names=POSE_NAMES)
 
 
 def _pose_entry(plant: MultibodyPlant, body: RigidBody, address: str, entry: str) -> Variable:
@@ -250,7 +283,7 @@ def _frame_pose(plant: MultibodyPlant, frame: FixedOffsetFrame, address: str) ->
     def write(context: Context, value: np.ndarray) -> None:
         frame.SetPoseInParentFrame(context, pose_from_array(value))
 
-    return _variable(plant, f"{address}.pose", A, (6,), POSE_UNIT, read, write)
+    return _variable(plant, f"{address}.pose", A, (6,), POSE_UNIT, read, write, entry_names=POSE_NAMES)
 
 
 def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str) -> Variable:
@@ -267,7 +300,13 @@ def _rotor_inertia(plant: MultibodyPlant, actuator: JointActuator, address: str)
 
 
 def friction_variables(plant: MultibodyPlant, scene_graph: SceneGraph, *, prefix: Prefix) -> Iterator[Variable]:
-    """Yield a coefficient of friction for every body with collision geometry, and for every geometry of the world."""
+    """Yield a coefficient of friction for every body with collision geometry, and for every geometry of the world.
+
+    Args:
+        plant: The plant, finalized.
+        scene_graph: The SceneGraph with which the plant is registered as a source.
+        prefix: Name of a model instance -> dotted prefix of its addresses.
+    """
     inspector = scene_graph.model_inspector()
 
     def with_friction(geometry: GeometryId) -> bool:

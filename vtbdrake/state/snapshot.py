@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.argument_checks import check_plain
+from vtbdrake.common.argument_checks import check_plain
 from vtbdrake.state.archive import archive_bytes, read_archive, write_archive
 from vtbdrake.state.codecs import SnapshotError, abstract_state
 from vtbdrake.state.systems import leaves, read_group, stateful_leaves, write_group
@@ -95,9 +95,14 @@ class Snapshot:
                     differences[key] = _largest_difference(mine[key], theirs[key])
         return differences
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one file (a zip of .npy arrays and a JSON header), whole or not at all."""
-        write_archive(path, kind=KIND, version=VERSION, **self._parts())
+    def save(self, path: str | os.PathLike[str], *, mode: int | None = None) -> None:
+        """Write one file (a zip of .npy arrays and a JSON header), whole or not at all.
+
+        Args:
+            path: The file.
+            mode: Its permissions, as far as the umask leaves them; by default what the umask leaves.
+        """
+        write_archive(path, mode=mode, kind=KIND, version=VERSION, **self._parts())
 
     def to_bytes(self) -> bytes:
         """Return the bytes that `save` writes."""
@@ -142,6 +147,12 @@ def take(
 ) -> Snapshot:
     """Return the snapshot of ``context``.
 
+    Args:
+        diagram: The root Diagram.
+        context: Its root context, which stays as it is.
+        variables: The variables of the Diagram; all but the derived ones are part of the snapshot.
+        scenario: The record of the scenario that built the Diagram; empty by default.
+
     Raises:
         SnapshotError: A system has an abstract value that neither a codec nor a hidden variable carries. (A testbed
             with such a system is refused when it is built.)
@@ -175,7 +186,7 @@ def apply(
         only: Predicate of a path that selects the systems to set; by default all.
 
     Raises:
-        SnapshotError: The Diagram differs in structure from that of the snapshot; the context is unchanged.
+        SnapshotError: The Diagram differs in structure from the snapshot's; the context is unchanged.
     """
     systems = list(stateful_leaves(diagram, context, only=only))
     left = {key for key in snapshot.groups if only(key.partition("/")[0])}

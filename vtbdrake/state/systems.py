@@ -7,6 +7,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -21,19 +22,36 @@ from vtbdrake.state.variables import A, Place, Variable, Variables, X
 if TYPE_CHECKING:
     from pydrake.geometry import SceneGraph
     from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.systems.scalar_conversion import TemplateSystem
     from pydrake.systems.sensors import RgbdSensor
 
     from vtbdrake.state.multibody import Prefix
 
 POSE_UNIT = "m, rad"
+POSE_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")  # names of the entries of `pose_to_array`
 # How groups are called in the addresses of systems that name no variables.
 _GROUP_NAMES = {DISCRETE: "discrete_state", PARAMETER: "parameter"}
 # Drake names a system without a name by its class and its address in memory.
 UNNAMED = re.compile(r"@[0-9a-f]{8,16}$")
 
 
+def class_for_float(template: TemplateSystem) -> Any:
+    """Return the class that a template of systems has for float, and make it.
+
+    Drake looks for the module of each class in the stack of all callers, whose sources it reads: a tenth of a second
+    within an import. From a thread of its own, the stack is short.
+    """
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(template.__getitem__, float).result()
+
+
 def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
-    """Yield all leaf systems below ``diagram``, of any scalar, with their dotted paths, in the Diagram's order."""
+    """Yield all leaf systems below ``diagram``, of any scalar, with their dotted paths, in the Diagram's order.
+
+    Args:
+        diagram: The Diagram, of any scalar.
+        path: Dotted path of ``diagram``, which begins every path; empty by default, for a root.
+    """
     for system in diagram.GetSystems():
         below = f"{path}.{system.get_name()}" if path else system.get_name()
         if hasattr(system, "GetSystems"):
@@ -43,7 +61,12 @@ def leaves(diagram: Diagram, *, path: str = "") -> Iterator[tuple[str, System]]:
 
 
 def output_ports(system: System, *, path: str = "") -> dict[str, tuple[System, OutputPort]]:
-    """Return the output ports of a system and of all systems below it, with their systems, by dotted address."""
+    """Return the output ports of a system and of all systems below it, with their systems, by dotted address.
+
+    Args:
+        system: A leaf system or a Diagram.
+        path: Dotted path of ``system``, which begins every address; empty by default, for a root.
+    """
     prefix = f"{path}." if path else ""
     ports = {}
     for i in range(system.num_output_ports()):
@@ -55,15 +78,27 @@ def output_ports(system: System, *, path: str = "") -> dict[str, tuple[System, O
 
 
 class Group(NamedTuple):
-    """A numeric group of a leaf system."""
+    """A numeric group of a leaf system.
 
-    kind: str  # ``continuous``, ``discrete`` or ``parameter``
-    number: int  # among those of its kind
+    Attributes:
+        kind: ``continuous``, ``discrete`` or ``parameter``.
+        number: Its number among the groups of its kind.
+        size: The number of its entries.
+    """
+
+    kind: str
+    number: int
     size: int
 
 
 class Leaf(NamedTuple):
-    """A leaf system, with all numeric groups of its context."""
+    """A leaf system, with all numeric groups of its context.
+
+    Attributes:
+        path: The path of the system.
+        system: The system.
+        groups: Its numeric groups.
+    """
 
     path: str
     system: System
@@ -155,6 +190,11 @@ def leaf_variables(path: str, system: System, *, declared: Iterable[Element] | N
     """Yield the variables of a leaf system that is neither a plant nor a SceneGraph.
 
     ``declared`` names the elements of a system of Drake's, which has no declaration of its own.
+
+    Args:
+        path: Dotted path of the system, which begins every address.
+        system: The leaf system.
+        declared: The named elements of the system; by default its own declaration, or its whole groups if it has none.
     """
     if is_camera(system):
         yield from _camera_pose(path, system)
@@ -181,7 +221,13 @@ def _unnamed_elements(system: System, groups: Iterable[Group]) -> Iterator[Eleme
 
 
 def read_group(context: Context, group: str, index: int) -> np.ndarray:
-    """Return a copy of a numeric group of a leaf context, of any scalar."""
+    """Return a copy of a numeric group of a leaf context, of any scalar.
+
+    Args:
+        context: The context of a leaf system.
+        group: Kind of the group: `CONTINUOUS`, `DISCRETE` or `PARAMETER`.
+        index: Number of the group among the system's groups of this kind; the continuous state ignores it.
+    """
     if group == CONTINUOUS:
         vector = context.get_continuous_state_vector()
     else:
@@ -190,7 +236,14 @@ def read_group(context: Context, group: str, index: int) -> np.ndarray:
 
 
 def write_group(context: Context, group: str, index: int, value: np.ndarray) -> None:
-    """Set a whole numeric group of a leaf context."""
+    """Set a whole numeric group of a leaf context.
+
+    Args:
+        context: The context of a leaf system, which is changed.
+        group: Kind of the group: `CONTINUOUS`, `DISCRETE` or `PARAMETER`.
+        index: Number of the group among the system's groups of this kind; the continuous state ignores it.
+        value: All numbers of the group, shape (n,).
+    """
     if group == CONTINUOUS:
         context.SetContinuousState(value)
     elif group == DISCRETE:
@@ -226,8 +279,18 @@ def _numeric(address: str, system: System, element: Element, *, alone: bool, ava
         write_group(context, element.group, element.index, group)
 
     kind = A if element.group == PARAMETER else X
-    place = Place(system, element.group, element.index, element.start)
-    return Variable(address, kind, element.shape, element.unit, read, write, bounds=element.bounds, place=place)
+    names = getattr(system, "entry_names", ())
+    return Variable(
+        address,
+        kind,
+        element.shape,
+        element.unit,
+        read,
+        write,
+        bounds=element.bounds,
+        place=Place(system, element.group, element.index, element.start),
+        entry_names=names if element.shape == (len(names),) else (),
+    )
 
 
 def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
@@ -247,7 +310,7 @@ def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
     def write(root: Context, value: np.ndarray) -> None:
         camera.SetX_PB(camera.GetMyMutableContextFromRoot(root), pose_from_array(value))
 
-    yield Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, carried_by=matrix)
+    yield Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, carried_by=matrix, entry_names=POSE_NAMES)
     yield Variable(matrix, A, (3, 4), "1, m", read_matrix, write_matrix, carried_by=matrix)
 
 

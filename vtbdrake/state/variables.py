@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, System
 
-from vtbdrake.argument_checks import as_array, suggestion
+from vtbdrake.common.argument_checks import as_array, suggestion
 
 X = "x"
 A = "a"
@@ -29,34 +29,57 @@ class VariableError(ValueError):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a value lies, entry by entry, in a numeric group of a leaf system's context."""
+    """Where a value lies, entry by entry, in a numeric group of a leaf system's context.
+
+    Attributes:
+        system: The leaf system.
+        group: ``continuous``, ``discrete`` or ``parameter``.
+        index: Number of the group.
+        start: First entry in the group.
+    """
 
     system: System
-    group: str  # ``continuous``, ``discrete`` or ``parameter``
-    index: int  # number of the group
-    start: int  # first entry in the group
+    group: str
+    index: int
+    start: int
 
 
 @dataclass(frozen=True, repr=False)
 class Variable:
-    """An addressed element of the state s = [x, a] of a Diagram."""
+    """An addressed element of the state s = [x, a] of a Diagram.
 
-    address: str  # dotted path, such as ``sim.sys.payload.mass``
-    kind: str  # ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part)
-    shape: tuple[int, ...]  # of its value; ``()`` is a scalar
-    unit: str  # SI unit; ``"1"`` if it has none
-    read: Reader  # reads the value from a context of the Diagram
-    # writes a checked value into a context; None marks a derived quantity, which is read only
+    Attributes:
+        address: Dotted path, such as ``sim.sys.payload.mass``.
+        kind: ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part).
+        shape: The shape of its value; ``()`` is a scalar.
+        unit: SI unit; ``"1"`` if it has none.
+        read: Reads the value from a context of the Diagram.
+        write: Writes a checked value into a context; None marks a derived quantity, which is read only.
+        bounds: Closed interval, for all entries or of the variable's shape.
+        carried_by: Empty if a copy of the numeric groups of a context contains the variable. Else (contact friction,
+            camera poses, joint locks, switches) the address of the hidden variable that copies and snapshots must hold:
+            the variable itself or one with more detail.
+        order: Variables of a lower order are written first, as writing them changes others.
+        place: Where the value lies as it is; None if it is computed from what lies somewhere.
+        refuse: Raises a VariableError for an array that is finite and within the bounds, but not allowed.
+        entry_names: The names of its entries; empty if they have none.
+        choices: The words for its values; empty if it is no enumeration.
+    """
+
+    address: str
+    kind: str
+    shape: tuple[int, ...]
+    unit: str
+    read: Reader
     write: Writer | None = None
-    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)  # closed interval, for all entries or of the variable's shape
-    # empty if a copy of the numeric groups of a context contains the variable. Else (contact friction, camera poses,
-    # joint locks, switches) the address of the hidden variable that copies and snapshots must hold: the variable itself
-    # or one with more detail.
+    bounds: tuple[ArrayLike, ArrayLike] = (-inf, inf)
     carried_by: str = ""
-    order: int = 0  # variables of a lower order are written first, as writing them changes others
-    place: Place | None = None  # where the value lies as it is; None if it is computed from what lies somewhere
-    # raises a VariableError for an array that is finite and within the bounds, but not allowed
+    order: int = 0
+    place: Place | None = None
     refuse: Callable[[np.ndarray], object] | None = None
+    entry_names: tuple[str, ...] = ()  # short names of the entries of an array, in C order; empty if they have none
+    # the values that an entry can have, with their names, if it is one of an enumeration; empty if it is not
+    choices: tuple[tuple[float, str], ...] = ()
 
     def __repr__(self) -> str:
         return f"Variable({self.address!r}, kind={self.kind!r}, shape={self.shape}, unit={self.unit!r})"
@@ -114,6 +137,10 @@ class Variable:
     def set(self, context: Context, value: ArrayLike) -> None:
         """Check ``value`` and write it into ``context``.
 
+        Args:
+            context: The root context, which is changed.
+            value: A number, or an array of the variable's shape, in its unit.
+
         Raises:
             VariableError: As `check`, or Drake rejects the value.
         """
@@ -123,7 +150,12 @@ class Variable:
 
 
 def with_unit(amount: str, unit: str) -> str:
-    """Return a text of numbers with their unit behind it, if they have one."""
+    """Return a text of numbers with their unit behind it, if they have one.
+
+    Args:
+        amount: The numbers, as text.
+        unit: The unit; empty or ``"1"`` for numbers without one.
+    """
     return amount if unit in ("", "1") else f"{amount} {unit}"
 
 
@@ -145,7 +177,12 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as text in columns under their names, as wide as their longest cell."""
+    """Return rows as text in columns under their names, as wide as their longest cell.
+
+    Args:
+        header: The names of the columns.
+        rows: The cells of each row, one per column.
+    """
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     lines = (header, ["-" * width for width in widths], *rows)
     return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
@@ -156,6 +193,10 @@ class Variables(Mapping[str, Variable]):
 
     ``by_demand`` maps addresses that are not listed to functions that make the variable, for example the height of a
     body.
+
+    Args:
+        variables: The variables, in the order of their systems.
+        by_demand: Functions that make variables which are not listed, by address: the height of a body, for example.
     """
 
     def __init__(
@@ -209,6 +250,10 @@ class Variables(Mapping[str, Variable]):
     def read(self, context: Context, addresses: Sequence[str]) -> dict[str, float | np.ndarray]:
         """Return sigma_s, equation (8), or sigma_q, equation (11): the values at ``addresses``, by address.
 
+        Args:
+            context: The root context.
+            addresses: The addresses.
+
         Raises:
             ValueError: An address does not exist, or there is one string instead of a sequence of addresses.
         """
@@ -221,6 +266,10 @@ class Variables(Mapping[str, Variable]):
 
         Their order does not matter: entries of one array are set together, and variables that change others (a mass,
         which scales the inertia) are set first.
+
+        Args:
+            context: The root context, which is changed.
+            values: Address -> value, in the variables' units.
 
         Raises:
             VariableError: ``values`` is no mapping, a value is refused, or an array is given both whole and by entries.
@@ -251,7 +300,12 @@ class Variables(Mapping[str, Variable]):
         return [v.address for v in self._listed.values() if not v.derived and v.address not in varied_addresses]
 
     def table(self, context: Context, *, pattern: str = "") -> str:
-        """Return a table of the variables whose address contains ``pattern``, as text."""
+        """Return a table of the variables whose address contains ``pattern``, as text.
+
+        Args:
+            context: The root context.
+            pattern: A part of the addresses; empty for all.
+        """
         rows = []
         for variable in self._listed.values():
             if pattern not in variable.address:
@@ -287,6 +341,10 @@ def overlap(addresses: Iterable[str], others: Iterable[str]) -> tuple[str, str] 
     """Return the first address of each that are an array and an entry of it, or equal; None if there are none.
 
     If the addresses and the others are the same object, an address is not compared with itself.
+
+    Args:
+        addresses: Addresses of variables, or of entries such as ``arm.q[2]``.
+        others: The addresses with which each of them is compared.
     """
     pairs = itertools.combinations(addresses, 2) if addresses is others else itertools.product(addresses, others)
     return next(((a, b) for a, b in pairs if a == b or a.startswith(f"{b}[") or b.startswith(f"{a}[")), None)

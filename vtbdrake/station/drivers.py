@@ -18,15 +18,18 @@ from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer, Pass
 from pydrake.systems.sensors import CameraConfig, ImageDepth16U, ImageLabel16I, ImageRgba8U
 
 from vtbdrake.control.fallback import Brake, Fallback, Hold, gravity_compensation
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status, wsg_command, wsg_status
-from vtbdrake.lcm.drake_messages import image_array_map
+from vtbdrake.drake_workarounds.schunk_wsg import FORCE_LIMIT, STATUS_PERIOD
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.maps import LcmMap
+from vtbdrake.lcm.sensor_messages import image_array_map
+from vtbdrake.lcm.wsg_messages import wsg_command, wsg_status
 from vtbdrake.station.models import JointLimits, arm_model, driven_joints
 from vtbdrake.testbed import ScenarioError, Signal, VirtualTestbedBuilder
-from vtbdrake.testbed.schunk_wsg import FORCE_LIMIT, STATUS_PERIOD
 
 AGE = 10.0
 """The largest age of a sensor signal, in periods of its messages."""
+ACTING_LATENCY = 4.0
+"""The number of periods within which a command acts on an arm and is in its status: 20 ms at 200 Hz."""
 _MARGIN = np.radians(5.0)  # by which joints run into their stops
 _FINGER_MARGIN = 0.02  # m
 _BRAKING_TIME = 0.1  # s, in which the brake of an arm takes the speed of a joint that moves alone
@@ -74,14 +77,21 @@ class StationDriver(ABC):
 
     @abstractmethod
     def continuity(self, period: float) -> Mapping[str, tuple[str, ArrayLike] | None]:
-        """Return where the actuator commands start from at a switch to real, in a loop of this period."""
+        """Return the signals from which the actuator commands start at a switch to real, in a loop of this period."""
 
     @abstractmethod
     def fallbacks(self) -> Mapping[str, Fallback]:
         """Return the fallbacks of the actuator signals."""
 
     def reported(self) -> Mapping[str, str]:
-        """Return `Protocol.reported`."""
+        """Return `Protocol.reported`: of a gripper nothing, whose status does not tell its target.
+
+        No status of these drivers tells of the machine's own stop, so there is no `Protocol.robot_mode`.
+        """
+        return {}
+
+    def idle(self) -> Mapping[str, float]:
+        """Return the commands that act while the machine does without any, for `Deployment.released_by`."""
         return {}
 
 
@@ -98,6 +108,15 @@ class Arm(StationDriver):
 
     After a fault, a position is held; torques brake the joints, and vanish without a measured velocity: the cabinet
     carries the weight.
+
+    Args:
+        driver: The driver in the file.
+        plant: The plant of the station's models.
+        models: The models, by name.
+        bus: The LCM bus of the driver.
+        speed_time: The time in s in which a position without a limit may reach its largest speed.
+        effort_time: The time in s in which a torque without a limit may reach its largest value.
+        where: The place in the file, for messages.
     """
 
     def __init__(
@@ -220,16 +239,20 @@ class Arm(StationDriver):
         fields = _of(fields, used)
         channel = f"IIWA_STATUS{self._suffix}"
         if self._has_position:
-            return iiwa_status(fields, channel=channel)
+            return iiwa_status({**fields, self._reported: "joint_position_commanded"}, channel=channel)
         on_top = {f"{self.name}_torque_added": "joint_torque_measured", self._reported: "joint_torque_commanded"}
         return iiwa_status(fields, on_top=on_top, gravity=gravity_compensation(self.model), channel=channel)
 
     @property
     def _reported(self) -> str:
-        return f"{self.name}_torque_reported"
+        return f"{self.name}_{'position' if self._has_position else 'torque'}_reported"
 
     def reported(self) -> Mapping[str, str]:
-        return {f"{self.name}_torque": self._reported} if self._torque_alone else {}
+        # The status says nothing about a torque on top of a position controller.
+        return {f"{self.name}_{'position' if self._has_position else 'torque'}": self._reported}
+
+    def idle(self) -> Mapping[str, float]:
+        return {f"{self.name}_torque": 0.0} if self._torque_alone else {}
 
     def command(self, used: Collection[str]) -> LcmMap:
         fields = {f"{self.name}_position": "joint_position", f"{self.name}_torque": "joint_torque"}
@@ -248,7 +271,7 @@ class Arm(StationDriver):
         return starts
 
     def fallbacks(self) -> Mapping[str, Fallback]:
-        # Of a joint that moves while the others are free, the inertia is smallest.
+        # The inertia of a joint is smallest while the others are free.
         mass = self.model.CalcMassMatrix(self.model.CreateDefaultContext())
         inertia = 1.0 / np.diag(np.linalg.inv(mass))
         brake = Brake(f"{self.name}_velocity_estimated", gain=inertia / _BRAKING_TIME)
@@ -271,6 +294,13 @@ class Gripper(StationDriver):
     ``_position`` (the distance in m) and ``_force_limit`` (N), which may be left out.
 
     After a fault, the last command goes on: a gripper that has grasped something keeps it.
+
+    Args:
+        driver: The driver in the file.
+        plant: The plant of the station's models.
+        models: The models, by name.
+        bus: The LCM bus of the driver.
+        where: The place in the file, for messages.
     """
 
     period = STATUS_PERIOD
@@ -374,6 +404,10 @@ class CameraImages:
 
     They are ``_color_image`` (`ImageRgba8U`), ``_depth_image`` (`ImageDepth16U`, in mm) and ``_label_image``
     (`ImageLabel16I`), as far as ``rgb``, ``depth`` and ``label`` of the `CameraConfig` ask for them.
+
+    Args:
+        config: The camera in the file.
+        bus: The LCM bus of its images.
     """
 
     _KINDS = (
@@ -395,7 +429,13 @@ class CameraImages:
         self._frames = {name: frame for name, *_, frame, _ in kinds}
 
     def connect(self, builder: VirtualTestbedBuilder, camera: System, used: Collection[str]) -> None:
-        """Connect the images that the DPS reads to the simulated camera."""
+        """Connect the images that the DPS reads to the simulated camera.
+
+        Args:
+            builder: The builder of the testbed.
+            camera: The simulated camera, a system with the image ports of Drake's cameras.
+            used: The names of the sensor signals that the DPS reads.
+        """
         for name, port in self._ports.items():
             if name in used:
                 builder.sim_sensor(name, camera.GetOutputPort(port))

@@ -12,7 +12,7 @@ from pydrake.multibody.parsing import ModelInstanceInfo, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, RigidBody
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.testbed import ScenarioError
 
 _log = logging.getLogger(__name__)
@@ -24,13 +24,20 @@ class JointLimits:
     """The limits of the joints of a model that its drivers move, in the order of its velocities; infinite if missing.
 
     Each is an array of shape (n,).
+
+    Attributes:
+        lower: The lower ends of the ranges, in rad or m.
+        upper: The upper ends of the ranges, in rad or m.
+        speed: The largest speeds, in rad/s or m/s.
+        acceleration: The largest accelerations, in rad/s^2 or m/s^2.
+        effort: The largest torques or forces, in N m or N.
     """
 
-    lower: Array  # rad or m
+    lower: Array
     upper: Array
-    speed: Array  # rad/s or m/s
-    acceleration: Array  # rad/s^2 or m/s^2
-    effort: Array  # N m or N
+    speed: Array
+    acceleration: Array
+    effort: Array
 
 
 def driven_joints(

@@ -19,16 +19,19 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.argument_checks import suggestion
-from vtbdrake.deployment import Deployment, Runtime
+from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.settings import setting
+from vtbdrake.control.bridge import acts_idle
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.settings import setting
-from vtbdrake.station.drivers import AGE, Arm, CameraImages, Gripper, StationDriver
+from vtbdrake.station.drivers import ACTING_LATENCY, AGE, Arm, CameraImages, Gripper, StationDriver
+from vtbdrake.station.hardware_sim import HardwareSimScenario
 from vtbdrake.station.models import JointLimits
-from vtbdrake.testbed import HardwareSimScenario, Interface, ScenarioError, Signal, VirtualTestbedBuilder
+from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.scenario_file import file_and_key, is_imported, read_fields
 
-_DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"  # that of LCM
+_DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"  # LCM's default
 
 
 @dataclass
@@ -103,7 +106,7 @@ class Station(HardwareSimScenario):
         Args:
             file: ``FILE``, or ``FILE#KEY`` of one with several stations; by default the ``file`` of the class.
             dps: The function that makes the DPS, or its name ``package.module:function``.
-            values: Values of fields, which override those of the file.
+            values: Values of fields, which override the file's.
 
         Raises:
             ScenarioError: The file does not exist, or does not describe a station.
@@ -174,14 +177,14 @@ class Station(HardwareSimScenario):
         return arms[name]
 
     def make_impl(self) -> System:
-        """Return a new system of the user, ``dps.impl``; by default that of the function ``dps``."""
+        """Return a new system of the user, ``dps.impl``; by default the one that the function ``dps`` makes."""
         function = self.__dict__.get("_dps_function")
         if function is None and self.dps:
             module, _, name = self.dps.partition(":")
             if not is_imported(self.dps):
                 raise ScenarioError(
-                    f"{self.where('dps')} names the function {self.dps}, and to import its module runs its code: "
-                    f"import {module} first, if that is what you want"
+                    f"{self.where('dps')} names the function {self.dps}, and to import its module runs its code: if "
+                    f"that is what you want, import {module} first, or add --trust {module} on the command line"
                 )
             function = sys.modules[module]
             for part in name.split("."):
@@ -293,6 +296,7 @@ class Station(HardwareSimScenario):
         self._check_channels([(map.channel, name) for map, _, name in sense])
         starts = [driver.continuity(pacer.period) for driver in contents.drivers]
         fallbacks = [driver.fallbacks() for driver in contents.drivers]
+        idle = {name: value for driver in contents.drivers for name, value in driver.idle().items()}
         return Deployment(
             protocol=Protocol(
                 sense=[map for map, _, _ in sense],
@@ -304,8 +308,10 @@ class Station(HardwareSimScenario):
             guards={
                 "fallback": {name: each[name] for each in fallbacks for name in each if name in commanded},
                 "max_delay": {driver.sense[0].name: AGE * driver.period for driver in contents.drivers},
+                "acting_latency": ACTING_LATENCY,
             },
             continuity={name: each[name] for each in starts for name in each if name in commanded},
+            released_by=acts_idle(idle),
             pace=pacer.sense[0].name,
         )
 
@@ -341,7 +347,13 @@ class Station(HardwareSimScenario):
     def deploy(
         self, url: str = "", *, record: str | os.PathLike[str] | None = None, **options: Any
     ) -> AbstractContextManager[Runtime]:
-        """Connect the DPS to the machine, see `Scenario.deploy`; by default on the bus of the file."""
+        """Connect the DPS to the machine, see `Scenario.deploy`; by default on the bus of the file.
+
+        Args:
+            url: The LCM URL; by default the bus of the file.
+            record: File of the log; None for none.
+            **options: As in `Scenario.deploy`.
+        """
         return super().deploy(url or self.url(), record=record, **options)
 
     def _bus(self, user: Any, where: str) -> DrakeLcmParams:
@@ -353,7 +365,7 @@ class Station(HardwareSimScenario):
         return self.lcm_buses[user.lcm_bus]
 
     def _read(self) -> _Contents:
-        """Return what the fields describe; what was read before, if they are the same."""
+        """Return the contents that the fields describe; the ones read before, if they are the same."""
         key = repr((self.record(), self.__dict__.get("_dps_function")))
         contents: _Contents | None = self.__dict__.get("_contents")
         if contents is None or contents.key != key:
@@ -362,8 +374,9 @@ class Station(HardwareSimScenario):
 
     def _new_contents(self, key: str) -> _Contents:
         plant = MultibodyPlant(self.plant_config.time_step or 1e-3)
-        models = self._process_directives(plant)
+        models = self.add_models_to(plant)
         self._check_drivers(models)
+        self._check_cameras()
         by_name = {model.model_name: model for model in models}
         times = {"speed_time": self.speed_time, "effort_time": self.effort_time}
         drivers: list[StationDriver] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cached_property
@@ -13,8 +12,11 @@ from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfi
 from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
-from vtbdrake.argument_checks import suggestion
-from vtbdrake.failures import FAILURES
+from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.failures import FAILURES
+from vtbdrake.drake_workarounds.cenic import CenicSimulator
+from vtbdrake.drake_workarounds.making import making
+from vtbdrake.drake_workarounds.step_watch import StepWatch
 from vtbdrake.state import AddressError, Snapshot, SnapshotError, Variable, Variables, collect
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.layout import StateLayout
@@ -25,25 +27,10 @@ from vtbdrake.testbed.dps_state import DpsReader
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.slow_part import SlowPart, slow_parts
-from vtbdrake.testbed.step_watch import StepWatch
 from vtbdrake.testbed.switch import BOARD, COMMAND, T_ACT, T_SENSE
 
 if TYPE_CHECKING:
-    from vtbdrake.testbed.scenario import Scenario
-
-
-_MAKING, _NOTHING = threading.RLock(), nullcontext()
-
-
-def making() -> AbstractContextManager[object]:
-    """Return what a thread holds while it makes testbeds and contexts, and begins simulations: one at a time.
-
-    Drake gives some warnings once, under a lock in C++, and pydrake passes them to Python: of two threads that come to
-    such a place at once, one would hold that lock and wait for the interpreter, and the other would hold the
-    interpreter and wait for that lock, for ever. The main thread waits for the others while they simulate; it holds
-    nothing, as a Ctrl-C could leave that behind.
-    """
-    return _NOTHING if threading.current_thread() is threading.main_thread() else _MAKING
+    from vtbdrake.testbed.scenario_identity import IdentifiedScenario
 
 
 _NO_CONTEXT = (
@@ -55,6 +42,10 @@ _NO_CONTEXT = (
 def check_root(diagram: Diagram, context: Context) -> None:
     """Reject a context that is not the root context of a Diagram.
 
+    Args:
+        diagram: The Diagram.
+        context: What may be its root context.
+
     Raises:
         ValueError: The context is another Diagram's, or none.
     """
@@ -64,27 +55,13 @@ def check_root(diagram: Diagram, context: Context) -> None:
         raise ValueError(_NO_CONTEXT) from error
 
 
-class _CenicSimulator(Simulator):
-    """Drake's Simulator, but where CENIC would end the process, it raises: for a step of length zero."""
-
-    def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
-        self._refuse_no_step(boundary_time)
-        return super().AdvanceTo(boundary_time, interruptible)
-
-    def AdvancePendingEvents(self) -> SimulatorStatus:
-        self._refuse_no_step(self.get_context().get_time())
-        return super().AdvancePendingEvents()
-
-    def _refuse_no_step(self, boundary_time: float) -> None:
-        if boundary_time == self.get_context().get_time():
-            raise ValueError(
-                f"the simulation is at {boundary_time!r} s already, and CENIC takes no step of length zero: leave the "
-                "call out, or advance to a later time"
-            )
-
-
 class WatchedSimulator(Simulator):
-    """Drake's Simulator, which raises a `NoProgressError` where its integrator would shorten a step for ever."""
+    """Drake's Simulator, which raises a `NoProgressError` where its integrator would shorten a step for ever.
+
+    Args:
+        target: The testbed, or the DPS alone.
+        context: The root context that it advances.
+    """
 
     def __init__(self, target: AddressedDiagram, context: Context) -> None:
         super().__init__(target.diagram, context)
@@ -99,6 +76,15 @@ class AddressedDiagram:
     """A Diagram with addresses for the contents of its Context, and with the settings of its simulation.
 
     It is not a subclass of Diagram: Drake would then look for Python overrides in every step of a simulation.
+
+    Args:
+        diagram: The Diagram.
+        interface: The signals of the DPS.
+        simulator_config: The settings of its integration.
+        scenario: The scenario that built it, or None.
+        extra: Variables beside the ones of the systems.
+        by_demand: Functions that make variables which are not listed, by address.
+        plant_roles: ``sys`` or ``env``, by model instance of the plant.
     """
 
     def __init__(
@@ -107,7 +93,7 @@ class AddressedDiagram:
         diagram: Diagram,
         interface: Interface,
         simulator_config: SimulatorConfig,
-        scenario: Scenario | None,
+        scenario: IdentifiedScenario | None,
         extra: Iterable[Variable] = (),
         by_demand: Mapping[str, Callable[[], Variable]] | None = None,
         plant_roles: Mapping[str, str] | None = None,
@@ -131,7 +117,7 @@ class AddressedDiagram:
         if self._sampling is not None:
             self._sampling.sample_dps_by(self.dps_state)
 
-    def _defaults_of(self, scenario: Scenario | None) -> dict[str, float]:
+    def _defaults_of(self, scenario: IdentifiedScenario | None) -> dict[str, float]:
         """Return the values of the scenario's pedigree for this side: DPS, world or both.
 
         Raises:
@@ -231,7 +217,7 @@ class AddressedDiagram:
     def _bare_simulator(self, context: Context) -> Simulator:
         if self._can_get_stuck:
             return WatchedSimulator(self, context)
-        kind = _CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
+        kind = CenicSimulator if self.simulator_config.integration_scheme == "cenic" else Simulator
         return kind(self.diagram, context)
 
     @cached_property
@@ -243,7 +229,7 @@ class AddressedDiagram:
         return StepWatch(simulator, self.reason_for_no_step) if self._can_get_stuck else nullcontext()
 
     def reason_for_no_step(self, context: Context) -> str:
-        """Return why no integration goes on from ``context``: the states whose time derivatives are not finite."""
+        """Return the reason why no integration goes on from ``context``: states with time derivatives not finite."""
         begin, state = context.get_time(), context.get_continuous_state_vector().CopyToVector()
         probe = self._own_context(context).Clone()
         # Where the derivatives are finite, they may not be so just behind.
@@ -331,7 +317,7 @@ class AddressedDiagram:
             timings.update(getattr(system, "timings", ()))
             if is_plant(system) and system.time_step() > 0.0:
                 timings.add((system.time_step(), 0.0))
-            elif isinstance(system, ZeroOrderHold):  # Of an abstract value: an unrestricted update.
+            elif isinstance(system, ZeroOrderHold):  # An abstract value has an unrestricted update.
                 timings.add((system.period(), system.offset()))
         return tuple(sorted(timings))
 
@@ -342,12 +328,21 @@ class AddressedDiagram:
         return self._variables
 
     def read(self, context: Context, address: str) -> Any:
-        """Return the value of a variable, or of a port, in ``context``; see `reader`."""
+        """Return the value of a variable, or of a port, in ``context``; see `reader`.
+
+        Args:
+            context: A root context of the Diagram.
+            address: Address of a variable, of an output port (``path.port``), or ``real.sense.<signal>``.
+        """
         self.check_context(context)
         return self.reader(address)(context)
 
     def write(self, context: Context, values: Mapping[str, Any]) -> None:
         """Set variables in ``context``: all of ``values`` (address -> value), or none.
+
+        Args:
+            context: A root context of the Diagram, which is changed.
+            values: Values by address, in the variables' units.
 
         Raises:
             ValueError: There is no such variable, or it does not take the value; nothing has been set.
@@ -420,7 +415,9 @@ class AddressedDiagram:
             )
         if self.scenario is None or not snapshot.scenario:
             return
-        if differing := record_differences(snapshot.scenario, self.scenario.record(), where="there"):
+        differing = record_differences(snapshot.scenario, self.scenario.record(), where="there")
+        differing += self.scenario.order_differences(snapshot.scenario, where="there")
+        if differing:
             raise SnapshotError(f"the snapshot is of another scenario ({'; '.join(differing)})")
 
     def copier_from(self, source: AddressedDiagram) -> StateCopier:
@@ -454,7 +451,13 @@ class AddressedDiagram:
 
 
 def record_differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], *, where: str) -> list[str]:
-    """Return the differences of two records of scenarios as phrases; ``where`` tells where ``theirs`` comes from."""
+    """Return the differences of two records of scenarios as phrases; ``where`` tells where ``theirs`` comes from.
+
+    Args:
+        theirs: The record of the other scenario, see `Scenario.record`.
+        mine: The record of the scenario here.
+        where: Where ``theirs`` comes from, such as ``in the log``; it follows the value.
+    """
     keys = ["scenario"] if theirs.get("scenario") != mine.get("scenario") else dict.fromkeys([*mine, *theirs])
     nothing = object()
     return [
@@ -476,7 +479,7 @@ def _is_no_board(path: str) -> bool:
 def _sampling_part(diagram: Diagram) -> SlowPart | None:
     sampling = {path: part for path, part in slow_parts(diagram).items() if part.samples_dps}
     if len(sampling) > 1:
-        # The samples of each would contain those of the other that are under way, and so on.
+        # A sample of each would contain the samples of the other that are under way, and so on.
         raise ValueError(
             f"a DPS has at most one slow part that samples its state, not {len(sampling)}: {', '.join(sampling)}"
         )

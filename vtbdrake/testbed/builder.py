@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
-from vtbdrake.argument_checks import as_addresses
+from vtbdrake.common.argument_checks import as_addresses
+from vtbdrake.drake_workarounds.kept_meshcats import keep_meshcat
 from vtbdrake.state.codecs import abstract_state
 from vtbdrake.state.systems import class_name, is_plant, is_python, is_scene_graph, leaves, name_systems
 from vtbdrake.testbed.integrator import controls_error
-from vtbdrake.testbed.kept_meshcats import keep_meshcat
 from vtbdrake.testbed.signal import Interface, Signal, SignalError
 from vtbdrake.testbed.switch import COMMAND, Switches
 from vtbdrake.testbed.testbed import MODES, BeliefRule, VirtualTestbed, check_mode
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
 
     from vtbdrake.testbed.scenario import Scenario
+
+_log = logging.getLogger(__name__)
 
 ROLES = ("sense", "sys", "act", "env")
 S = TypeVar("S", bound=System)
@@ -56,11 +61,16 @@ def _draws(system: System) -> bool:
 class VirtualTestbedBuilder:
     """Adds the parts of Figure 4 one by one; `build` puts the switches between them.
 
+    Args:
+        interface: The signals of the DPS.
+        simulator_config: The settings of the integration; Drake's defaults if left out.
+
     Attributes:
         diagram_builder: The DiagramBuilder of the testbed, for functions of Drake that take one.
         plant, scene_graph: Plant and SceneGraph of the simulated world; None until `add_plant` adds them.
         sensors, actuators: The ports of the simulated world, by signal.
         belief_rules: The rules that `believe` has declared.
+        place_of: Returns where the default position of a joint is declared, of model and joint; for messages.
     """
 
     def __init__(self, interface: Interface, *, simulator_config: SimulatorConfig | None = None) -> None:
@@ -70,6 +80,7 @@ class VirtualTestbedBuilder:
             )
         self.interface = interface
         self.simulator_config = simulator_config or SimulatorConfig()
+        self.place_of: Callable[[str, str], str] = lambda model, joint: ""
         self.diagram_builder = DiagramBuilder()
         self.plant: MultibodyPlant | None = None
         self.scene_graph: SceneGraph | None = None
@@ -98,7 +109,12 @@ class VirtualTestbedBuilder:
         return self.diagram_builder.AddNamedSystem(f"sim.{role}.{name}", system)
 
     def connect(self, source: OutputPort, target: InputPort) -> None:
-        """Connect an output port of the simulated world to an input port, like `DiagramBuilder.Connect`."""
+        """Connect an output port of the simulated world to an input port, like `DiagramBuilder.Connect`.
+
+        Args:
+            source: An output port of a system that was added.
+            target: An input port of a system that was added.
+        """
         self.diagram_builder.Connect(source, target)
 
     def add_plant(
@@ -126,34 +142,75 @@ class VirtualTestbedBuilder:
         """Assign a model instance of the plant to the role ``sys`` or ``env``.
 
         By default, a model instance that is fixed to the world and has no joints belongs to ``env``.
+
+        Args:
+            instance: Name of the model instance.
+            role: ``sys`` or ``env``.
         """
         if role not in ("sys", "env"):
             raise ValueError(f"model instance {instance} belongs to sys or env, not to {role!r}")
         self._places[instance] = role
 
-    def add_sensor(self, signal: str, sensor: S, *, name: str = "") -> S:
+    def add_sensor(
+        self,
+        signal: str,
+        sensor: S,
+        *,
+        name: str = "",
+        output: str = "",
+        inputs: Mapping[str, OutputPort] | None = None,
+    ) -> S:
         """Add a simulated sensor, connect its inputs to the plant and offer its output as a sensor signal.
 
         Args:
             signal: The sensor signal of the interface.
-            sensor: A System with one output port, whose input ports have the names of output ports of the plant, such
-                as the sensors in `vtbdrake.components.sensors`.
+            sensor: A System whose input ports have the names of output ports of the plant, or of ``inputs``, such as
+                the sensors in `vtbdrake.components.sensors`; ``geometry_query``, of a camera, is the SceneGraph's.
+                What may stay unconnected is in the sensor's attribute ``optional_inputs``, if it has one.
             name: The sensor is added as ``sim.sense.<name>``; by default, it has the name of the signal.
+            output: The output port that is the signal; by default the only one.
+            inputs: The ports that other inputs come from, by the name of the input: ``light`` and ``haze`` of a camera.
 
         Raises:
-            ValueError: The testbed has no plant.
+            ValueError: The testbed has no plant; nothing offers an input; or the output port is not known.
         """
         if self.plant is None:
             raise ValueError(f"the sensor {name or signal} measures a plant: call add_plant first")
         self.add("sense", name or signal, sensor)
-        for index in range(sensor.num_input_ports()):
-            port = sensor.get_input_port(index)
-            self.connect(self.plant.GetOutputPort(port.get_name()), port)
-        self.sim_sensor(signal, sensor.get_output_port())
+        self._connect_inputs(sensor, inputs or {})
+        names = [sensor.get_output_port(index).get_name() for index in range(sensor.num_output_ports())]
+        if output not in names and (output or len(names) != 1):
+            given = f", not {output!r}" if output else ""
+            raise ValueError(f"output= of {class_name(sensor)}, for {signal}, is one of {', '.join(names)}{given}")
+        self.sim_sensor(signal, sensor.GetOutputPort(output or names[0]))
         return sensor
 
+    def _connect_inputs(self, sensor: System, inputs: Mapping[str, OutputPort]) -> None:
+        """Connect the inputs of a sensor to the ports of their names: given ones, the plant's, the SceneGraph's."""
+        assert self.plant is not None and self.scene_graph is not None
+        sources = {"geometry_query": self.scene_graph.get_query_output_port()}
+        offered = [self.plant.get_output_port(index) for index in range(self.plant.num_output_ports())]
+        sources |= {port.get_name(): port for port in offered} | dict(inputs)
+        ports = [sensor.get_input_port(index) for index in range(sensor.num_input_ports())]
+        for port in ports:
+            if port.get_name() in sources:
+                self.connect(sources[port.get_name()], port)
+            elif port.get_name() not in getattr(sensor, "optional_inputs", ()):
+                raise ValueError(
+                    f"neither plant nor SceneGraph has an output {port.get_name()}, which {class_name(sensor)} needs: "
+                    f"give inputs={{{port.get_name()!r}: port}}"
+                )
+        names = [port.get_name() for port in ports]
+        if unknown := [name for name in inputs if name not in names]:
+            raise ValueError(f"{class_name(sensor)} has no input {unknown[0]!r}; it has: {', '.join(names) or 'none'}")
+
     def sim_sensor(self, name: str, port: OutputPort) -> None:
-        """Offer ``port`` as the simulated sensor signal ``name``."""
+        """Offer ``port`` as the simulated sensor signal ``name``.
+
+        Args:
+            name: Name of a sensor signal of the interface.
+            port: The output port that measures it.
+        """
         self._claim(self.interface.sense, name, "sensor", self.sensors, port, OutputPort)
 
     def sim_actuator(self, name: str, port: InputPort, *, raises_at: str = "") -> None:
@@ -171,7 +228,12 @@ class VirtualTestbedBuilder:
         self._claim(self.interface.act, name, "actuator", self.actuators, port, InputPort)
 
     def command(self, name: str, port: OutputPort) -> None:
-        """Take the command ``name`` from ``port``, instead of the variable ``u.<name>``."""
+        """Take the command ``name`` from ``port``, instead of the variable ``u.<name>``.
+
+        Args:
+            name: Name of a command of the interface.
+            port: The output port that shows its value.
+        """
         self._claim(self.interface.commands, name, "command", self._commands, port, OutputPort)
 
     @staticmethod
@@ -325,7 +387,7 @@ class VirtualTestbedBuilder:
         return diagram
 
     def finish_world(self) -> None:
-        """Finalize the plant: that of `add_plant`, or one that Drake's own functions have added as ``plant``.
+        """Finalize the plant: the one of `add_plant`, or one that Drake's own functions have added as ``plant``.
 
         Raises:
             SignalError: The simulated world lacks a signal of the interface.
@@ -344,8 +406,12 @@ class VirtualTestbedBuilder:
             if plant is not None and is_plant(plant):
                 self.plant = plant
                 self.scene_graph = scene_graph if scene_graph is not None and is_scene_graph(scene_graph) else None
-        if self.plant is not None and not self.plant.is_finalized():
-            self.plant.Finalize()
+        if self.plant is not None:
+            if not self.plant.is_finalized():
+                self.plant.Finalize()
+            for model, joint, problem in _positions_outside(self.plant):
+                place = self.place_of(model, joint)
+                _warn_once(f"{place}: {problem}" if place else problem)
 
     def _guarded_commands(self) -> dict[str, bool]:
         """Return the actuator signals whose commands are checked -> whether what they enter, as a plant, refuses NaN.
@@ -394,3 +460,26 @@ class VirtualTestbedBuilder:
                 raise ValueError(f"the plant has no model instance {name}; it has: {', '.join(roles)}")
             roles[name] = role
         return roles
+
+
+def _positions_outside(plant: MultibodyPlant) -> Iterator[tuple[str, str, str]]:
+    """Yield (model, joint, problem) for every joint of a plant whose default position is outside its limits."""
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        q, lower, upper = joint.default_positions(), joint.position_lower_limits(), joint.position_upper_limits()
+        if ((q < lower) | (q > upper)).any():
+            model = plant.GetModelInstanceName(joint.model_instance())
+            unit = {"revolute": " rad", "prismatic": " m"}.get(joint.type_name(), "")
+            start, low, high = (np.array2string(each, precision=6).strip("[] ") for each in (q, lower, upper))
+            yield (
+                model,
+                joint.name(),
+                f"the default position of {joint.name()} of {model} is {start}{unit}, outside its limits, {low} to "
+                f"{high}{unit}: give it another one, or correct the limits",
+            )
+
+
+@cache
+def _warn_once(message: str) -> None:
+    # A study builds the same testbed again and again.
+    _log.warning("%s", message)

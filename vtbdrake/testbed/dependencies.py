@@ -38,7 +38,12 @@ def followers(diagram: Diagram, sources: Iterable[str]) -> dict[str, str]:
 
 
 def chain(predecessors: dict[str, str], path: str) -> list[str]:
-    """Return the paths from a source to the follower ``path``, both included, in what `followers` returned."""
+    """Return the paths from a source to the follower ``path``, both included, in what `followers` returned.
+
+    Args:
+        predecessors: Path of each follower -> path of the system before it, see `followers`.
+        path: Path of the follower, one of the keys.
+    """
     passed = [path]
     while predecessors[passed[-1]] != passed[-1]:
         passed.append(predecessors[passed[-1]])
@@ -60,7 +65,12 @@ def connections(diagram: Diagram) -> Iterator[tuple[tuple[System, int], tuple[Sy
 
 
 def writer_of(system: System, port: OutputPortIndex) -> tuple[System, int]:
-    """Return the leaf system that computes an output port, and the number of its own port."""
+    """Return the leaf system that computes an output port, and the number of its own port.
+
+    Args:
+        system: A leaf system or a Diagram.
+        port: The number of the output port of ``system``.
+    """
     while isinstance(system, Diagram):
         system, port = system.get_output_port_locator(port)
     return system, int(port)

@@ -16,12 +16,19 @@ from vtbdrake.state.layout import FlatState, StateLayout
 
 @dataclass(frozen=True, eq=False)
 class DpsState:
-    """The state of a DPS at one instant, before the updates of that instant."""
+    """The state of a DPS at one instant, before the updates of that instant.
 
-    time: float  # in seconds
-    contents: FlatState  # state and parameters of the DPS's systems
-    commands: Mapping[str, np.ndarray]  # the commands u that are set from outside, by name
-    # the vector sensor values that the DPS has at its ports at this instant, by name; without those never fed
+    Attributes:
+        time: The instant, in seconds.
+        contents: State and parameters of the DPS's systems.
+        commands: The commands u that are set from outside, by name.
+        received: The vector sensor values that the DPS has at its ports at this instant, by name; without those never
+            fed.
+    """
+
+    time: float
+    contents: FlatState
+    commands: Mapping[str, np.ndarray]
     received: Mapping[str, np.ndarray]
 
 

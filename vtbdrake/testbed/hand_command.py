@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.testbed.signal import Interface, SignalError
 
-HAND_SIZE, HEAD_SIZE = 8, 7
-"""The numbers of entries of the commands that a hand and a head give."""
+HAND_SIZE = 8
+"""The number of entries of the command that a hand gives."""
+HEAD_SIZE = 7
+"""The number of entries of the command that a head gives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,8 +23,8 @@ class HandCommand:
 
     Its value is [c; w, x, y, z; p]. While a clutch is held, c is 1, and the others are the pose X_WT that the robot's
     tool T is to take: a unit quaternion, and a position in the world, in m. While c is 0, the robot holds its position,
-    whatever the others are. The default of the command has c = 0, and its ``max_age`` is that of a hand's last message:
-    a loop on a machine returns to the default when nothing newer has come.
+    whatever the others are. The default of the command has c = 0, and its ``max_age`` bounds the age of a hand's last
+    message: a loop on a machine returns to the default when nothing newer has come.
 
     Attributes:
         command: The name of the command u.

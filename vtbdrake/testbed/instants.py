@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 
 def sample_times(horizon: float, sample_period: float) -> NDArray[np.float64]:
-    """Return the sample times from 0 to the horizon, in seconds: the multiples of the sample period, and the end."""
+    """Return the sample times from 0 to the horizon, in seconds: the multiples of the sample period, and the end.
+
+    Args:
+        horizon: The last sample time, in seconds, at least 0.
+        sample_period: The time between two samples, in seconds, above 0.
+    """
     times = np.arange(np.floor(horizon / sample_period * (1.0 + 1e-12)) + 1.0) * sample_period
     rest = horizon - times[-1]
     return np.append(times, horizon) if rest > 1e-9 * sample_period else times
@@ -18,7 +23,7 @@ def sample_times(horizon: float, sample_period: float) -> NDArray[np.float64]:
 def sample_instants(
     times: NDArray[np.float64], t0: float, timings: Sequence[tuple[float, float]]
 ) -> NDArray[np.float64]:
-    """Return the simulator's time at each sample: t0 + t, or that of the first event that coincides up to rounding.
+    """Return the simulator's time at each sample: t0 + t, or the first event's that coincides up to rounding.
 
     Drake puts an event at offset + n * period. 3 * 0.1 and 15 * 0.02 differ in the last bit: a simulation that is
     advanced to the one would take another step, of 1e-16 s, to the other. And the updates of the other would have

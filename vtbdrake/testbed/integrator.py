@@ -26,6 +26,10 @@ def apply_simulator_config(config: SimulatorConfig, simulator: Simulator) -> Non
     a seventh of the time; the distance walked in 15 s changes by less than a micrometre.
 
     Like Drake's function it gives the simulator a new integrator, which remembers nothing of an earlier one.
+
+    Args:
+        config: Drake's configuration of the integrator and of the pace.
+        simulator: The simulator, which is changed.
     """
     ApplySimulatorConfig(config, simulator)
     if config.integration_scheme == "cenic":

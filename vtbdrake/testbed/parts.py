@@ -14,7 +14,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from vtbdrake.state import Snapshot
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.state.snapshot import StateCopier
-from vtbdrake.state.variables import html_table
 from vtbdrake.testbed.addressed import AddressedDiagram, is_dps
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.scenario import Scenario, check_is_scenario
@@ -34,6 +33,8 @@ class DpsAlone(AddressedDiagram):
     Attributes:
         dps: The data processing system, a direct subsystem of the diagram.
     """
+
+    scenario: Scenario | None
 
     def __init__(self, scenario: Scenario) -> None:
         check_is_scenario(scenario)
@@ -66,17 +67,15 @@ class DpsAlone(AddressedDiagram):
 
     def _repr_html_(self) -> str:
         """Show the signals and the variables in a notebook."""
-        sides = (
-            ("sensor", self.interface.sense),
-            ("actuator", self.interface.act),
-            ("command", self.interface.commands),
-        )
-        signals = [(kind, signal.name, str(signal.size or ""), signal.unit) for kind, side in sides for signal in side]
-        variables = self.variables()._repr_html_()
-        return f"<b>{escape(repr(self))}</b>{html_table([('signal', 'name', 'size', 'unit'), *signals])}{variables}"
+        return f"<b>{escape(repr(self))}</b>{self.interface._repr_html_()}{self.variables()._repr_html_()}"
 
     def continue_from(self, testbed: VirtualTestbed, context: Context) -> Context:
-        """Return a context in which the DPS continues from a context of its testbed, at the same time."""
+        """Return a context in which the DPS continues from a context of its testbed, at the same time.
+
+        Args:
+            testbed: The whole testbed.
+            context: Its root context, from which the DPS continues.
+        """
         copied = self.default_context()
         if id(testbed) not in self._copiers:
             self._copiers[id(testbed)] = StateCopier(
@@ -89,6 +88,10 @@ class DpsAlone(AddressedDiagram):
 
     def restore(self, context: Context, snapshot: Snapshot) -> None:
         """Make ``context`` continue from where the DPS is in a snapshot, of a testbed or of a DPS alone.
+
+        Args:
+            context: The root context of the DPS alone, which is changed.
+            snapshot: The snapshot.
 
         Raises:
             SnapshotError: The snapshot is of another scenario, or of a DPS that is built in another way.
@@ -133,6 +136,7 @@ class WorldAlone(AddressedDiagram):
         scenario.validate()
         scenario_copy = copy.deepcopy(scenario)
         parts = VirtualTestbedBuilder(scenario_copy.interface(), simulator_config=scenario_copy.simulator_config)
+        parts.place_of = scenario_copy.where_position
         scenario_copy.add_world(parts)
         parts.finish_world()
         for signal in parts.interface.sense:

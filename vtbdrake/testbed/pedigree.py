@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.settings import check_settings, setting
 
 SOURCES = ("assumed", "datasheet", "measured", "calibrated")
 
@@ -14,7 +14,7 @@ class Number:
     """A number of a testbed, or an array of them, by its address."""
 
     source: str = setting("assumed", "Where it is from; what has no entry is assumed.", choices=SOURCES)
-    value: float | None = setting(None, "The value in s0; None: that of the scenario without this entry.")
+    value: float | None = setting(None, "The value in s0; None: the scenario's value without this entry.")
     deviation: float | None = setting(None, "Its standard deviation, if it is known.", ge=0)
     lower: float | None = setting(None, "The lower end of its interval of 95 %.")
     upper: float | None = setting(None, "The upper end of its interval of 95 %.")
@@ -28,8 +28,8 @@ class Number:
 class Posterior:
     """The joint distribution of numbers that were fitted together: normal, within ranges.
 
-    It is that of single numbers, and of ten numbers (`vtbdrake.calibration.model.pseudo_inertia`) for each body whose
-    inertia was fitted as a whole, so that every sample is a body of positive masses.
+    Its numbers are single ones, and ten (`vtbdrake.testbed.inertia.pseudo_inertia`) for each body whose inertia
+    was fitted as a whole, so that every sample is a body of positive masses.
     """
 
     addresses: list[str] = setting(default_factory=list, doc="The addresses of the single numbers.")
@@ -51,7 +51,7 @@ class Pedigree:
     posterior: Posterior = setting(default_factory=Posterior, doc="How those that were fitted vary together.")
     logs: dict[str, str] = setting(default_factory=dict, doc="SHA-256 of the recordings of the fit, by their source.")
     reasons: list[str] = setting(default_factory=list, doc="Why the fit is not accepted.")
-    domain: str = setting("", "The file of the validity domain, beside that of the scenario.")
+    domain: str = setting("", "The file of the validity domain, beside the scenario's file.")
 
     def __repr__(self) -> str:
         sources = [number.source for number in self.numbers.values()]

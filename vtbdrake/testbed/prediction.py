@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.systems.analysis import InitializeParams
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.testbed.parts import WorldAlone
 from vtbdrake.testbed.testbed import BeliefRule
 

@@ -10,41 +10,39 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, is_dataclass, replace
-from importlib.metadata import version
 from inspect import get_annotations
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, Union
 
 import numpy as np
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import System
 
-from vtbdrake.argument_checks import suggestion
-from vtbdrake.settings import check_settings, check_value, field_types, plain_types
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import suggestion
+from vtbdrake.common.field_types import field_types
+from vtbdrake.common.settings import check_settings, check_value, plain_types
+from vtbdrake.drake_workarounds.cenic import DRAKE, FIXED_STEPS_ARE_STALE
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 from vtbdrake.testbed.pedigree import Number, Pedigree
+from vtbdrake.testbed.posterior_samples import samples
+from vtbdrake.testbed.scenario_identity import ScenarioError
+from vtbdrake.testbed.scenario_text import save_scenario
 from vtbdrake.testbed.signal import Interface
 from vtbdrake.testbed.testbed import VirtualTestbed
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-    from vtbdrake.deployment import Deployment, Runtime
+    from vtbdrake.common.validity_domain import ValidityDomain
     from vtbdrake.testbed.hand_command import HandCommand
-    from vtbdrake.validity_domain import ValidityDomain
+    from vtbdrake.upper_layers import Deployment, Runtime
 
-# With 1.51.1, and not with 1.58, poses and contact results after a fixed step of CENIC are those before the step.
-_DRAKE = version("drake")
-_CENIC_IS_FRESH = tuple(int(part) for part in _DRAKE.split(".")[:2]) >= (1, 58)
 # The keys of these fields in files.
 FILE_KEYS = {"simulator_config": "simulator", "plant_config": "plant"}
 # Begin of the addresses of fields.
 _FIELD = "scenario."
 # Fields of SimulatorConfig that do not change a trajectory.
 _NO_IDENTITY = {"simulator.start_time", "simulator.target_realtime_rate", "simulator.publish_every_time_step"}
-
-
-class ScenarioError(ValueError):
-    """A scenario cannot be found, read or built."""
 
 
 @dataclass
@@ -107,17 +105,35 @@ class Scenario(ABC):
         return cls()
 
     def set_origin(self, path: str, lines: Mapping[str, int]) -> None:
-        """Remember the file that the fields come from, and the line of each dotted name, for `where`."""
+        """Remember the file that the fields come from, and the line of each dotted name, for `where`.
+
+        Args:
+            path: Path of the file.
+            lines: Line numbers by dotted name of a field, from 1.
+        """
         self.__dict__["_origin"] = (path, lines)
 
+    def forget_origin(self) -> None:
+        """Forget the file that the fields come from: it is gone."""
+        self.__dict__.pop("_origin", None)
+
     def where(self, name: str = "") -> str:
-        """Return where a field is set, for messages: file and line if it comes from a file, else class and field."""
+        """Return the place where a field is set, for messages: file and line of a field from a file, else its class."""
         if "_origin" not in self.__dict__:
             return f"{type(self).__name__}.{name}" if name else type(self).__name__
         path, lines = self.__dict__["_origin"]
         while name and name not in lines:
             name = name.rpartition(".")[0]
         return f"{path}, line {lines[name]}" if name else str(path)
+
+    def where_position(self, model: str, joint: str) -> str:
+        """Return the place where the default position of a joint is declared, for messages.
+
+        Args:
+            model: Name of the model instance.
+            joint: Name of the joint.
+        """
+        return self.where()
 
     @abstractmethod
     def interface(self) -> Interface:
@@ -159,10 +175,10 @@ class Scenario(ABC):
                 f"{name}.simulator_config.integration_scheme is one of {', '.join(schemes)}, not "
                 f"{config.integration_scheme!r}"
             )
-        if config.integration_scheme == "cenic" and not config.use_error_control and not _CENIC_IS_FRESH:
+        if config.integration_scheme == "cenic" and not config.use_error_control and FIXED_STEPS_ARE_STALE:
             raise ScenarioError(
                 f"{name}.simulator_config: CENIC without error control leaves poses one step behind in Drake "
-                f"{_DRAKE}; set use_error_control to true, or use Drake 1.58"
+                f"{DRAKE}; set use_error_control to true, or use Drake 1.58"
             )
         if config.max_step_size <= 0 or config.accuracy <= 0:
             raise ScenarioError(
@@ -191,6 +207,7 @@ class Scenario(ABC):
         self.validate()
         scenario = copy.deepcopy(self)  # The caller may change this one afterwards.
         builder = VirtualTestbedBuilder(scenario.interface(), simulator_config=scenario.simulator_config)
+        builder.place_of = scenario.where_position
         try:
             builder.set_dps(scenario.make_dps())
             scenario.add_world(builder)
@@ -208,13 +225,11 @@ class Scenario(ABC):
         return self
 
     def deployment(self) -> Deployment:
-        """Return how the DPS runs on its machine; the default has no protocol. Each call returns a new one."""
-        from vtbdrake.deployment import Deployment
-
-        return Deployment()
+        """Return a new deployment: how the DPS runs on its machine; the default has no protocol."""
+        return upper_layers.Deployment()
 
     def hand_command(self) -> HandCommand | None:
-        """Return how a hand in virtual reality leads the robot, or None if no command u takes its pose."""
+        """Return the command by which a hand in virtual reality leads a robot, or None if no command takes it."""
         return None
 
     def deploy(
@@ -230,9 +245,10 @@ class Scenario(ABC):
 
         The block begins when the processes of slow parts and recorder are ready: no result and no cycle is missed.
         The DPS runs without its simulated world, and commands from `Runtime.take_over` on. At the end of the block, the
-        fallbacks command for a while (see `Runtime.leave`), and the connection is closed. In the block, SIGTERM raises
-        KeyboardInterrupt, unless the program handles it: it ends the block as Ctrl-C does. A loop that runs in another
-        thread is stopped at the end.
+        fallbacks command for a while (see `Runtime.leave`), and the connection is closed. In the block, SIGTERM and
+        SIGHUP raise KeyboardInterrupt, unless the program handles them: they end the block as Ctrl-C does. Sent to the
+        whole process group, they end the loop first, and then its processes: the log holds the last commands. A loop
+        that runs in another thread is stopped at the end.
 
         Args:
             url: The URL of the LCM bus.
@@ -244,7 +260,7 @@ class Scenario(ABC):
                 * ``context`` (Context): the state of the target to continue from.
                 * ``start`` (Snapshot): a snapshot to continue from.
                 * ``values`` (mapping of address to value): variables to set before the first cycle.
-                * ``deployment`` (Deployment): replaces that of the scenario.
+                * ``deployment`` (Deployment): replaces the scenario's.
                 * ``live`` (bool): serve ``vtbdrake get``, ``set``, ``watch`` and ``reset``; False by default.
                 * ``claim`` (bool): ask the hub for protected channels whose owner has fallen silent; False by default.
                 * ``clock``, ``watchers``, ``statistics``: see `Runtime`.
@@ -253,12 +269,10 @@ class Scenario(ABC):
             DeploymentError: The DPS cannot run safely on its machine.
             ProtocolError: The deployment has no protocol, or it does not fit the signals.
             BridgeError: There is no bus at this URL.
-            ProcessStartError: The process of a slow part, or that of the recorder, does not start.
+            ProcessStartError: The process of a slow part, or of the recorder, does not start.
             RecordingError: At the end of the block: the log lacks cycles.
         """
-        from vtbdrake.deployment import deploy
-
-        return deploy(self, url, record=record, **options)
+        return upper_layers.deploy(self, url, record=record, **options)
 
     def name(self) -> str:
         """Return ``package.module:Class``."""
@@ -271,8 +285,30 @@ class Scenario(ABC):
         flat = {key: value for key, value in _flat(values) if key not in _NO_IDENTITY}
         return {"scenario": self.name(), **flat, **self.pedigree.values}
 
+    def order_differences(self, record: Mapping[str, Any], *, where: str) -> list[str]:
+        """Return the differences in the order of dictionaries, which signals follow, from a `record`, as phrases.
+
+        ``where`` tells where the record comes from.
+
+        Args:
+            record: A `record` of a scenario of this class.
+            where: Where the record comes from, for the phrases.
+        """
+        return [
+            f"{name}: {', '.join(theirs)} {where}, {', '.join(entries)} here"
+            for name, entries in _dictionaries(self)
+            if (theirs := _recorded_order(record, name, entries)) != list(entries)
+        ]
+
+    def take_order(self, record: Mapping[str, Any]) -> None:
+        """Bring the entries of all dictionaries into the order of a `record` of this scenario."""
+        for name, entries in _dictionaries(self):
+            ordered = {key: entries[key] for key in _recorded_order(record, name, entries)}
+            entries.clear()
+            entries.update(ordered)
+
     def numeric_fields(self) -> dict[str, float]:
-        """Return the fields that are numbers, nested ones by dotted names, without those of the integrator."""
+        """Return the fields that are numbers, nested ones by dotted names, without the integrator's fields."""
         values = {name: getattr(owner, name.rpartition(".")[2]) for name, owner, _ in _plain_fields(self)}
         return {
             name: value
@@ -298,10 +334,10 @@ class Scenario(ABC):
                 raise ScenarioError(f"{type(self).__name__} has no field {name!r} of a plain type{near}")
             owner, annotation = owners[name]
             types = plain_types(annotation)
-            check_value(f"{type(self).__name__}.{name}", value, " | ".join(types), error=ScenarioError)
+            check_value(f"{type(self).__name__}.{name}", value, Union[types], error=ScenarioError)  # noqa: UP007
             if isinstance(value, np.generic | np.ndarray):
                 value = value.item()
-            if type(value) is int and "int" not in types:
+            if type(value) is int and int not in types:
                 value = float(value)
             setattr(owner, name.rpartition(".")[2], value)
         changed.validate()
@@ -339,14 +375,15 @@ class Scenario(ABC):
         Raises:
             ScenarioError: Nothing was calibrated.
         """
-        from vtbdrake.calibration.posterior import samples
-
         return samples(self.pedigree.posterior, count, seed=seed)
 
     def save(self, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:
-        """Write a YAML file that `load_scenario` reads, and the model's validity domain beside it."""
-        from vtbdrake.testbed.scenario_file import save_scenario
+        """Write a YAML file that `load_scenario` reads, and the model's validity domain beside it.
 
+        Args:
+            path: The file.
+            domain: Where the model was compared with recordings; None for none.
+        """
         save_scenario(self, path, domain=domain)
 
 
@@ -382,6 +419,28 @@ def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     else:
         # One of Drake's configs without fields, such as Rotation.Identity.
         yield name, type(value).__name__ if hasattr(value, "__fields__") else value
+
+
+def _dictionaries(value: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield (dotted name, dictionary) of every dictionary inside, by the names of `_flat`."""
+    if isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            yield from _dictionaries(item, f"{name}[{i}]")
+    elif isinstance(value, dict) or field_types(value):
+        if isinstance(value, dict):
+            yield name, value
+        for key, item in (value if isinstance(value, dict) else _values(value)).items():
+            yield from _dictionaries(item, f"{name}.{key}".lstrip("."))
+
+
+def _recorded_order(record: Mapping[str, Any], name: str, entries: Mapping[str, Any]) -> list[str]:
+    """Return the keys of a dictionary in the order of a record; those that it lacks stay at the end."""
+    places: dict[str, int] = {}
+    for place, recorded in enumerate(record):
+        for key in entries:
+            if recorded == f"{name}.{key}" or recorded.startswith((f"{name}.{key}.", f"{name}.{key}[")):
+                places.setdefault(key, place)
+    return sorted(entries, key=lambda key: places.get(key, len(record)))
 
 
 def _changed_fields(owner: Any) -> str:

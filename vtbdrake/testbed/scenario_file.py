@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
-import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
 from inspect import isabstract
 from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args
 
 import yaml
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+from pydrake.common.yaml import yaml_load_typed
 
-from vtbdrake.settings import field_types
-from vtbdrake.testbed.pedigree import Pedigree
-from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, ScenarioError, class_name
-
-if TYPE_CHECKING:
-    from vtbdrake.validity_domain import ValidityDomain
+from vtbdrake.common.field_types import alternatives, field_types, resolve_types
+from vtbdrake.common.scenario_names import ScenarioNameError, file_name, full_name, importable_name, suggested_scenarios
+from vtbdrake.common.suggestions import did_you_mean
+from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, class_name
+from vtbdrake.testbed.scenario_identity import ScenarioError
 
 S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
 _MOST_NODES = 100_000
 # Packages that are imported because a file names them: they are installed beside this module.
 _OWN = ("vtbdrake", "vtbdrake_diagrams", "builtins", "math", "numpy")
-# What lies below the key in a file.
-_PEDIGREE = re.compile(r"^  pedigree:\n(?:    .*\n)*", re.MULTILINE)
 
 
 def load_scenario(source: str | os.PathLike[str]) -> Scenario:
@@ -43,7 +36,11 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
         source: One of
 
             * ``package.module:Class``: the scenario with its defaults;
-            * ``package.module:Class@FILE``: with the fields of a YAML file;
+            * ``cart_pole``: the same by a short name, which packages declare as entry points of the group
+              ``vtbdrake.scenarios`` (``vtbdrake examples`` lists them);
+            * ``folder/file.py:Class``: the class in a file, whose folder (of a package, the folder that holds it) is
+              appended to ``sys.path``;
+            * ``package.module:Class@FILE``, or one of the others with ``@FILE``: with the fields of a YAML file;
             * ``package.module:Class@FILE#KEY``: with the fields below one of several keys of the file, as in files of
               Drake's ``hardware_sim``;
             * the YAML file alone, if the class that it names is imported already. For example::
@@ -55,7 +52,10 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
         ScenarioError: The class, file or key does not exist, a key of the file is unknown or occurs twice, or a value
             has the wrong type or is rejected by the scenario.
     """
-    text = os.fspath(source)
+    try:
+        text = importable_name(full_name(os.fspath(source)))
+    except ScenarioNameError as error:
+        raise ScenarioError(str(error)) from error
     name, at, file = text.partition("@")
     if not (at and ":" in name):  # A file may have any name.
         name, file = "", text
@@ -71,64 +71,25 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
 def scenario_of_text(name: str, text: str) -> Scenario:
     """Return the scenario ``package.module:Class`` with the fields of a text that `scenario_text` has returned.
 
+    Args:
+        name: The name ``package.module:Class``, whose module is imported.
+        text: YAML of the fields, as `scenario_text` returns it.
+
     Raises:
         ScenarioError: As in `load_scenario`.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
         path.write_text(text, "utf-8")
-        return load_scenario(f"{name}@{path}")
-
-
-def scenario_text(scenario: Scenario) -> str:
-    """Return the text of the file that `save_scenario` writes.
-
-    Raises:
-        ScenarioError: A field is of a type that no file can hold.
-    """
-    resolve_types(type(scenario))
-    try:
-        text = yaml_dump_typed(scenario, child_name=scenario.name())
-    except Exception:
-        for item in fields(scenario):
-            try:
-                yaml_dump_typed({"": getattr(scenario, item.name)}, schema=dict[str, item.type])  # type: ignore[name-defined]
-            except Exception as error:
-                raise ScenarioError(
-                    f"no file can hold {type(scenario).__name__}.{item.name}, a {_type_name(item.type)}: make it of "
-                    "numbers, texts, lists, dictionaries, dataclasses of them and Drake's configs"
-                ) from error
-        raise
-    # A file without a pedigree is one that hardware_sim reads, too.
-    return text if scenario.pedigree != Pedigree() else _PEDIGREE.sub("", text)
+        scenario = load_scenario(f"{name}@{path}")
+    scenario.forget_origin()
+    return scenario
 
 
 def file_and_key(source: str) -> tuple[str, str]:
     """Return the parts of ``FILE#KEY``; the key is empty without one. A file that exists may have any name."""
     file, _, key = source.partition("#") if not Path(source).exists() else (source, "", "")
     return file, key
-
-
-def save_scenario(scenario: Scenario, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:
-    """Write a YAML file that `load_scenario` reads.
-
-    Args:
-        scenario: The scenario.
-        path: The file.
-        domain: The validity domain of its model: it gets a file beside, NAME.domain.json, which the pedigree names.
-
-    Raises:
-        ScenarioError: A field is of a type that no file can hold.
-    """
-    if domain is not None:
-        file = Path(path).with_suffix(".domain.json")
-        domain.save(file)
-        scenario.pedigree.domain = file.name
-    Path(path).write_text(scenario_text(scenario))
-
-
-def _type_name(kind: Any) -> str:
-    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
 
 
 def scenario_class(name: str) -> type[Scenario]:
@@ -139,10 +100,15 @@ def scenario_class(name: str) -> type[Scenario]:
     """
     module_name, _, class_ = name.partition(":")
     if not module_name or not class_:
-        raise ScenarioError(f"a scenario is named package.module:Class, or by a .yaml file, not {name!r}")
+        near = suggested_scenarios(name) or "; 'vtbdrake examples' lists short names"
+        raise ScenarioError(
+            f"a scenario is named package.module:Class, file.py:Class, by a file or a short name, not {name!r}{near}"
+        )
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
+        if near := suggested_scenarios(name):
+            raise ScenarioError(f"cannot import {module_name}: {error}{near}") from error
         raise ScenarioError(
             f"cannot import {module_name}, of the scenario {name}: {error}. Is its folder on the Python path?"
         ) from error
@@ -155,7 +121,10 @@ def scenario_class(name: str) -> type[Scenario]:
         alternatives = [
             k for k, v in vars(module).items() if isinstance(v, type) and issubclass(v, Scenario) and not isabstract(v)
         ]
-        raise ScenarioError(f"{module_name} has no scenario {class_!r}; it has: {', '.join(alternatives) or 'none'}")
+        near = did_you_mean(class_, alternatives, count=1)
+        raise ScenarioError(
+            f"{module_name} has no scenario {class_!r}{near}; it has: {', '.join(alternatives) or 'none'}"
+        )
     return kind
 
 
@@ -169,15 +138,21 @@ def is_trusted(name: str, *, trusted: Sequence[str] = ()) -> bool:
 
     Importing a module runs its code. So it must be imported already, or one of vtbdrake's or of those in ``trusted``,
     which are modules, or packages of them.
+
+    Args:
+        name: The name ``package.module:name`` in the file.
+        trusted: Modules that may be imported, or packages of them; by default none but vtbdrake's.
     """
     module = name.partition(":")[0]
     if module in sys.modules and module != "__main__":
         return True
+    if file_name(name) is not None or not module.replace(".", "_").isidentifier():
+        return False  # The name of a file, which may begin like a module's.
     return any(module == each or module.startswith(f"{each}.") for each in (*_OWN, *trusted))
 
 
 def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> Scenario:
-    """Return the scenario of a `Scenario.record`, such as that of a snapshot.
+    """Return the scenario of a `Scenario.record`, such as a snapshot's.
 
     Args:
         record: The record.
@@ -195,7 +170,7 @@ def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> S
             )
         base = load_scenario(name)
     elif base.name() != name:
-        raise ScenarioError(f"the record is not that of {base.name()}, but of {name or 'a bare Diagram'}")
+        raise ScenarioError(f"the record does not belong to {base.name()}, but to {name or 'a bare Diagram'}")
     present = base.record()
     fields_by_key = {key: field for field, key in FILE_KEYS.items()}
     changed = {}
@@ -204,8 +179,9 @@ def scenario_of(record: Mapping[str, Any], *, base: Scenario | None = None) -> S
             head, dot, rest = key.partition(".")
             changed[f"{fields_by_key.get(head, head)}{dot}{rest}"] = value
     scenario = base.with_fields(changed)
+    scenario.take_order(record)
     if scenario.record() != dict(record):
-        raise ScenarioError(f"the record is not that of {name} with today's code: name the scenario with its file")
+        raise ScenarioError(f"the record does not fit {name} with today's code: name the scenario with its file")
     return scenario
 
 
@@ -303,7 +279,12 @@ def _filled(scenario: S, content: yaml.Node, path: Path, name: str) -> S:
 
 
 def lines_by_name(node: yaml.Node | None, name: str = "") -> Iterator[tuple[str, int]]:
-    """Yield (dotted name, line, counted from 1) of keys and of the entries of lists, which have numbers."""
+    """Yield (dotted name, line, counted from 1) of keys and of the entries of lists, which have numbers.
+
+    Args:
+        node: A node of the YAML file; None, or a scalar, has no keys.
+        name: The dotted name of ``node``, which begins every name; empty by default, for the outermost node.
+    """
     entries: list[tuple[str, yaml.Node, yaml.Node]] = []
     if isinstance(node, yaml.MappingNode):
         entries = [(str(key.value), key, value) for key, value in node.value]
@@ -316,29 +297,11 @@ def lines_by_name(node: yaml.Node | None, name: str = "") -> Iterator[tuple[str,
 
 
 def _use_new_keys(content: yaml.Node, schema: type[Scenario]) -> None:
-    """Rename the keys of older files to those of the fields."""
+    """Rename the keys of older files to the names of the fields."""
     keys = field_types(schema)
     renamed = {old: new for new, old in FILE_KEYS.items() if new in keys and old not in keys}
     for key, _ in content.value if isinstance(content, yaml.MappingNode) else []:
         key.value = renamed.get(key.value, key.value)
-
-
-def resolve_types(schema: type) -> None:
-    """Replace the names of the types of a dataclass by types, also in the dataclasses of its fields."""
-    # Drake's reader needs types; `from __future__ import annotations` leaves their names.
-    hints = get_type_hints(schema)
-    for item in fields(schema):
-        item.type = hints[item.name]
-        for part in _parts(item.type):
-            if isinstance(part, type) and is_dataclass(part):
-                resolve_types(part)
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """Yield a type and its parts: for list[Rock] | None also list[Rock], Rock and None."""
-    yield hint
-    for argument in get_args(hint):
-        yield from _parts(argument)
 
 
 def _check_nodes(document: yaml.Node | None, path: Path) -> None:
@@ -350,7 +313,7 @@ def _check_nodes(document: yaml.Node | None, path: Path) -> None:
         if count > _MOST_NODES:
             raise ScenarioError(f"{path} has more than {_MOST_NODES} entries, with aliases expanded")
         if isinstance(node, yaml.MappingNode):
-            # Of two equal keys, YAML readers silently keep the last.
+            # YAML readers silently keep the last of two equal keys.
             keys = [str(key.value) for key, _ in node.value]
             if len(set(keys)) < len(keys):
                 twice = next(key for key in keys if keys.count(key) > 1)
@@ -366,14 +329,14 @@ def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
 
     Args:
         node: The content of a file.
-        hint: The expected type, of which `resolve_types` has made the dataclasses ready.
+        hint: The expected type.
         name: The name of the field that has this content.
 
     Raises:
         ScenarioError: There is such a key.
     """
-    alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    inside: Any = tuple(part for alternative in alternatives for part in get_args(alternative))
+    kinds = alternatives(hint)
+    inside: Any = tuple(part for alternative in kinds for part in get_args(alternative))
     inside = Union[inside] if inside else Any  # noqa: UP007
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
@@ -382,7 +345,7 @@ def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
     if not isinstance(node, yaml.MappingNode):
         return
     # A tag chooses one of several classes; the first one needs no tag.
-    classes = [p for p in alternatives if isinstance(p, type) and (field_types(p) or hasattr(p, "__fields__"))]
+    classes = [p for p in kinds if isinstance(p, type) and (field_types(p) or hasattr(p, "__fields__"))]
     expected = next((part for part in classes if node.tag == f"!{part.__name__}"), classes[0] if classes else None)
     if len(classes) > 1 and node.tag.startswith("!") and expected and node.tag != f"!{expected.__name__}":
         tags = ", ".join(f"!{part.__name__}" for part in classes)
@@ -398,8 +361,5 @@ def refuse_unknown(node: yaml.Node, hint: Any, name: str = "") -> None:
         elif key.value in types:
             refuse_unknown(value, types[key.value], below)
         else:
-            near = difflib.get_close_matches(key.value, types, n=1, cutoff=0.5)
-            hint_text = f"did you mean {near[0]}?" if near else f"it has: {', '.join(types)}"
-            raise ScenarioError(
-                f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}; {hint_text}"
-            )
+            near = did_you_mean(key.value, types, count=1, cutoff=0.5) or f"; it has: {', '.join(types)}"
+            raise ScenarioError(f"line {key.start_mark.line + 1}: {expected.__name__} has no field {below!r}{near}")

@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import is_dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 
-from vtbdrake.settings import check_settings, field_types
-from vtbdrake.testbed.scenario import ScenarioError
-from vtbdrake.testbed.scenario_file import compose_yaml, lines_by_name, refuse_unknown, resolve_types
+from vtbdrake.common.field_types import alternatives, field_types, is_dataclass_type
+from vtbdrake.common.scenario_names import file_name, full_name
+from vtbdrake.common.settings import check_settings
+from vtbdrake.testbed.scenario_file import compose_yaml, lines_by_name, refuse_unknown
+from vtbdrake.testbed.scenario_identity import ScenarioError
 
 T = TypeVar("T")
 # The name of an entry in a message: criteria[a], or qualities[0].
@@ -49,7 +49,7 @@ class Lines:
             raise ValueError(f"line {self._names[name]}: {error}") from error
 
     def message(self, error: object) -> str:
-        """Return an error with the file, and its line or that of the first text of the file that it mentions."""
+        """Return an error with the file, and its line or the line of the first text of the file that it mentions."""
         text = str(error)
         if text.startswith("line "):
             return f"{self._path}: {text}"
@@ -87,7 +87,6 @@ def read_settings(kind: type[T], path: Path, *, noun: str, example: str, error: 
     Raises:
         ValueError: The file does not exist or is not YAML, or a key or value in it is not possible.
     """
-    resolve_types(kind)
     try:
         node = compose_yaml(path, kind=noun, loader=Loader)
     except ScenarioError as cause:
@@ -105,10 +104,22 @@ def read_settings(kind: type[T], path: Path, *, noun: str, example: str, error: 
 
 
 def scenario_beside(path: Path, scenario: str) -> str:
-    """Return the name of a scenario that a file names; a file of the scenario is looked for beside that file."""
-    name, at, file = scenario.partition("@")
+    """Return the name of a scenario that a file names; a file of the scenario is looked for beside that file.
+
+    A short name becomes ``package.module:Class``, whose module has to be trusted.
+
+    Args:
+        path: The file that names the scenario.
+        scenario: The name in it: ``package.module:Class``, or a short one, with ``@file.yaml`` behind it for a file.
+
+    Raises:
+        ScenarioError: It is named by its Python file.
+    """
+    if (module := file_name(scenario)) is not None:
+        raise ScenarioError(f"a file names a scenario as package.module:Class, not {scenario}: try {module.stem}:CLASS")
+    name, at, file = full_name(scenario).partition("@")
     beside = path.parent / file.partition("#")[0]
-    return f"{name}@{path.parent / file}" if at and beside.exists() else scenario
+    return f"{name}@{path.parent / file}" if at and beside.exists() else f"{name}{at}{file}"
 
 
 class Loader(yaml.SafeLoader):
@@ -123,16 +134,14 @@ Loader.add_implicit_resolver(
 
 def _typed(hint: Any, content: Any, name: str, error: type[ValueError]) -> Any:
     """Return content of a file with dataclasses where the type of its field has them, and texts as keys."""
-    kind: Any
-    for kind in get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,):
-        if is_dataclass(kind):
+    for kind in alternatives(hint):
+        if is_dataclass_type(kind):
             types = field_types(kind)
             if not isinstance(content, Mapping):
                 raise error(f"{name} is a mapping of {', '.join(types)}, not {content!r}")
             # A key without content is left out.
             values = {key: value for key, value in content.items() if value is not None}
-            fill: Any = kind
-            return fill(**{k: _typed(types[k], v, f"{name}.{k}".lstrip("."), error) for k, v in values.items()})
+            return kind(**{k: _typed(types[k], v, f"{name}.{k}".lstrip("."), error) for k, v in values.items()})
         if get_origin(kind) is dict and isinstance(content, Mapping):
             inner = get_args(kind)[1]
             # {} may be left out, too.

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, InputPort, OutputPort, PortDataType
 
-from vtbdrake.argument_checks import as_array
+from vtbdrake.common.argument_checks import as_array
+from vtbdrake.state.variables import html_table
 
 
 class SignalError(ValueError):
@@ -26,10 +27,13 @@ class Signal:
     Attributes:
         name: Name of the signal's port, in the DPS, in the simulated world and on the machine.
         size: Number of entries of a vector signal; None for an abstract one.
-        model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector signal. The
-            size of a model image is that of all images; a model image of size zero allows any.
+        model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector signal. All
+            images have the size of the model image; a model image of size zero allows any.
         unit: SI unit of all entries; ``"1"`` for numbers without a unit.
         lower, upper: Limits of the entries, scalars or arrays of shape (size,).
+        entry_names: Short names of the entries of a vector signal, such as joints' names; empty if they have none.
+        values: The values that an entry can have, if it is one of an enumeration: numbers, or an ``IntEnum``, whose
+            names errors tell. The limits are by default the least and the largest of them. None: all within the limits.
         rate: Limit of the first derivative by time, a scalar or shape (size,).
         acceleration: Limit of the second derivative by time, a scalar or shape (size,).
         max_age: Largest age in seconds; an older sample is stale. A command u that a bridge received returns to its
@@ -49,13 +53,16 @@ class Signal:
     max_age: float = inf
     idle: Any = None
     default: ArrayLike | None = None
+    values: Iterable[float] | None = None
+    entry_names: Sequence[str] = ()
 
     def __repr__(self) -> str:
         """Show the fields that differ from the defaults."""
         shown = [repr(self.name)]
         for item in fields(self)[1:]:
             value = getattr(self, item.name)
-            if not (np.ndim(value) == 0 and isinstance(value, type(item.default)) and value == item.default):
+            is_plain = np.ndim(value) == 0 or isinstance(value, tuple)
+            if not (is_plain and isinstance(value, type(item.default)) and value == item.default):
                 text = f"<{type(value).__name__}>" if item.name == "model_value" else _brief(value)
                 shown.append(f"{item.name}={text}")
         return f"Signal({', '.join(shown)})"
@@ -71,12 +78,39 @@ class Signal:
             self._check_vector()
         else:
             self._check_abstract()
+        self._take_entry_names()
         if not isinstance(self.max_age, int | float | np.number) or not self.max_age > 0:
             raise SignalError(f"signal {self.name}: max_age must be positive, in s, not {self.max_age!r}")
+
+    def _take_entry_names(self) -> None:
+        names = tuple(self.entry_names)
+        if isinstance(self.entry_names, str) or not all(isinstance(name, str) for name in names):
+            raise SignalError(f"signal {self.name}: its entry_names are texts, not {self.entry_names!r}")
+        if names and len(names) != self.size:
+            raise SignalError(f"signal {self.name} has {self.size or 'no'} entries, but {len(names)} entry_names")
+        object.__setattr__(self, "entry_names", names)
+
+    def _take_values(self) -> None:
+        if self.values is None:
+            return
+        try:
+            values = tuple(self.values)
+            numbers = as_array(f"signal {self.name}: its values", values)
+        except (TypeError, ValueError):
+            raise SignalError(
+                f"signal {self.name}: its values are numbers, or an IntEnum, not {self.values!r}"
+            ) from None
+        if numbers.ndim != 1 or not numbers.size or not np.isfinite(numbers).all():
+            raise SignalError(f"signal {self.name}: its values are finite numbers, at least one, not {self.values!r}")
+        object.__setattr__(self, "values", values)
+        for name, unlimited, end in (("lower", -inf, min(values)), ("upper", inf, max(values))):
+            if np.ndim(limit := getattr(self, name)) == 0 and limit == unlimited:
+                object.__setattr__(self, name, float(end))
 
     def _check_vector(self) -> None:
         if not isinstance(self.size, int | np.integer) or isinstance(self.size, bool) or self.size < 1:
             raise SignalError(f"signal {self.name} must have at least one entry, not {self.size!r}")
+        self._take_values()
         for name in ("lower", "upper", "rate", "acceleration", "idle", "default"):
             value = getattr(self, name)
             if value is None and name in ("idle", "default"):
@@ -102,9 +136,15 @@ class Signal:
                 raise SignalError(
                     f"signal {self.name}: its {name} {value} lies outside its limits, {self.lower} to {self.upper}"
                 )
+            if value is not None and (index := self.foreign_entry(value)) is not None:
+                raise SignalError(
+                    f"signal {self.name}: its {name} {np.ravel(value)[index]:g} is not one of its values, "
+                    f"{self.values_text()}"
+                )
 
     def _check_abstract(self) -> None:
-        for name, nothing in (("lower", -inf), ("upper", inf), ("rate", inf), ("acceleration", inf), ("default", None)):
+        nothings = {"lower": -inf, "upper": inf, "rate": inf, "acceleration": inf, "default": None, "values": None}
+        for name, nothing in nothings.items():
             value = getattr(self, name)
             if value is not None and not (np.ndim(value) == 0 and value == nothing):
                 raise SignalError(f"signal {self.name} is abstract: only a vector has a {name}")
@@ -127,6 +167,22 @@ class Signal:
         """Return the default of a command as an array of shape (size,)."""
         return self.vector(0.0 if self.default is None else self.default)
 
+    def foreign_entry(self, value: ArrayLike) -> int | None:
+        """Return the index of the first entry that is not one of ``values``; None if all are, or if all may be."""
+        if self.values is None:
+            return None
+        foreign = ~np.isin(np.ravel(np.asarray(value, dtype=float)), np.array(list(self.values), dtype=float))
+        return int(np.argmax(foreign)) if foreign.any() else None
+
+    @property
+    def choices(self) -> tuple[tuple[float, str], ...]:
+        """Return the values that an entry can have, each with its name in an enumeration, if it has one."""
+        return tuple((float(value), str(getattr(value, "name", "")).lower()) for value in self.values or ())
+
+    def values_text(self) -> str:
+        """Return the values that an entry can have as text, with the names of an enumeration: ``0 (follow), 1``."""
+        return ", ".join(f"{value:g} ({name})" if name else f"{value:g}" for value, name in self.choices)
+
     def abstract_value(self) -> AbstractValue:
         """Return a new container of the signal's abstract type."""
         return Value(self.model_value)
@@ -144,6 +200,8 @@ class Signal:
                 raise SignalError(
                     f"signal {self.name}: entry {int(np.argmax(np.isnan(array)))} is NaN: do not feed unknown values"
                 )
+            if (index := self.foreign_entry(array)) is not None:
+                raise SignalError(f"signal {self.name} is one of {self.values_text()}, not {float(array[index])}")
             return
         model = self.abstract_value().get_value()
         if not isinstance(value, type(model)):
@@ -152,7 +210,12 @@ class Signal:
             raise SignalError(f"signal {self.name} carries images of {_pixels(model)}, not one of {_pixels(value)}")
 
     def check_port(self, port: InputPort | OutputPort, owner: str) -> None:
-        """Raise a SignalError if ``port`` of the system ``owner`` cannot carry this signal."""
+        """Raise a SignalError if ``port`` of the system ``owner`` cannot carry this signal.
+
+        Args:
+            port: The port that shall carry the signal.
+            owner: Name of the port's system, for the message.
+        """
         is_vector = port.get_data_type() == PortDataType.kVectorValued
         if is_vector != self.is_vector:
             kinds = {True: "vector", False: "abstract"}
@@ -175,7 +238,7 @@ class Signal:
             if _ANY_SIZE not in (_pixels(expected), _pixels(actual)) and _pixels(expected) != _pixels(actual):
                 raise SignalError(
                     f"signal {self.name} carries images of {_pixels(expected)}, but the port {port.get_name()} of "
-                    f"{owner} those of {_pixels(actual)}: give a model_value of that size"
+                    f"{owner} images of {_pixels(actual)}: give a model_value of that size"
                 )
 
 
@@ -205,7 +268,8 @@ class Interface:
             value is the variable ``u.<name>`` of the testbed.
 
     Raises:
-        SignalError: Two signals have one name, an actuator signal has no idle value, or a command is abstract.
+        SignalError: Two signals have one name, an actuator signal has no idle value, or a command is abstract or has a
+            default that is not one of its values.
     """
 
     sense: Sequence[Signal]
@@ -232,10 +296,20 @@ class Interface:
         for signal in self.commands:
             if not signal.is_vector:
                 raise SignalError(f"command {signal.name} is abstract; a command is a vector (give size=)")
+            if signal.foreign_entry(signal.default_vector()) is not None:
+                raise SignalError(
+                    f"command {signal.name} is one of {signal.values_text()}: give default=, which is 0 otherwise"
+                )
 
     def __repr__(self) -> str:
         sides = {item.name: ", ".join(signal.name for signal in getattr(self, item.name)) for item in fields(self)}
         return f"Interface({', '.join(f'{side}=[{names}]' for side, names in sides.items())})"
+
+    def _repr_html_(self) -> str:
+        """Show the signals in a notebook."""
+        sides = (("sensor", self.sense), ("actuator", self.act), ("command", self.commands))
+        signals = [(kind, signal.name, str(signal.size or ""), signal.unit) for kind, side in sides for signal in side]
+        return html_table([("signal", "name", "size", "unit"), *signals])
 
     @staticmethod
     def _refuse_twins(signals: Sequence[Signal], kind: str) -> None:
@@ -250,6 +324,10 @@ class Feed:
 
     After the first call, a value is changed in place, which takes one or two microseconds. `GetMutableData` must be
     called before each change, to invalidate caches; the view of a vector's numbers can be kept.
+
+    Args:
+        ports: By name, the signal and its input port.
+        context: The context of the ports' system.
     """
 
     def __init__(self, ports: Mapping[str, tuple[Signal, InputPort]], context: Context) -> None:

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, Diagram, DiscreteStateIndex, EventStatus, InputPort, State
 
-from vtbdrake.arrays import immutable
+from vtbdrake.common.arrays import immutable
+from vtbdrake.drake_workarounds.event_times import SAMPLED_EARLY, SHOWN_EARLY
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.codecs import array_codec, codec_of
 from vtbdrake.state.declarations import weakly
@@ -50,7 +51,7 @@ class SlowFunction:
     makes: frozenset[str]
 
     def __call__(self, arrays: Arrays) -> dict[str, np.ndarray]:
-        """Return the arrays of the outputs and the memory, for those of the inputs and the memory.
+        """Return the arrays of the outputs and the memory, for the arrays of the inputs and the memory.
 
         If the function returns None for the outputs, there is no result, and no arrays of outputs.
 
@@ -95,6 +96,10 @@ class SlowFunction:
 def encode(values: Mapping[str, Any], codecs: Mapping[str, Codec]) -> dict[str, np.ndarray]:
     """Return the values as read-only arrays of their own.
 
+    Args:
+        values: The values by name; every codec needs one.
+        codecs: The codec of each value, by its name.
+
     Raises:
         SlowPartError: A value is not of its codec's type.
     """
@@ -121,19 +126,30 @@ def _read_only_copy(value: np.ndarray) -> np.ndarray:
 
 
 def decode(arrays: Arrays, name: str, codec: Codec) -> Any:
-    """Return one of the values that the arrays hold."""
+    """Return one of the values that the arrays hold.
+
+    Args:
+        arrays: The arrays by ``name`` or ``name.part``, as `encode` returns them.
+        name: The name of the value.
+        codec: The codec of the value.
+    """
     return codec.decode(parts_of(arrays, name))
 
 
 def parts_of(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
-    """Return the arrays of one value, by part; empty if it is not there."""
+    """Return the arrays of one value, by part; empty if it is not there.
+
+    Args:
+        arrays: The arrays by ``name`` or ``name.part``, as `encode` returns them.
+        name: The name of the value.
+    """
     prefix = f"{name}."
     parts = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
     return {"": arrays[name]} if name in arrays else parts
 
 
 def split_memory(arrays: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
-    """Return the arrays of the memory and those of the outputs in a result."""
+    """Return the arrays of the memory and the arrays of the outputs in a result."""
     memory = {name: array for name, array in arrays.items() if name.partition(".")[0] == MEMORY}
     return memory, {name: array for name, array in arrays.items() if name not in memory}
 
@@ -184,6 +200,10 @@ class Progress:
 
         The memory of the result is always used, its outputs only if they are awaited. A result without outputs is
         missing.
+
+        Args:
+            tick: The number of the sample.
+            arrays: The arrays of the result: its outputs, and its memory, if it has one.
         """
         memory, outputs = split_memory(arrays)
         result = Work(tick, WorkStatus.DONE if outputs else WorkStatus.MISSING, outputs)
@@ -192,7 +212,12 @@ class Progress:
         return replace(self, memory=memory or self.memory, under_way=under_way)
 
     def after(self, work: Work, shown: Arrays) -> Progress:
-        """Return the progress after ``work`` was due, with the arrays that are shown now."""
+        """Return the progress after ``work`` was due, with the arrays that are shown now.
+
+        Args:
+            work: The sample whose result was due; it and all earlier ones are under way no more.
+            shown: The arrays of the abstract outputs from now on.
+        """
         return replace(self, shown=shown, under_way=tuple(w for w in self.under_way if w.tick > work.tick))
 
 
@@ -213,16 +238,72 @@ PROGRESS_CODEC = Codec(_encode, _decode)
 
 
 MOST_UNDER_WAY = 16
-# Drake sometimes skips a periodic event with an offset when a simulation is advanced to exactly its time, because
-# (t - offset) / period is rounded up. Events that are a little early are not skipped, and results are there in time.
-# It also skips an event that is due the last bit of a number after another one: so results are shown before samples of
-# the same instant are taken, by more than that.
-_EARLY = 1e-8  # s
-_SHOWN_EARLY = 2e-8  # s
 _SHORTEST = 1e-6  # s
-_SAMPLED_AT, _VALID, _MISSED = "sampled_at", "valid", "missed"
-_REQUEST, _TAKEN, _DPS = "request", "taken", "dps"
+_SAMPLED_AT = "sampled_at"
+_VALID = "valid"
+_MISSED = "missed"
+_REQUEST = "request"
+_TAKEN = "taken"
+_DPS = "dps"
 _RESERVED = ("tick", MEMORY, _SAMPLED_AT, _VALID, _MISSED, _REQUEST, _TAKEN, _DPS)
+
+
+@dataclass(frozen=True)
+class _Signature:
+    """What the function of a slow part takes and returns: sizes or model values, by name, and their codecs.
+
+    Attributes:
+        inputs: What arrives by input ports; the request is one of them.
+        outputs: What is returned.
+        memory: The initial memory under its name; empty if there is none.
+        codecs: The codec of each of these.
+        samples_dps: Whether the function also gets the state of the whole DPS.
+    """
+
+    inputs: Mapping[str, Any]
+    outputs: Mapping[str, Any]
+    memory: Mapping[str, Any]
+    codecs: Mapping[str, Codec]
+    samples_dps: bool
+
+    def slow_function(self, function: Callable[..., Any], *, makes: frozenset[str]) -> SlowFunction:
+        inputs, outputs, memory = (
+            {name: self.codecs[name] for name in names} for names in (self.inputs, self.outputs, self.memory)
+        )
+        if self.samples_dps:
+            inputs[_DPS] = DPS_STATE_CODEC
+        return SlowFunction(function, inputs, outputs, memory, makes)
+
+    def first_outputs(self, initial: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Return the arrays of the outputs until the first result."""
+        first = {name: np.zeros(model) if _is_size(model) else model for name, model in self.outputs.items()}
+        return encode({**first, **initial}, {name: self.codecs[name] for name in self.outputs})
+
+    def first_memory(self) -> dict[str, np.ndarray]:
+        """Return the arrays of the memory that the first call begins with."""
+        return encode(self.memory, {name: self.codecs[name] for name in self.memory})
+
+
+def _signature(
+    inputs: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+    memory: Any,
+    initial: Mapping[str, Any],
+    codecs: Mapping[str, Codec],
+    *,
+    on_request: bool,
+    samples_dps: bool,
+) -> _Signature:
+    """Return the signature by the arguments of `SlowPart`, checked."""
+    memories = {} if memory is None else {MEMORY: memory}
+    models = {**inputs, **outputs, **memories}
+    coded = {name: models.get(name) for name in codecs}
+    _check_names(inputs, outputs, initial, coded, on_request or samples_dps)
+    codecs_by_name = {name: codecs.get(name) or _codec(name, model) for name, model in models.items()}
+    if on_request:
+        inputs = {**inputs, _REQUEST: 1}
+        codecs_by_name[_REQUEST] = array_codec((1,))
+    return _Signature(inputs, outputs, memories, codecs_by_name, samples_dps)
 
 
 class SlowPart(AddressedSystem):
@@ -299,47 +380,25 @@ class SlowPart(AddressedSystem):
     ) -> None:
         super().__init__()
         _check_times(period, latency, offset, patience)
-        most = 1 if samples_dps else MOST_UNDER_WAY
         if not on_request:
-            _check_under_way(period, latency, offset, most)
-        models = {**inputs, **outputs, **({} if memory is None else {MEMORY: memory})}
-        special = {**({_REQUEST: 1} if on_request else {}), **({_DPS: RootReference()} if samples_dps else {})}
-        _check_names(inputs, outputs, initial or {}, {name: models.get(name) for name in codecs or {}}, bool(special))
+            _check_under_way(period, latency, offset, 1 if samples_dps else MOST_UNDER_WAY)
+        signature = _signature(
+            inputs, outputs, memory, initial or {}, codecs or {}, on_request=on_request, samples_dps=samples_dps
+        )
+        shown, remembered = signature.first_outputs(initial or {}), signature.first_memory()
         self.period, self.latency, self.offset, self.patience = period, latency, offset, patience
-        codecs_by_name = {name: (codecs or {}).get(name) or _codec(name, model) for name, model in models.items()}
-        taken = {name: codecs_by_name[name] for name in inputs}
-        if on_request:
-            inputs = {**inputs, _REQUEST: 1}
-            taken[_REQUEST] = array_codec((1,))
-        if samples_dps:
-            taken[_DPS] = DPS_STATE_CODEC
-        made = {name: codecs_by_name[name] for name in outputs}
-        remembered = {MEMORY: codecs_by_name[MEMORY]} if MEMORY in codecs_by_name else {}
-        first = {name: np.zeros(model) if _is_size(model) else model for name, model in outputs.items()}
-        shown = encode({**first, **(initial or {})}, made)
-        remembers = encode({MEMORY: memory}, remembered)
-        self.function = SlowFunction(function, taken, made, remembered, frozenset({*shown, *remembers}))
-        self._inputs = {name: self._declare_input(name, model) for name, model in inputs.items()}
-        self._request = self._inputs.get(_REQUEST)
         self.samples_dps = samples_dps
+        self.function = signature.slow_function(function, makes=frozenset({*shown, *remembered}))
+        self._inputs = {name: self._declare_input(name, model) for name, model in signature.inputs.items()}
+        self._request = self._inputs.get(_REQUEST)
         self._root = self._declare_input(_DPS, RootReference()) if samples_dps else None
         self._read_dps: DpsReader | None = None
-        sizes = {name: model for name, model in outputs.items() if _is_size(model)}
-        vectors = {name: Quantity(shown.pop(name) if n > 1 else shown.pop(name).item()) for name, n in sizes.items()}
-        report = {
-            _SAMPLED_AT: Quantity(-inf, "s"),
-            _VALID: Quantity(0.0, bounds=(0.0, 1.0)),
-            _MISSED: Quantity(0.0, bounds=(0.0, inf)),
-            **({_TAKEN: Quantity(0.0)} if on_request else {}),
-        }
-        self._vectors = tuple(vectors)
-        self._indices = {
-            name: int(self.declare_discrete_state(**{name: quantity}).index)
-            for name, quantity in {**vectors, **report}.items()
-        }
-        self._progress = self.DeclareAbstractState(Value(Progress(shown, remembers)))
+        self._vectors = tuple(name for name, model in outputs.items() if _is_size(model))
+        first_vectors = {name: shown.pop(name) for name in self._vectors}
+        self._indices = self._declare_numbers(first_vectors, on_request=on_request)
+        self._progress = self.DeclareAbstractState(Value(Progress(shown, remembered)))
         for name, model in outputs.items():
-            if name not in sizes:
+            if name not in self._vectors:
                 self._declare_abstract_output(name, model)
         for name, index in self._indices.items():
             self.DeclareStateOutputPort(name, DiscreteStateIndex(index))
@@ -356,6 +415,20 @@ class SlowPart(AddressedSystem):
         if _is_size(model):
             return self.DeclareVectorInputPort(name, model)
         return self.DeclareAbstractInputPort(name, Value(model))
+
+    def _declare_numbers(self, vectors: Arrays, *, on_request: bool) -> dict[str, int]:
+        """Declare a group of discrete state for each vector output and each number about the results; return them."""
+        quantities = {name: Quantity(first if len(first) > 1 else first.item()) for name, first in vectors.items()}
+        quantities |= {
+            _SAMPLED_AT: Quantity(-inf, "s"),
+            _VALID: Quantity(0.0, bounds=(0.0, 1.0)),
+            _MISSED: Quantity(0.0, bounds=(0.0, inf)),
+        }
+        if on_request:
+            quantities[_TAKEN] = Quantity(0.0)
+        return {
+            name: int(self.declare_discrete_state(**{name: quantity}).index) for name, quantity in quantities.items()
+        }
 
     def _declare_abstract_output(self, name: str, model: Any) -> None:
         codec = self.function.outputs[name]
@@ -458,12 +531,12 @@ class SlowPart(AddressedSystem):
     # -- results from outside
 
     def sampled(self, tick: int) -> float:
-        """Return when sample number ``tick`` is taken, in seconds: just before its time, but not before 0."""
-        return max(0.0, self.offset - _EARLY) + tick * self.period
+        """Return the time at which sample ``tick`` is taken, in seconds: just before its instant, not before 0."""
+        return max(0.0, self.offset - SAMPLED_EARLY) + tick * self.period
 
     def due(self, tick: int) -> float:
-        """Return when the result of sample number ``tick`` is shown, in seconds: just before a latency has passed."""
-        return self.offset + self.latency - _SHOWN_EARLY + tick * self.period
+        """Return the time at which the result of sample ``tick`` is shown, in s: just before a latency has passed."""
+        return self.offset + self.latency - SHOWN_EARLY + tick * self.period
 
     def waiting(self, context: Context) -> dict[int, Arrays]:
         """Return the samples whose results have neither arrived nor been declared missing, by tick, in order.

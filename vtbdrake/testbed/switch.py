@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
@@ -28,7 +29,7 @@ from pydrake.systems.primitives import Adder, ConstantValueSource, Gain, PortSwi
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from vtbdrake.state.declarations import DISCRETE, NO_DICT, AddressedSystem, Codec, Element
-from vtbdrake.state.systems import leaf_variables
+from vtbdrake.state.systems import class_for_float, leaf_variables
 from vtbdrake.state.variables import Variable, VariableError, X
 from vtbdrake.testbed.signal import Interface, Signal
 
@@ -54,10 +55,14 @@ class Position(StrEnum):
 SENSE_POSITIONS = (Position.SIM, Position.REAL)
 ACT_POSITIONS = tuple(Position)
 
-T_SENSE, T_ACT, COMMAND, BOARD = "T_sense.", "T_act.", "u.", "switches"
+T_SENSE = "T_sense."
+T_ACT = "T_act."
+COMMAND = "u."
+BOARD = "switches"
 
 
-@TemplateSystem.define("SwitchBoard_")  # type: ignore[untyped-decorator]
+# The scope is named, because Drake would look for it in the stack of all callers, which takes time.
+@TemplateSystem.define("SwitchBoard_", scope=sys.modules[__name__])  # type: ignore[untyped-decorator]
 def SwitchBoard_(T: type) -> type:
     """Make the class `SwitchBoard` for the scalar type ``T``.
 
@@ -102,7 +107,7 @@ def SwitchBoard_(T: type) -> type:
     return Impl
 
 
-SwitchBoard = SwitchBoard_[None]
+SwitchBoard = class_for_float(SwitchBoard_)
 _POSITION_CODEC = Codec(
     encode=lambda port: {"port": np.array(int(port))}, decode=lambda arrays: InputPortIndex(int(arrays["port"]))
 )
@@ -123,6 +128,13 @@ class Selector:
     """The position of one switch: abstract state ``index`` of the switch board.
 
     ``flag`` is its entry in the board's ``active``; None for a sensor signal.
+
+    Args:
+        board: The switch board.
+        name: The address of the switch.
+        positions: The positions that it has.
+        index: The number of its abstract state.
+        flag: Its entry in the board's ``active``; None for a sensor signal.
     """
 
     def __init__(self, board: System, name: str, positions: Sequence[Position], index: int, flag: int | None) -> None:
@@ -138,7 +150,12 @@ class Selector:
         return self._positions[int(port) - 1]
 
     def set(self, context: Context, position: Position) -> None:
-        """Set the position in a context of the testbed."""
+        """Set the position in a context of the testbed.
+
+        Args:
+            context: A root context of the testbed, which is changed.
+            position: The position; an actuator signal commands the machine in all but `Position.SIM`.
+        """
         board = self._board.GetMyMutableContextFromRoot(context)
         board.SetAbstractState(self._index, position.port)
         if self._flag is not None:
@@ -164,6 +181,7 @@ class Selector:
             lambda context, value: self.set(context, self._positions[int(value)]),
             bounds=(0.0, len(self._positions) - 1.0),
             refuse=refuse,
+            choices=tuple((float(position.number), str(position)) for position in self._positions),
         )
 
 
@@ -203,13 +221,28 @@ class CommandBoard:
             yield self.variable(f"{COMMAND}{name}", index, by_name[name])
 
     def variable(self, address: str, index: int, signal: Signal) -> Variable:
-        """Return the constant ``index`` of the board as a variable with the unit and bounds of a signal."""
+        """Return the constant ``index`` of the board as a variable with the unit and bounds of a signal.
+
+        Args:
+            address: The address of the variable.
+            index: The number of the constant among the board's groups of discrete state.
+            signal: The signal, with the size, unit, bounds and allowed values of the constant.
+        """
         size = signal.vector(0.0).size
         shape = () if size == 1 else (size,)
         bounds = (signal.vector(signal.lower).reshape(shape), signal.vector(signal.upper).reshape(shape))
         element = Element("", DISCRETE, index, shape, unit=signal.unit, bounds=bounds)
         (variable,) = leaf_variables(address, self.system, declared=[element])
-        return variable
+        variable = replace(variable, entry_names=tuple(signal.entry_names), choices=signal.choices)
+        if signal.values is None:
+            return variable
+
+        def refuse(value: np.ndarray) -> None:
+            if (index := signal.foreign_entry(value)) is not None:
+                entry = f"{address}[{index}]" if shape else address
+                raise VariableError(f"{entry} is one of {signal.values_text()}, not {float(np.ravel(value)[index])}")
+
+        return replace(variable, refuse=refuse)
 
 
 class Switches:
@@ -230,6 +263,11 @@ class Switches:
         u: Default values of the constant commands, by signal.
         guarded: The actuator signals whose commands are checked before they enter the simulated world -> whether they
             enter a plant, which refuses NaN itself.
+        builder: The DiagramBuilder that gets them.
+        interface: The signals of the DPS.
+        sense_position: The initial position of T_sense.
+        act_position: The initial position of T_act.
+        dps: The data processing system.
     """
 
     def __init__(
@@ -366,6 +404,10 @@ class AbstractSwitch(AddressedSystem):
         - ...
         output_ports:
         - value
+
+    Args:
+        signal: The signal.
+        count: The number of inputs.
     """
 
     def __init__(self, signal: Signal, count: int) -> None:
@@ -398,6 +440,10 @@ class ActuatorGate(AddressedSystem):
         - command
         output_ports:
         - value
+
+    Args:
+        signal: The actuator signal.
+        closed: The port of the switch at which the command is empty.
     """
 
     def __init__(self, signal: Signal, *, closed: InputPortIndex) -> None:

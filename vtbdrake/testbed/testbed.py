@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import ceil, inf
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.argument_checks import as_number
-from vtbdrake.failures import FAILURES
+from vtbdrake import upper_layers
+from vtbdrake.common.argument_checks import as_number
+from vtbdrake.common.failures import FAILURES
+from vtbdrake.drake_workarounds.cenic import CenicSimulator
 from vtbdrake.state import Snapshot, SnapshotError, Variable, Variables
 from vtbdrake.state import snapshot as snapshots
 from vtbdrake.testbed.addressed import AddressedDiagram, WatchedSimulator
@@ -22,12 +24,11 @@ from vtbdrake.testbed.signal import SignalError
 from vtbdrake.testbed.switch import ACT_POSITIONS, SENSE_POSITIONS, Position
 
 if TYPE_CHECKING:
-    from vtbdrake.compiled import CompiledRollouts
     from vtbdrake.testbed.builder import VirtualTestbedBuilder
     from vtbdrake.testbed.scenario import Scenario
     from vtbdrake.testbed.signal import Interface
     from vtbdrake.testbed.switch import Switches
-    from vtbdrake.web import View
+    from vtbdrake.upper_layers import CompiledRollouts, View
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,14 @@ class BeliefRule:
 
     ``period`` is the sample period of the estimates in seconds, 0 if they are computed at any time. If it is given,
     ``by`` gets the keyword ``late``, see `late`, to extrapolate the targets to the present.
+
+    Attributes:
+        targets: Addresses in sim that are set.
+        of: Addresses of the estimates in dps.
+        by: Returns the targets' values from the estimates; None: the estimate itself.
+        age: The age of the estimates, in seconds.
+        period: The sample period of the estimates, in seconds; 0 if they are computed at any time, None if ``by`` does
+            not extrapolate.
 
     Raises:
         ValueError: There are several estimates and no ``by``; ``age`` or ``period`` is negative or infinite; or there
@@ -152,6 +161,12 @@ def wanted_positions(
 ) -> tuple[dict[str, Position], dict[str, Position]]:
     """Return the wanted positions of the sensor and of the actuator signals, by signal.
 
+    Args:
+        interface: The interface of the DPS, which names the signals.
+        mode: ``sim``, ``real``, ``shadow`` or ``twin``, for all switches; None: by ``sense`` and ``act``.
+        sense: ``sim`` or ``real`` for all sensor signals, or by signal; None: no change.
+        act: ``sim``, ``real`` or ``twin`` for all actuator signals, or by signal; None: no change.
+
     Raises:
         ValueError: The mode, a signal or a position is unknown, or there are a mode and positions.
     """
@@ -178,25 +193,50 @@ def wanted_positions(
     return sides[0], sides[1]
 
 
-class _GuardedSimulator(WatchedSimulator):
-    """Drake's Simulator, which names the actuator command that the guard before the world has refused."""
+class _NamingSimulator(WatchedSimulator):
+    """Drake's Simulator, which names the actuator command that a guard before the world, or a plant, has refused."""
 
     def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
         super().__init__(testbed, context)
         self._testbed = testbed
 
     def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
-        try:
+        with _refused_command(self._testbed, self):
             return super().AdvanceTo(boundary_time, interruptible)
-        except (ValueError, RuntimeError) as error:  # of the guard, of a plant
-            named = self._testbed.named_command(self.get_context(), error)
-            if named is error:
-                raise
-            raise named from error
+
+
+class _NamingCenicSimulator(CenicSimulator):
+    """The same for CENIC: a class in Python has one base of Drake's."""
+
+    def __init__(self, testbed: VirtualTestbed, context: Context) -> None:
+        super().__init__(testbed.diagram, context)
+        self._testbed = testbed
+
+    def AdvanceTo(self, boundary_time: float, interruptible: bool = True) -> SimulatorStatus:
+        with _refused_command(self._testbed, self):
+            return super().AdvanceTo(boundary_time, interruptible)
+
+
+@contextmanager
+def _refused_command(testbed: VirtualTestbed, simulator: Simulator) -> Iterator[None]:
+    """Raise a SignalError with the name of a command that is not finite, instead of what it has caused."""
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        named = testbed.named_command(simulator.get_context(), error)
+        if named is error:
+            raise
+        raise named from error
 
 
 class VirtualTestbed(AddressedDiagram):
     """A DPS in one Diagram with the simulated world around it, behind switches.
+
+    Args:
+        parts: The builder, with the parts.
+        switches: The switches between them.
+        commands: The variables of the constant commands.
+        scenario: The scenario that built it, or None.
 
     Attributes:
         diagram: Input ports ``real.sense.<signal>``; output ports ``real.act.<signal>`` and ``real.act.active`` (1
@@ -211,6 +251,8 @@ class VirtualTestbed(AddressedDiagram):
         visualized: True if the testbed draws into a Meshcat.
         guarded: True if vector commands that are not finite are refused before they enter the simulated world.
     """
+
+    scenario: Scenario | None
 
     def __init__(
         self,
@@ -250,15 +292,15 @@ class VirtualTestbed(AddressedDiagram):
 
     def _repr_html_(self) -> str:
         """Show Figure 4 in a notebook, with the switches as they were built."""
-        from vtbdrake.visualization.diagram import svg
-
-        return svg(self)
+        return upper_layers.svg(self)
 
     def _bare_simulator(self, context: Context) -> Simulator:
-        return _GuardedSimulator(self, context) if self.guarded else super()._bare_simulator(context)
+        if self.simulator_config.integration_scheme == "cenic":
+            return _NamingCenicSimulator(self, context)
+        return _NamingSimulator(self, context)
 
     def named_command(self, context: Context, error: Exception) -> Exception:
-        """Return why a simulation failed: a command of the DPS that is not finite, by its name, or else ``error``.
+        """Return the reason why a simulation failed: a command of the DPS that is not finite, by name, or ``error``.
 
         Args:
             context: The root context where the simulation stands.
@@ -353,9 +395,7 @@ class VirtualTestbed(AddressedDiagram):
             ValueError: An address does not exist, or cannot be varied.
             CompilerError: ``compile`` is True, and there is no C compiler, or it fails.
         """
-        from vtbdrake.compiled import CompiledRollouts
-
-        return CompiledRollouts(
+        return upper_layers.CompiledRollouts(
             self.diagram,
             self.variables(),
             self.default_context() if context is None else context,
@@ -369,7 +409,7 @@ class VirtualTestbed(AddressedDiagram):
             workers=workers,
         )
 
-    def view(self, context: Context | None = None, **options: Any) -> View:
+    def view(self, context: Context | None = None, **options: Any) -> View[Any]:
         """Run a copy of this testbed in the background, with a web page where it is watched and steered.
 
         Args:
@@ -379,16 +419,18 @@ class VirtualTestbed(AddressedDiagram):
         Raises:
             ValueError: The testbed was built without a scenario, or as `vtbdrake.web.view` raises it.
         """
-        from vtbdrake.web import view
-
         if self.scenario is None:
             raise ValueError("this testbed was built without a scenario, so that no copy of it can be built")
-        return view(self.scenario, start=None if context is None else self.snapshot(context), **options)
+        return upper_layers.view(self.scenario, start=None if context is None else self.snapshot(context), **options)
 
     # -- s(t) as a whole
 
     def restore(self, context: Context, snapshot: Snapshot) -> None:
         """Make ``context`` continue from ``snapshot``: s_sim(t0) from a file.
+
+        Args:
+            context: A root context of this testbed, which is changed.
+            snapshot: A snapshot of a testbed of the same scenario.
 
         Raises:
             SnapshotError: The snapshot is of another scenario, or of a testbed that is built in another way.
@@ -417,7 +459,7 @@ class VirtualTestbed(AddressedDiagram):
         self.write(context, self.belief(context))
 
     def belief(self, context: Context) -> dict[str, ArrayLike]:
-        """Return what the DPS in ``context`` believes of the simulated world: values of its variables, by address.
+        """Return the values of the simulated world's variables that the DPS in ``context`` believes, by address.
 
         An estimate beyond the bounds of its target (a joint a little past its stop) is clipped.
 
@@ -430,7 +472,11 @@ class VirtualTestbed(AddressedDiagram):
         return self.belief_of(estimates, time=context.get_time())
 
     def belief_of(self, estimates: Mapping[str, Any], *, time: float) -> dict[str, ArrayLike]:
-        """Return what a DPS with these estimates (by address) believes of the simulated world at ``time`` (s).
+        """Return the values of the world's variables that a DPS with these estimates believes at ``time`` (s).
+
+        Args:
+            estimates: Values of the estimates of the DPS, by the addresses that `VirtualTestbedBuilder.believe` names.
+            time: The time for which the world is believed, in seconds; estimates that are late are older.
 
         Raises:
             ValueError: The testbed declares no belief, or there is none at present.

@@ -4,6 +4,6 @@
 also where nothing of Drake is tested.
 """
 
-from vtbdrake.lazy import lazy_names
+from vtbdrake.common.lazy_names import attach_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.argument_checks import as_addresses
+from vtbdrake.campaigns.results import least_rate
+from vtbdrake.common.argument_checks import as_addresses
+from vtbdrake.common.failures import error_text
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.statistics import QUANTITIES, LoopStatistics
 from vtbdrake.control.stepping import ChangeKind
 from vtbdrake.control.switching import checked_continuity
-from vtbdrake.failures import error_text
 from vtbdrake.machine import MachineStatistics
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.replay import Target
 from vtbdrake.recording.replay import replay as replay_log
 from vtbdrake.testbed import Signal
 from vtbdrake.testbed.switch import Position
-from vtbdrake.testing.campaign_results import least_rate
 from vtbdrake.testing.failure import fail
 from vtbdrake.testing.trace import ENERGY, Source, Trace, TraceError, trace_of
 
@@ -382,7 +382,7 @@ def _statistics(source: Runtime | LoopStatistics | MachineStatistics) -> LoopSta
 
 
 def _from(trace: Trace, address: str, after: float) -> np.ndarray:
-    """Return which samples have a value and lie at least ``after`` seconds behind the first one, shape (n,)."""
+    """Return a mask (n,) of the samples with a value, at least ``after`` seconds behind the first one."""
     asserted = trace.times - trace.times[:1] >= after - 1e-9
     if address in trace.absent:
         asserted = asserted & ~trace.absent[address]

@@ -7,15 +7,15 @@ from contextlib import AbstractContextManager
 from math import floor
 from typing import Any, Self
 
-from vtbdrake.control.bridge import Bridge, reported_signals
+from vtbdrake.control.bridge import Bridge, Reports
 from vtbdrake.control.clock import Clock, SimulatedClock
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
+from vtbdrake.lcm.lcm_bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.machine import Machine
-from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed, WorldAlone
 
 _REORDER_WINDOW = 0.1  # s, see `LcmBridge`
 _ON_GRID = 1e-6  # of a cycle: a time that close to its beginning belongs to it
@@ -45,15 +45,15 @@ class MachineBridge(Bridge):
         self.cut = self.dead = False
         self.channels = {name: map.channel for map in protocol.sense for name in map.signals}
         self.sensed = {signal.name: ReceivedSignal() for signal in interface.sense}
-        carriers = reported_signals(interface, protocol.reported)
-        self.reported = {name: ReceivedSignal() for name in carriers}
+        reports = Reports(interface, protocol.reported, protocol.robot_mode)
+        self.reported, self.robot_mode = reports.acting, reports.robot_mode
         # Those that come from outside would be published by an operator; here they are written by address.
         self.commands = {}
         self._clock = clock
         self._start = clock.now()
         self._sent_cycle = -1
-        received = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
-        signals = {signal.name: signal for signal in (*interface.sense, *carriers.values())}
+        received = self.sensed | reports.received
+        signals = {signal.name: signal for signal in (*interface.sense, *reports.signals)}
         self._readers = {
             map.channel: ChannelReader(
                 map, [signals[name] for name in map.signals], received, _REORDER_WINDOW, clock=clock.now
@@ -127,6 +127,7 @@ class LockStep(AbstractContextManager["LockStep"]):
         target: The testbed or DPS alone to run; by default a new DPS alone.
         config: The configuration of the machine.
         values: Variables of the target to set before the first cycle, by address.
+        world: The world of the scenario, if it has been built already, see `Machine`.
 
     Attributes:
         machine: The machine; `Machine.begin` injects faults.
@@ -147,8 +148,9 @@ class LockStep(AbstractContextManager["LockStep"]):
         target: DpsAlone | VirtualTestbed | None = None,
         config: MachineConfig | None = None,
         values: Mapping[str, Any] | None = None,
+        world: WorldAlone | None = None,
     ) -> None:
-        self.machine = Machine(scenario, config)
+        self.machine = Machine(scenario, config, world=world)
         self.clock = SimulatedClock()
         self.bridge = MachineBridge(self.machine, self.clock)
         # By the clock: where messages began the cycles, those that fail to come would stop it.

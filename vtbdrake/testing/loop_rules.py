@@ -61,7 +61,7 @@ class LoopRules:
         self._last: dict[str, tuple[float, np.ndarray, int]] = {}  # (time, command, number of the cycle)
         self._left: dict[str, int] = {}  # The cycle in which a signal left real.
         self._on_real: set[str] = set()
-        self._departing: set[str] = set()  # The signals of which nothing has left since they went to real.
+        self._departing: set[str] = set()  # The signals that have sent nothing since they went to real.
         self._latched = False
         bridge.rules = self
         runtime.watch(self._judge_cycle)

@@ -11,11 +11,13 @@ import numpy as np
 from pydrake.systems.framework import System
 from pydrake.systems.primitives import Gain, MatrixGain, ZeroOrderHold
 
-from vtbdrake.failures import error_text
+from vtbdrake.common.failures import error_text
 from vtbdrake.testbed import DpsAlone, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.parts import WorldAlone
 
-SENSE, ACT, WORLD = "sense", "act", "world"
+SENSE = "sense"
+ACT = "act"
+WORLD = "world"
 
 _FOR_EVER = 1e9  # s, the period of a sensor that is stuck
 
@@ -129,7 +131,11 @@ def mutants_of(scenario: Scenario) -> list[Mutant]:
 def mutate(scenario: Scenario, mutant: Mutant) -> Scenario:
     """Return a copy of a scenario in whose simulated world a mistake is made, in this process and in others.
 
-    It is of a subclass of the scenario's class. Of a mutated scenario, it is that scenario.
+    It is of a subclass of the scenario's class. A mutated scenario returns itself.
+
+    Args:
+        scenario: The scenario; it stays as it is.
+        mutant: The mistake, which changes the builder of the simulated world.
     """
     if hasattr(scenario, "mutant"):
         return scenario
@@ -181,7 +187,7 @@ class MutationScore:
 def mutation_score(
     tests: Callable[[Scenario], object] | Iterable[Callable[[Scenario], object]], scenario: Scenario
 ) -> MutationScore:
-    """Return which mutants of a scenario tests notice, as pytest's option ``--vtb-mutants`` does for test files.
+    """Return the score of tests by the mutants of a scenario that they notice, see pytest's ``--vtb-mutants``.
 
     Args:
         tests: Functions of a scenario that raise if something is wrong with it.

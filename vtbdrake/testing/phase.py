@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vtbdrake.argument_checks import as_addresses
+from vtbdrake.common.argument_checks import as_addresses
 from vtbdrake.control.bridge import Bridge
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.received_signal import ReceivedSignal
@@ -65,7 +65,7 @@ class Phase:
     * ``sim``: the whole testbed on a simulated clock, its switches on sim.
     * ``machine``: the DPS alone controls a machine in a process of its own, over a hub.
     * ``shadow``: it does so, too, and beside it the whole testbed listens to the same machine, with T_sense on real and
-      T_act on sim. The loop under test is that of the testbed: its DPS sees the machine, and commands the simulated
+      T_act on sim. The loop under test is the testbed's: its DPS sees the machine, and commands the simulated
       world.
 
     The machine waits for each command, and the loop for each state and for the results of slow parts: the same happens
@@ -107,6 +107,7 @@ class Phase:
         self._started = False
         self._clock: SimulatedClock | None = None
         self._cycle: Cycle | None = None
+        self._runtime: Runtime | None = None
         self._driver: Runtime | None = None  # what controls the machine, if it is not the loop under test
 
     def __repr__(self) -> str:
@@ -128,16 +129,18 @@ class Phase:
 
     @property
     def runtime(self) -> Runtime:
-        """Return the loop under test."""
+        """Return the loop under test; a `RuntimeError` before the phase has begun."""
+        if self._runtime is None:
+            raise RuntimeError(f"the phase {self.name} has not begun: use it in a block, with Phase(...) as phase")
         return self._runtime
 
     def read(self, address: str) -> Any:
         """Return the present value at an address of the loop under test, see `reader_of`."""
-        return reader_of(self._runtime.target, address)(self._runtime.context)
+        return reader_of(self.runtime.target, address)(self.runtime.context)
 
     def write(self, values: Mapping[str, Any]) -> None:
         """Set variables of the DPS and commands u by address; before the first `run`, before the DPS takes over."""
-        for runtime in filter(None, (self._runtime, self._driver)):
+        for runtime in filter(None, (self.runtime, self._driver)):
             runtime.write(values)
 
     def run(self, seconds: float, *, record: str | Sequence[str] = ()) -> Trace:
@@ -152,7 +155,7 @@ class Phase:
             AssertionError: The DPS raised or commanded NaN, or the guards found another fault.
             SwitchRefusedError: The DPS could not take over the machine.
         """
-        runtime = self._runtime
+        runtime = self.runtime
         addresses = as_addresses("what is recorded", record)
         readers = [reader_of(runtime.target, address) for address in addresses]
         if not self._started:
@@ -177,7 +180,7 @@ class Phase:
         if self._clock is not None:
             self._clock.advance(self.period)
         # First the loop that only listens: the machine goes on when the other one answers.
-        for runtime in filter(None, (self._runtime, self._driver)):
+        for runtime in filter(None, (self.runtime, self._driver)):
             runtime.run(cycles=1)
             runtime.slow_parts.wait(PATIENCE)
             latched = [fault.reason for fault in runtime.guards.latched]
@@ -188,10 +191,10 @@ class Phase:
 
     def _start(self) -> None:
         if self.name == "shadow":
-            self._runtime.run(cycles=1)
-            self._runtime.switch("shadow")
+            self.runtime.run(cycles=1)
+            self.runtime.switch("shadow")
         if self.name != "sim":
-            (self._driver or self._runtime).take_over(timeout=PATIENCE)
+            (self._driver or self.runtime).take_over(timeout=PATIENCE)
         self._started = True
 
     def _simulated(self, stack: ExitStack) -> Runtime:

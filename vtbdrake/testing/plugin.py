@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.lazy import extra_module
+from vtbdrake.common.extras import extra_module
 
 if TYPE_CHECKING:
     import pytest
@@ -52,9 +52,9 @@ def parametrize_with_checks(
     Raises:
         ValueError: There is no check of an expected name.
     """
-    from vtbdrake.testing.check import CheckFailedError, CheckSkippedError, checked_expectations
     from vtbdrake.testing.checks import CHECKS
-    from vtbdrake.testing.subject import Subject
+    from vtbdrake.testing.scenario_check import checked_expectations
+    from vtbdrake.testing.subject import CheckFailedError, CheckSkippedError, Subject
 
     # The subject of one scenario at a time: a testbed with its contexts can be large.
     present: dict[int, Subject] = {}
@@ -64,6 +64,7 @@ def parametrize_with_checks(
         for check in CHECKS:
 
             def run(scenario: Scenario, check: Any = check, number: int = number) -> None:
+                __tracebackhide__ = True
                 if number not in present:
                     present.clear()
                     present[number] = Subject(scenario, values=_of(scenario, values), horizon=horizon)
@@ -138,7 +139,12 @@ def machine_options() -> dict[str, Any]:
 
 @pytest.fixture
 def machine(scenario: Scenario, machine_options: Mapping[str, Any]) -> Iterator[MachineProcess]:
-    """Yield the simulated machine of the scenario, in a process and at a hub of its own (``machine.url``)."""
+    """Yield the simulated machine of the scenario, in a process and at a hub of its own (``machine.url``).
+
+    Args:
+        scenario: The scenario of the test, a fixture.
+        machine_options: Keyword arguments of `MachineProcess`, a fixture.
+    """
     from vtbdrake.lcm.hub import Hub
     from vtbdrake.machine import MachineProcess
 
@@ -148,7 +154,12 @@ def machine(scenario: Scenario, machine_options: Mapping[str, Any]) -> Iterator[
 
 @pytest.fixture
 def log_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """Return a new file for ``record=``: if the test fails, it is kept, and the report says how to replay it."""
+    """Return a new file for ``record=``: if the test fails, it is kept, and the report says how to replay it.
+
+    Args:
+        request: Pytest's fixture; it tells the test.
+        tmp_path: Pytest's fixture: the test's folder.
+    """
     log = tmp_path / "loop.lcm"
     request.node.stash[_LOG] = log
     return log
@@ -158,7 +169,14 @@ def log_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def phase(
     request: pytest.FixtureRequest, scenario: Scenario, log_file: Path, machine_options: Mapping[str, Any]
 ) -> Iterator[Phase]:
-    """Yield the DPS of the scenario in each phase, see `vtbdrake.testing.phase.Phase`; its loop is recorded."""
+    """Yield the DPS of the scenario in each phase, see `vtbdrake.testing.phase.Phase`; its loop is recorded.
+
+    Args:
+        request: Pytest's fixture, whose ``param`` is the phase.
+        scenario: The scenario of the test, a fixture.
+        log_file: The file in which the loop is recorded, a fixture.
+        machine_options: Keyword arguments of `MachineProcess`, a fixture.
+    """
     from vtbdrake.testing.phase import Phase
 
     if request.param != "sim" and scenario.deployment().protocol is None:
@@ -191,7 +209,12 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Keep the log of a failed test, and report how to replay it."""
+    """Keep the log of a failed test, and report how to replay it.
+
+    Args:
+        item: The test.
+        call: The part of the test that has ended: its set-up, its call or its tear-down.
+    """
     report = yield
     log, folder = item.stash.get(_LOG, None), _folder(item)
     if call.when == "call" and report.failed and log is not None and folder is not None:

@@ -15,13 +15,21 @@ from vtbdrake.recording.log_format import installed_versions
 from vtbdrake.rollout.course import Course, DrivenRollout, task_without_problem
 from vtbdrake.rollout.named_function import is_named
 from vtbdrake.state import Snapshot
+from vtbdrake.state.archive import whole_file
 from vtbdrake.state.declarations import PARAMETER
 from vtbdrake.state.variables import A, X
-from vtbdrake.testbed.scenario_file import scenario_of_text, scenario_text
+from vtbdrake.testbed.scenario_file import scenario_of_text
+from vtbdrake.testbed.scenario_text import scenario_text
 
 if TYPE_CHECKING:
-    from vtbdrake.rollout import Quality, RolloutTask
-    from vtbdrake.testbed import VirtualTestbed
+    from vtbdrake.rollout import Quality, RolloutResult, RolloutTask
+    from vtbdrake.testbed import Scenario, VirtualTestbed
+
+# The lines of a test that expect values of variables.
+_CHECKS_OF_VALUES = """\
+values = driven.read(list(EXPECTED))
+for address, expected in EXPECTED.items():
+    assert values[address] == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE), address"""
 
 
 class SavedCourseError(ValueError):
@@ -41,7 +49,7 @@ def drive_again(
 ) -> DrivenRollout:
     """Compute a saved course with the testbed of today, and return the rollout where it ends.
 
-    The state is that of the snapshot. Parameters (masses, gains, frictions) are those of today's testbed, except those
+    The state comes from the snapshot. Parameters (masses, gains, frictions) come from today's testbed, except the ones
     that somebody had changed before the course was saved: so a change of the model is a change of the course.
 
     Args:
@@ -112,6 +120,7 @@ def save_course(
     task: RolloutTask | None = None,
     addresses: Sequence[str] = (),
     tolerance: float = 1e-6,
+    mode: int | None = None,
 ) -> None:
     """Write a course as a test, NAME.py, and its snapshot, NAME.vtb, beside it.
 
@@ -125,25 +134,18 @@ def save_course(
         task: The task whose quality is expected.
         addresses: The variables whose values are expected; by default all that move in the simulated world.
         tolerance: The relative difference that the test allows.
+        mode: Permissions of both files, such as `PRIVATE` of a course that begins in the log of a machine, as far as
+            the umask leaves them; by default what the umask leaves.
 
     Raises:
         SavedCourseError: The name is no test's, a file exists, the scenario or the quality cannot be written into a
             file, or the course fails.
     """
-    scenario, snapshot_path = testbed.scenario, path.with_suffix(".vtb")
-    if not re.fullmatch(r"test_[a-z0-9_]+\.py", path.name):
-        raise SavedCourseError(
-            f"pytest finds a test in test_NAME.py, with small letters, digits and _, not {path.name}"
-        )
-    for file in (path, snapshot_path):
-        if file.exists():
-            raise SavedCourseError(f"{file} exists, and is not overwritten: give another name, or remove it")
-    if not path.parent.is_dir():
-        raise SavedCourseError(f"{path} lies in a folder that does not exist")
+    snapshot_path = path.with_suffix(".vtb")
+    _check_files(path, snapshot_path)
     if not 0.0 < tolerance < 1.0:
         raise SavedCourseError(f"the tolerance is a relative difference between 0 and 1, not {tolerance}")
-    if scenario is None or scenario.name().startswith("__main__"):
-        raise SavedCourseError("the scenario is of a script or a notebook: a test can only import it from a module")
+    scenario = _checked_scenario(testbed)
     parameters = _changed_parameters(course.start, testbed)
     begin = _with_parameters_of_today(course.start, testbed)
     driven = _as_saved(replace(course, start=begin), parameters).driven(
@@ -152,20 +154,14 @@ def save_course(
     result = driven.end()
     if result.failed:
         raise SavedCourseError(f"the course fails, so that no test can expect anything of it: {result.message}")
-    stated, imports = "", []
     if task is not None:
         stated, f = _task_code(task)
         imports = ["from vtbdrake.rollout import Quality", f]
-        checks = f"assert result.end == {result.end!r}\n" + _approx("result.value", result.value)
-        checks = f"result = driven.end()\n{checks}\n{_approx('result.t_star', result.t_star)}"
+        checks = _checks_of_quality(result)
     else:
         expected = {a: np.asarray(v).tolist() for a, v in driven.read(addresses or _moving(testbed)).items()}
         lines = "".join(f"    {address!r}: {value!r},\n" for address, value in expected.items())
-        stated = f"EXPECTED = {{\n{lines}}}\n{stated}"
-        checks = (
-            "values = driven.read(list(EXPECTED))\nfor address, expected in EXPECTED.items():\n"
-            "    assert values[address] == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE), address"
-        )
+        stated, imports, checks = f"EXPECTED = {{\n{lines}}}\n", [], _CHECKS_OF_VALUES
     code = _TEMPLATE.format(
         scenario=scenario.name(),
         time=f"{course.start.time:g}",
@@ -183,8 +179,37 @@ def save_course(
         task="\n        **TASK," if task is not None else "",
         checks=textwrap.indent(checks, "    "),
     )
-    course.start.save(snapshot_path)
-    path.write_text(code, "utf-8")
+    course.start.save(snapshot_path, mode=mode)
+    with whole_file(path, mode=mode) as partial:
+        partial.write_text(code, "utf-8")
+
+
+def _check_files(path: Path, snapshot_path: Path) -> None:
+    """Refuse files that pytest would not find, or that would be overwritten."""
+    if not re.fullmatch(r"test_[a-z0-9_]+\.py", path.name):
+        raise SavedCourseError(
+            f"pytest finds a test in test_NAME.py, with small letters, digits and _, not {path.name}"
+        )
+    for file in (path, snapshot_path):
+        if file.exists():
+            raise SavedCourseError(f"{file} exists, and is not overwritten: give another name, or remove it")
+    if not path.parent.is_dir():
+        raise SavedCourseError(f"{path} lies in a folder that does not exist")
+
+
+def _checked_scenario(testbed: VirtualTestbed) -> Scenario:
+    """Return the scenario of a testbed; refuse one that a test cannot import."""
+    scenario = testbed.scenario
+    if scenario is None or scenario.name().startswith("__main__"):
+        raise SavedCourseError("the scenario is of a script or a notebook: a test can only import it from a module")
+    return scenario
+
+
+def _checks_of_quality(result: RolloutResult) -> str:
+    """Return the lines of a test that expect the result of a task."""
+    end = f"assert result.end == {result.end!r}"
+    lines = ["result = driven.end()", end, _approx("result.value", result.value)]
+    return "\n".join([*lines, _approx("result.t_star", result.t_star)])
 
 
 def _moving(testbed: VirtualTestbed) -> list[str]:
@@ -226,7 +251,7 @@ def _quality_code(quality: Quality) -> str:
 _TEMPLATE = '''"""A course of {scenario}, saved from its live page.
 
 It begins with the snapshot beside this file, at t = {time} s, and sets WRITES: the number of the step, and values by
-address. Parameters of the model are those of today, except PARAMETERS. What is expected was computed with
+address. Parameters of the model have today's values, except PARAMETERS. What is expected was computed with
 {versions}. There the course repeats to the last bit; with another
 processor or Drake the last digits differ, which contacts amplify: TOLERANCE is what may differ, relatively.
 """

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from vtbdrake.common.extras import extra_module
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
-from vtbdrake.lazy import extra_module
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine import InjectedFault, Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
@@ -33,6 +34,143 @@ EXAMPLES = 20
 
 START = 30
 """Number of cycles before the first switch: the pace of the messages is known then."""
+
+
+@dataclass(frozen=True, eq=False)
+class _LoopCase:
+    """What a state machine is made for.
+
+    Attributes:
+        scenario: The scenario.
+        deployment: Its deployment, with cycles begun by the clock.
+        alone: Whether the DPS runs alone.
+        values: Values of variables by address that are set at first.
+    """
+
+    scenario: Scenario
+    deployment: Deployment
+    alone: bool
+    values: Mapping[str, Any]
+
+    @cached_property
+    def target(self) -> VirtualTestbed | DpsAlone:
+        """Return the target of the loop; all examples share it."""
+        return DpsAlone(self.scenario) if self.alone else self.scenario.build()
+
+    @cached_property
+    def world(self) -> WorldAlone:
+        """Return the world of the machine; all examples share it."""
+        return WorldAlone(self.scenario)
+
+    def machine(self, *, epoch: int = 0) -> Machine:
+        """Return a new machine, whose time stamps begin at ``epoch`` in microseconds."""
+        return Machine(self.scenario, world=self.world, epoch=epoch)
+
+
+class _LoopMachine(stateful.RuleBasedStateMachine):
+    """The loop, its machine and its clock, and the rules whose strategies do not depend on the scenario.
+
+    Attributes:
+        case: The scenario, and how its loop is run.
+    """
+
+    case: ClassVar[_LoopCase]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clock = SimulatedClock()
+        self.bridge = WatchedBridge(self.case.machine(), self.clock)
+        self.runtime: Runtime = self.case.deployment.runtime(self.case.target, self.bridge, clock=self.clock)
+        self.loop_rules = LoopRules(self.runtime, self.bridge)
+        self.runtime.write(self.case.values)
+
+    def teardown(self) -> None:
+        with self.runtime:
+            self.runtime.leave("the test ended")
+
+    def _restart(self) -> None:
+        self.bridge.restart(self.case.machine(epoch=round(1e6 * self.clock.now())))
+
+    def _run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.clock.advance(self.case.deployment.period)
+            self.runtime.run(cycles=1)
+
+    @stateful.initialize()
+    def start(self) -> None:
+        self._run(START)
+        self.switch("real")
+
+    @stateful.rule(cycles=st.integers(1, 40))
+    def run(self, cycles: int) -> None:
+        self._run(cycles)
+
+    def disturb(self, fault: InjectedFault, cycles: int) -> None:
+        """Let messages be lost, late, repeated or corrupted for some cycles."""
+        self.bridge.machine.begin(fault)
+        self._run(cycles)
+        self.bridge.machine.end_faults()
+
+    @stateful.rule(periods=st.floats(0.0, 40.0))
+    def hold_up(self, periods: float) -> None:
+        self.clock.advance(periods * self.case.deployment.period)
+        self.runtime.run(cycles=1)
+
+    @stateful.rule(cycles=st.integers(1, 5))
+    def hurry(self, cycles: int) -> None:
+        """Run cycles at once, as by hand."""
+        for _ in range(cycles):
+            self.runtime.run(cycles=1)
+
+    @stateful.rule(cut=st.booleans())
+    def connect(self, cut: bool) -> None:
+        self.bridge.cut = cut
+
+    @stateful.precondition(lambda self: not self.bridge.dead)
+    @stateful.rule()
+    def kill(self) -> None:
+        self.bridge.dead = True
+
+    @stateful.precondition(lambda self: self.bridge.dead)
+    @stateful.rule()
+    def restart(self) -> None:
+        self._restart()
+        self._run(START)
+
+    def switch(self, mode: str) -> None:
+        before = self.runtime.active, set(self.runtime.watched)
+        try:
+            self.runtime.switch(mode)
+        except SwitchRefusedError:
+            assert (self.runtime.active, set(self.runtime.watched)) == before, "a refused switch was thrown"
+        self.loop_rules.note_switch()
+
+    @stateful.rule()
+    def reset(self) -> None:
+        try:
+            self.runtime.reset()
+        except SwitchRefusedError:
+            return
+        self.loop_rules.note_reset()
+
+    @stateful.rule()
+    def recover(self) -> None:
+        if self.bridge.dead:
+            self._restart()
+        self.bridge.cut = False
+        self.runtime.write(self.case.values)
+        self._run(START)
+        self.reset()
+        self.switch("real")
+
+    def command(self, values: dict[str, Any]) -> None:
+        # Some commands may come from inside the testbed.
+        variables = self.runtime.target.variables()
+        self.runtime.write({address: value for address, value in values.items() if address in variables})
+
+    @stateful.invariant()
+    def rules_are_kept(self) -> None:
+        assert not self.loop_rules.violations, "\n".join(self.loop_rules.violations)
 
 
 def loop_state_machine(
@@ -64,116 +202,16 @@ def loop_state_machine(
     """
     # By the clock: where messages began the cycles, those that fail to come would stop it.
     deployment = Deployment.of(scenario, pace="")
-    interface, protocol, period = scenario.interface(), protocol_of(scenario), deployment.period
+    faults = injected_faults(protocol_of(scenario), period=deployment.period)
     modes = ["real"] if alone else list(MODES)
 
-    @cache
-    def built() -> tuple[VirtualTestbed | DpsAlone, WorldAlone]:
-        return DpsAlone(scenario) if alone else scenario.build(), WorldAlone(scenario)
+    class LoopMachine(_LoopMachine):
+        """The rules whose strategies depend on the scenario, besides."""
 
-    class LoopMachine(stateful.RuleBasedStateMachine):
-        """The loop, its machine and its clock."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            target, world = built()
-            self.clock = SimulatedClock()
-            self.bridge = WatchedBridge(Machine(scenario, world=world), self.clock)
-            self.runtime: Runtime = deployment.runtime(target, self.bridge, clock=self.clock)
-            self.loop_rules = LoopRules(self.runtime, self.bridge)
-            self.runtime.write(values or {})
-
-        def teardown(self) -> None:
-            with self.runtime:
-                self.runtime.leave("the test ended")
-
-        def _restart(self) -> None:
-            epoch = round(1e6 * self.clock.now())
-            self.bridge.restart(Machine(scenario, world=built()[1], epoch=epoch))
-
-        def _run(self, cycles: int) -> None:
-            for _ in range(cycles):
-                self.clock.advance(period)
-                self.runtime.run(cycles=1)
-
-        @stateful.initialize()
-        def start(self) -> None:
-            self._run(START)
-            self.switch("real")
-
-        @stateful.rule(cycles=st.integers(1, 40))
-        def run(self, cycles: int) -> None:
-            self._run(cycles)
-
-        @stateful.rule(fault=injected_faults(protocol, period=period), cycles=st.integers(1, 20))
-        def disturb(self, fault: InjectedFault, cycles: int) -> None:
-            """Let messages be lost, late, repeated or corrupted for some cycles."""
-            self.bridge.machine.begin(fault)
-            self._run(cycles)
-            self.bridge.machine.end_faults()
-
-        @stateful.rule(periods=st.floats(0.0, 40.0))
-        def hold_up(self, periods: float) -> None:
-            self.clock.advance(periods * period)
-            self.runtime.run(cycles=1)
-
-        @stateful.rule(cycles=st.integers(1, 5))
-        def hurry(self, cycles: int) -> None:
-            """Run cycles at once, as by hand."""
-            for _ in range(cycles):
-                self.runtime.run(cycles=1)
-
-        @stateful.rule(cut=st.booleans())
-        def connect(self, cut: bool) -> None:
-            self.bridge.cut = cut
-
-        @stateful.precondition(lambda self: not self.bridge.dead)
-        @stateful.rule()
-        def kill(self) -> None:
-            self.bridge.dead = True
-
-        @stateful.precondition(lambda self: self.bridge.dead)
-        @stateful.rule()
-        def restart(self) -> None:
-            self._restart()
-            self._run(START)
-
-        @stateful.rule(mode=st.sampled_from(modes))
-        def switch(self, mode: str) -> None:
-            before = self.runtime.active, set(self.runtime.watched)
-            try:
-                self.runtime.switch(mode)
-            except SwitchRefusedError:
-                assert (self.runtime.active, set(self.runtime.watched)) == before, "a refused switch was thrown"
-            self.loop_rules.note_switch()
-
-        @stateful.rule()
-        def reset(self) -> None:
-            try:
-                self.runtime.reset()
-            except SwitchRefusedError:
-                return
-            self.loop_rules.note_reset()
-
-        @stateful.rule()
-        def recover(self) -> None:
-            if self.bridge.dead:
-                self._restart()
-            self.bridge.cut = False
-            self.runtime.write(values or {})
-            self._run(START)
-            self.reset()
-            self.switch("real")
-
-        @stateful.rule(values=commands(interface))
-        def command(self, values: dict[str, Any]) -> None:
-            # Some commands may come from inside the testbed.
-            variables = self.runtime.target.variables()
-            self.runtime.write({address: value for address, value in values.items() if address in variables})
-
-        @stateful.invariant()
-        def rules_are_kept(self) -> None:
-            assert not self.loop_rules.violations, "\n".join(self.loop_rules.violations)
+        case = _LoopCase(scenario, deployment, alone, dict(values or {}))
+        disturb = stateful.rule(fault=faults, cycles=st.integers(1, 20))(_LoopMachine.disturb)
+        switch = stateful.rule(mode=st.sampled_from(modes))(_LoopMachine.switch)
+        command = stateful.rule(values=commands(scenario.interface()))(_LoopMachine.command)
 
     # As Hypothesis has them for state machines, but with fewer examples: each has some hundred cycles.
     LoopMachine.TestCase.settings = hypothesis.settings(

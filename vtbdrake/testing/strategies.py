@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vtbdrake.lazy import extra_module
+from vtbdrake.common.extras import extra_module
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine import Corrupt, Delay, Drop, Duplicate, Freeze, InjectedFault, Reorder
 from vtbdrake.machine.injected_faults import ACT, CORRUPTIONS, SENSE
@@ -24,9 +24,11 @@ LARGEST = 1e3
 
 
 def samples(signal: Signal) -> SearchStrategy[Any]:
-    """Return values of a signal within its limits: arrays of shape (size,), or the model value of an abstract one."""
+    """Return values of a signal, within its limits: arrays of shape (size,), or the model value of an abstract one."""
     if not signal.is_vector:
         return st.just(signal.model_value)
+    if signal.values is not None:
+        return st.tuples(*signal.vector(0.0).size * [st.sampled_from(list(map(float, signal.values)))]).map(np.array)
     lower, upper = signal.vector(signal.lower), signal.vector(signal.upper)
     lowest = np.where(np.isfinite(lower), lower, np.minimum(upper, 0.0) - LARGEST)
     highest = np.where(np.isfinite(upper), upper, np.maximum(lower, 0.0) + LARGEST)
@@ -42,6 +44,7 @@ def bad_samples(signal: Signal) -> SearchStrategy[Any]:
     wrong = [(i, number) for i in range(len(lower)) for number in (nan, inf, -inf)]
     wrong += [(i, nextafter(low, -inf)) for i, low in enumerate(lower) if isfinite(low)]
     wrong += [(i, nextafter(high, inf)) for i, high in enumerate(upper) if isfinite(high)]
+    wrong += [(i, nextafter(low, inf)) for i, low in enumerate(lower) if signal.values is not None]
 
     def put(value: np.ndarray, place: tuple[int, float]) -> np.ndarray:
         value[place[0]] = place[1]
@@ -70,7 +73,7 @@ def commands(interface: Interface) -> SearchStrategy[dict[str, Any]]:
 
 
 def injected_faults(protocol: Protocol, *, period: float, late: int = 20) -> SearchStrategy[InjectedFault]:
-    """Return what can go wrong with the messages between a machine and its controller: see `InjectedFault`.
+    """Return a strategy of faults in the messages between a machine and its controller: see `InjectedFault`.
 
     They are lost, late, repeated, swapped, frozen or corrupted (bits, NaN, cut off, another type), on one side, on some
     channels or on all.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.failures import FAILURES, error_text
+from vtbdrake.common.failures import FAILURES, error_text
 from vtbdrake.rollout.repeatability import Sample, Trace, trace, within
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.task import RolloutTask
@@ -18,7 +18,9 @@ from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.scenario import check_is_scenario
-from vtbdrake.testing.check import CheckFailedError, CheckSkippedError
+
+# Pytest shows none of the frames of this module: what a check has found is its message.
+__tracebackhide__ = True
 
 _BUDGET = 0.2  # s of processor time for the simulation with which others are compared
 _LONGEST = 2.0  # s that are simulated
@@ -26,6 +28,14 @@ _PERIOD = 0.05  # s between samples, where nothing has a period
 
 Readers = Mapping[str, Callable[[Context], Any]]
 """Functions of a root context that read a value, by signal."""
+
+
+class CheckFailedError(AssertionError):
+    """A scenario does not have the property that a check asks for."""
+
+
+class CheckSkippedError(Exception):
+    """A check does not concern a scenario, or presupposes what another check has refuted."""
 
 
 class Subject:
@@ -51,6 +61,8 @@ class Subject:
             ThreadPoolExecutor(1): [],
             ThreadPoolExecutor(1): [],
         }
+        self._start: Snapshot | None = None
+        self._runners: list[RolloutRunner] | None = None
         self._outcomes: dict[str, CheckFailedError | CheckSkippedError | None] = {}
 
     def outcome(self, check: Callable[[Subject], None]) -> CheckFailedError | CheckSkippedError | None:
@@ -69,7 +81,7 @@ class Subject:
                 self._outcomes[name] = None
             except (CheckFailedError, CheckSkippedError) as error:
                 self._outcomes[name] = error
-            except FAILURES as error:  # Of the scenario: none of our own functions raises.
+            except FAILURES as error:  # An error of the scenario: none of our own functions raises.
                 failure = CheckFailedError(f"an error of the scenario: {error_text(error)}")
                 failure.__cause__ = error
                 self._outcomes[name] = failure
@@ -99,9 +111,19 @@ class Subject:
         Raises:
             CheckSkippedError: It cannot be built.
         """
+        return self.presuppose_testbed()
+
+    def presuppose_testbed(self) -> VirtualTestbed:
+        """Raise a CheckSkippedError if the testbed cannot be built; return it otherwise."""
         if not isinstance(self.built, VirtualTestbed):
-            raise CheckSkippedError(f"the testbed cannot be built: {error_text(self.built)}")
+            # One of the two checks has failed, and says why.
+            raise CheckSkippedError("it presupposes a testbed: check_builds or check_no_algebraic_loop fails")
         return self.built
+
+    def presuppose_simulation(self) -> None:
+        """Raise a CheckSkippedError if the reference simulation fails."""
+        if self.failure:
+            raise CheckSkippedError("it presupposes check_simulates, which fails")  # and says why
 
     def started(self, testbed: VirtualTestbed) -> Context:
         """Return a new context of ``testbed`` with the values set."""
@@ -109,10 +131,16 @@ class Subject:
         testbed.write(context, self.values)
         return context
 
-    @cached_property
+    @property
     def start(self) -> Snapshot:
         """Return s0 of the shared testbed, as it was before anything was simulated."""
-        return self.testbed.snapshot(self.started(self.testbed))
+        return self._take_start()
+
+    def _take_start(self) -> Snapshot:
+        """Return s0, which is taken at the first call: before anything is simulated."""
+        if self._start is None:
+            self._start = self.testbed.snapshot(self.started(self.testbed))
+        return self._start
 
     @cached_property
     def period(self) -> float:
@@ -126,22 +154,27 @@ class Subject:
         horizon = self._horizon if self._horizon is not None else _LONGEST
         return RolloutTask(self.scenario, horizon, sample_period=min(self.period, horizon))
 
-    @cached_property
-    def _runners(self) -> list[RolloutRunner]:
+    def _make_runners(self) -> list[RolloutRunner]:
+        """Return the three runners; at the first call they are made, and so are the simulations in other threads.
+
+        That is before anything is simulated: what a simulation changes in the Diagram does not change their s0.
+        """
+        if self._runners is not None:
+            return self._runners
         if self.testbed.visualized:
             raise CheckSkippedError("the testbed draws into a Meshcat, which no rollout may do")
-        # Made before anything is simulated: what a simulation changes in the Diagram does not change their s0.
-        self.start  # noqa: B018
+        self._take_start()
         for thread, traces in self._beside.items():
             traces.append(thread.submit(lambda: trace(RolloutRunner(self.task, self.testbed), self.values)).result())
-        return [RolloutRunner(self.task, self.testbed) for _ in range(3)]
+        self._runners = [RolloutRunner(self.task, self.testbed) for _ in range(3)]
+        return self._runners
 
     def beside(self) -> Iterator[tuple[float, Sample]]:
         """Yield the samples of a simulation in one thread, while the same in another thread takes its steps in turn.
 
         Each begins in its thread, to which its renderer belongs.
         """
-        self._runners  # noqa: B018
+        self._make_runners()
         try:
             for _ in self.reference:
                 samples = [thread.submit(next, traces[0], None).result() for thread, traces in self._beside.items()]
@@ -158,7 +191,7 @@ class Subject:
 
         Number 0 runs the reference.
         """
-        return self._runners[number]
+        return self._make_runners()[number]
 
     @cached_property
     def reference(self) -> Trace:
@@ -168,7 +201,7 @@ class Subject:
 
     @property
     def failure(self) -> str:
-        """Return why the reference simulation fails; empty if it does not."""
+        """Return the reason why the reference simulation fails; empty if it does not."""
         return next((text for text in self.reference[-1][1][""] if isinstance(text, str)), "")
 
     @property
@@ -178,8 +211,7 @@ class Subject:
         Raises:
             CheckSkippedError: The simulation fails.
         """
-        if self.failure:
-            raise CheckSkippedError(f"the simulation fails: {self.failure}")
+        self.presuppose_simulation()
         return self.task.instants(0.0, self.testbed.event_timings())[: len(self.reference)]
 
     def readers(self, testbed: VirtualTestbed) -> tuple[Readers, Readers]:
@@ -214,5 +246,5 @@ def command_readers(target: AddressedDiagram) -> Readers:
 def _reader(target: AddressedDiagram, address: str, signal: Signal) -> Callable[[Context], Any]:
     """Return a function of a context that reads a signal; of a vector signal an array of shape (size,)."""
     read = target.reader(address)
-    # The address may be that of a variable, which of one entry is a number.
+    # The address may name a variable, which is a number if it has one entry.
     return (lambda context: np.reshape(read(context), signal.size)) if signal.is_vector else read

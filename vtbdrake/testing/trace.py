@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.argument_checks import as_addresses, suggestion
+from vtbdrake.common.argument_checks import as_addresses, suggestion
 from vtbdrake.control.stepping import time_after
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.replay import replay
@@ -140,7 +140,12 @@ def reader_of(target: VirtualTestbed | DpsAlone, address: str) -> Callable[[Cont
 
 
 def units_of(target: VirtualTestbed | DpsAlone, addresses: Sequence[str]) -> dict[str, str]:
-    """Return the units of addresses, where they are known."""
+    """Return the units of addresses, where they are known.
+
+    Args:
+        target: The testbed, or the DPS alone, to which the addresses belong.
+        addresses: Addresses of variables and of signals, ``sense.<name>`` and ``act.<name>``.
+    """
     interface, variables = target.interface, target.variables()
     units = {f"sense.{signal.name}": signal.unit for signal in interface.sense}
     units |= {f"act.{signal.name}": signal.unit for signal in interface.act} | {ENERGY: "J"}

@@ -7,9 +7,11 @@ from html import escape
 from matplotlib.figure import Figure
 
 from vtbdrake.calibration.validation import COLUMNS, Comparison
-from vtbdrake.visualization.plots import Picture, finish, image_html
+from vtbdrake.common.summary_html import image_html
+from vtbdrake.visualization.plots import Picture, finish
 
-_RECORDED, _SIMULATED = "0.2", "tab:orange"
+_RECORDED = "0.2"
+_SIMULATED = "tab:orange"
 
 
 def plot_comparison(comparison: Comparison) -> Figure:

@@ -11,7 +11,7 @@ from pydrake.geometry import MeshcatVisualizer
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, System
 
-from vtbdrake.argument_checks import counted
+from vtbdrake.common.argument_checks import counted
 from vtbdrake.testbed import Signal, VirtualTestbed
 from vtbdrake.testbed.switch import BOARD, T_ACT, T_SENSE
 
@@ -23,6 +23,11 @@ class Wire:
     """A signal, the position of its switch (empty for a command, which has none), and the simulated system at its end.
 
     The constant commands of the testbed have no system at their end.
+
+    Attributes:
+        signal: The signal.
+        position: The position of its switch; empty for a command.
+        part: The simulated system at its end; empty for a command.
     """
 
     signal: Signal
@@ -46,21 +51,32 @@ class Wire:
 
 @dataclass(frozen=True)
 class Structure:
-    """Figure 4 of one testbed."""
+    """Figure 4 of one testbed.
 
-    name: str  # of its scenario's class
-    dps: str  # class of the DPS; empty if it is a plain Diagram
-    dps_parts: tuple[str, ...]  # the DPS's subsystems
-    # role -> simulated parts; role is sense, sys, act or env, or ``other`` for what was added without one
+    Attributes:
+        name: The name of its scenario's class.
+        dps: Class of the DPS; empty if it is a plain Diagram.
+        dps_parts: The DPS's subsystems.
+        world: Role -> simulated parts; role is sense, sys, act or env, or ``other`` for what was added without one.
+        sense, act, commands: The signals.
+    """
+
+    name: str
+    dps: str
+    dps_parts: tuple[str, ...]
     world: dict[str, tuple[str, ...]]
-    # sense, act, commands: the signals
     sense: tuple[Wire, ...]
     act: tuple[Wire, ...]
     commands: tuple[Wire, ...]
 
 
 def structure_of(testbed: VirtualTestbed, context: Context | None = None) -> Structure:
-    """Return Figure 4 of a testbed, with its switches as in ``context`` (by default, as it was built)."""
+    """Return Figure 4 of a testbed, with its switches as in ``context`` (by default, as it was built).
+
+    Args:
+        testbed: The testbed.
+        context: A root context of the testbed; None: the default context.
+    """
     positions = testbed.positions(context if context is not None else testbed.default_context())
     sources: dict[tuple[str, int], str] = {}
     targets: dict[str, str] = {}
@@ -130,13 +146,32 @@ def _plant_instances(testbed: VirtualTestbed) -> Iterator[tuple[str, str]]:
             yield ("sys" if in_sys else "env"), name
 
 
-SIM, REAL, DPS, OFF, INK, PALE = "#1d6fb8", "#c8501e", "#2f6f4f", "#b9c0c8", "#1f2933", "#6b7682"
+# Colours.
+SIM = "#1d6fb8"
+REAL = "#c8501e"
+DPS = "#2f6f4f"
+OFF = "#b9c0c8"
+INK = "#1f2933"
+PALE = "#6b7682"
 FILLS = {SIM: "#eaf2fb", REAL: "#fdf0e7", DPS: "#e9f4ee"}
 
+# Lengths and places in pixels. Those along x are from the left edge, and mirrored on the right.
 WIDTH = 1200
-# From left to right: the lines to the worlds, the chips at their ends, contacts, poles, the DPS; mirrored on the right.
-BUS, CHIP, CHIP_WIDTH, CONTACT, POLE, BOX = (34, 46), 62, 196, 286, 334, 490
-ROW, REACH = 84, 17
+# The lines to the real world and to the simulated one.
+BUS = (34, 46)
+# The chips at their ends.
+CHIP = 62
+CHIP_WIDTH = 196
+# The contacts of the switches.
+CONTACT = 286
+# Their poles.
+POLE = 334
+# The box of the DPS.
+BOX = 490
+# Height of the row of a signal.
+ROW = 84
+# Distance of a contact above or below the pole.
+REACH = 17
 WORLD_BOXES = ((62, 250), (362, 226), (612, 226), (888, 250))
 WORLD_ROLES = ("sense", "sys", "env", "act")
 

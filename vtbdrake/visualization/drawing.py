@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Flag
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -15,20 +15,21 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.still import Still
+from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
     from numpy.typing import NDArray
 
-# Of the primaries of sRGB, to the eye.
+# Brightness of the primaries of sRGB, to the eye.
 _BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
-# What moves in a live view gets a field of view that is larger than it needs by this factor, and a page that is as
-# narrow as this beside its panel.
-_ROOM, _ASPECT = 1.3, 0.8
+# What moves in a live view gets a field of view that is larger than it needs by this factor.
+_ROOM = 1.3
+# Assumed width over height of the page beside its panel.
+_ASPECT = 0.8
 
 
 class Parts(Flag):
@@ -43,7 +44,7 @@ class Drawing:
     """What a testbed looks like, below a path in Meshcat.
 
     The objects are sent once; afterwards `pose` sends the poses of the moving frames, for any context of the testbed:
-    that of the simulation, or that of a fork. So several drawings of a testbed show its futures side by side.
+    of the simulation, or of a fork. So several drawings of a testbed show its futures side by side.
 
     Args:
         meshcat: The server that shows it; only the thread that made it may use it.
@@ -72,6 +73,8 @@ class Drawing:
         if testbed.scene_graph is None:
             raise ValueError(f"{testbed!r} has no SceneGraph, so that there is nothing to draw")
         self.path = path
+        self._looks: dict[str, Any] = {"tint": tint, "opacity": opacity, "parts": parts}
+        self._testbed = testbed
         self._meshcat, self._scene_graph, self._plant = meshcat, testbed.scene_graph, testbed.plant
         query = self._query(context)
         inspector = query.inspector()
@@ -114,7 +117,12 @@ class Drawing:
         return floating[0] if len(bases) == len(floating) == 1 else ""
 
     def pose(self, context: Context, *, time_in_recording: float | None = None) -> None:
-        """Show the poses of a root context of the testbed; of a recording, at a time in seconds."""
+        """Show the poses of a root context of the testbed; of a recording, at a time in seconds.
+
+        Args:
+            context: A root context of the testbed.
+            time_in_recording: The time in a recording of Meshcat, in seconds; None: the poses are shown now.
+        """
         query = self._query(context)
         for frame, place in self._frames:
             self._meshcat.SetTransform(place, query.GetPoseInWorld(frame), time_in_recording)
@@ -139,8 +147,13 @@ class Drawing:
         corners = self.corners(context)
         return float(np.linalg.norm(np.ptp(corners, axis=1))) if corners.size else 0.0
 
-    def fit_camera(self, context: Context, camera: Camera | None = None) -> None:
-        """Move the camera so that what moves is in view, with room around it; or to a camera."""
+    def fit_camera(self, context: Context, camera: Viewpoint | None = None) -> None:
+        """Move the camera so that what moves is in view, with room around it; or to a camera.
+
+        Args:
+            context: A root context of the testbed, whose poses are to be in view.
+            camera: The camera to move to; None: one that fits.
+        """
         corners = self.corners(context)
         if camera is None and corners.size:
             camera = fitting_camera(corners, margin=_ROOM, aspect=_ASPECT)
@@ -177,14 +190,28 @@ class Drawing:
                 Rgba(color.r(), color.g(), color.b(), color.a() * (opacity if moves else 1.0)),
             )
 
-    def still(self, context: Context, camera: Camera | None = None) -> Still:
-        """Return a picture of what is drawn in the poses of a context, by default of all that moves."""
+    def still(self, context: Context, camera: Viewpoint | None = None) -> Still:
+        """Return a picture of what is drawn in the poses of a context, by default of all that moves.
+
+        Args:
+            context: A root context of the testbed.
+            camera: From where the picture is taken; None: a camera that fits what moves.
+        """
         corners = self.corners(context)
         if camera is None and corners.size and np.isfinite(corners).all():
             camera = fitting_camera(corners)
         still = Still(camera)
         self.add_to(still, context)
         return still
+
+    def again(self, meshcat: Meshcat, context: Context) -> Drawing:
+        """Return the same drawing in another Meshcat, in the poses of a context.
+
+        Args:
+            meshcat: The server that shows it; only the thread that made it may use it.
+            context: A root context of the testbed, whose poses are shown first.
+        """
+        return Drawing(meshcat, self._testbed, context, self.path, **self._looks)
 
     def delete(self) -> None:
         """Remove it from the scene."""

@@ -6,7 +6,9 @@ import base64
 import hashlib
 import html
 import json
+import logging
 import os
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import cycle
@@ -22,14 +24,15 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
+from vtbdrake.common.failures import one_line
+from vtbdrake.common.json_data import plain
 from vtbdrake.components.rendering import RenderingError
-from vtbdrake.failures import one_line
+from vtbdrake.drake_workarounds.kept_meshcats import keep_meshcat
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
-from vtbdrake.testbed.kept_meshcats import keep_meshcat
-from vtbdrake.visualization.camera import Camera, fitting_camera
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.still import Still
+from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
@@ -47,8 +50,8 @@ _UNTINTED = "#555555"
 # The opacity of what moves in the picture of a recording, at instants from its begin to its end.
 _EXPOSURES = (0.15, 0.3, 1.0)
 
-# The scripts and styles of pages, and the tag before the script of Meshcat's viewer.
-_PAGE = Path(__file__).parents[1] / "web" / "page"
+# The scripts and styles of the page of a recording, and the tag before the script of Meshcat's viewer.
+_PAGE = Path(__file__).with_name("page")
 _SCRIPT_TAG = '<script type="text/javascript">'
 
 # Keyframes lie on whole milliseconds; the browser interpolates between them.
@@ -57,24 +60,40 @@ _RESOLUTION = 1000.0
 
 @dataclass(frozen=True)
 class Curve:
-    """The quality trajectory of a motion, equation (13), beside its recording."""
+    """The quality trajectory of a motion, equation (13), beside its recording.
 
-    times: np.ndarray  # in s, shape (n,)
-    values: np.ndarray  # shape (n,)
-    t_star: float  # t*, equation (16), in s; NaN if there is none
+    Attributes:
+        times: The times in s, shape (n,).
+        values: The quality at these times, shape (n,).
+        t_star: The instant t*, equation (16), in s; NaN if there is none.
+        color: The colour of the curve.
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    t_star: float
     color: str
 
 
 @dataclass(frozen=True, repr=False)
 class Scene:
-    """The scene of a Meshcat with its recording, which shows itself in a notebook."""
+    """The scene of a Meshcat with its recording, which shows itself in a notebook.
 
-    meshcat: Meshcat  # the server whose scene is shown; the scene is copied when it is displayed or saved
-    title: str = ""  # a caption
-    legend: Mapping[str, str] = field(default_factory=dict)  # label -> colour, below the caption
-    height: int = 400  # of the notebook's cell output, in pixels
-    curves: Mapping[str, Curve] = field(default_factory=dict)  # label -> curve, bound to the clock of the recording
-    still: Still | None = None  # what readers without a kernel see
+    Attributes:
+        meshcat: The server whose scene is shown; the scene is copied when it is displayed or saved.
+        title: A caption.
+        legend: Label -> colour, below the caption.
+        height: The height of the notebook's cell output, in pixels.
+        curves: Label -> curve, bound to the clock of the recording.
+        still: What readers without a kernel see.
+    """
+
+    meshcat: Meshcat
+    title: str = ""
+    legend: Mapping[str, str] = field(default_factory=dict)
+    height: int = 400
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+    still: Still | None = None
 
     def page(self) -> str:
         """Return the scene as one self-contained HTML page."""
@@ -117,7 +136,7 @@ class Scene:
                 "label": name,
                 "color": curve.color,
                 "times": curve.times.tolist(),
-                "values": [value if isfinite(value) else None for value in curve.values.tolist()],
+                "values": plain(curve.values),
                 "star": _star(curve),
             }
             for name, curve in self.curves.items()
@@ -149,9 +168,13 @@ class Scene:
 
 
 def picture_bundle(text: str, still: Still | None) -> dict[str, Any]:
-    """Return how something that is drawn appears in a notebook without a kernel: its picture, or a text.
+    """Return the bundle that a notebook without a kernel shows: the picture of a drawing, or a text.
 
     There is no picture where nothing moves, or where Drake cannot render: the text tells why.
+
+    Args:
+        text: The text that stands for the drawing.
+        still: The picture; None where there is none.
     """
     if still is None or still.camera is None:
         return {"text/plain": text}
@@ -173,18 +196,43 @@ def _read(name: str) -> str:
     return (_PAGE / name).read_text(encoding="utf-8")
 
 
+class _ShownMeshcat(Meshcat):
+    """A Meshcat that shows itself in a notebook: a link, and its page in a frame."""
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        # Its address is not for those who read a stored notebook without a kernel, and leads them nowhere.
+        url = html.escape(self.web_url(), quote=True)
+        frame = f'<iframe src="{url}" style="width: 100%; height: 450px; border: 0"></iframe>'
+        link = f'<a href="{url}" target="_blank">{url}</a>, in a browser on the machine of the kernel'
+        return {"text/plain": "<Meshcat: run the cell to see it>", "text/html": f"{link}{frame}"}
+
+
 def make_meshcat() -> Meshcat:
-    """Start a Meshcat server that listens on this machine only (Drake's default listens on all interfaces).
+    """Start a Meshcat server at a random address of this machine, where no web page finds it.
+
+    Drake's Meshcat serves whoever connects to it, web pages of any origin included, and one message that it cannot read
+    ends it. So it listens at one of the 16 million addresses 127.x.y.z, at a port that the system chooses, and Drake
+    does not print where: `Meshcat.web_url` tells. Other users of this machine can find it (in /proc/net/tcp).
 
     In the main thread, a server that nothing uses any more ends when the next one is made.
     """
-    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    host = ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
+
+    def keeps_secret(record: logging.LogRecord) -> bool:
+        return host not in record.getMessage()
+
+    log = logging.getLogger("drake")
+    log.addFilter(keeps_secret)
+    try:
+        meshcat = _ShownMeshcat(MeshcatParams(host=host, port=0, show_stats_plot=False))
+    finally:
+        log.removeFilter(keeps_secret)
     keep_meshcat(meshcat)
     return meshcat
 
 
 def show_motion(
-    meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0, camera: Camera | None = None
+    meshcat: Meshcat, motion: Motion, *, prefix: str = "rollout", rate: float = 20.0, camera: Viewpoint | None = None
 ) -> Scene:
     """Record a motion in ``meshcat``; one second of the recording is one simulated second.
 
@@ -218,7 +266,7 @@ def show_motions(
     opacity: float | Mapping[str, float] = 1.0,
     spacing: ArrayLike = (0.0, 0.0, 0.0),
     rate: float = 20.0,
-    camera: Camera | None = None,
+    camera: Viewpoint | None = None,
 ) -> Scene:
     """Record several motions overlaid (Figure 7), for example of the unloaded and the loaded robot.
 
@@ -275,7 +323,7 @@ def show_poses(
     colors: Mapping[str, ColorType] | None = None,
     opacity: float | Mapping[str, float] = 1.0,
     title: str = "",
-    camera: Camera | None = None,
+    camera: Viewpoint | None = None,
 ) -> Scene:
     """Draw motions as poses at several instants, like a photograph that is exposed several times (Figure 8).
 
@@ -400,7 +448,7 @@ def _curves(motions: Mapping[str, Motion], colors: Mapping[str, str]) -> dict[st
     }
 
 
-def _set_camera(meshcat: Meshcat, still: Still, camera: Camera | None, corners: list[np.ndarray]) -> None:
+def _set_camera(meshcat: Meshcat, still: Still, camera: Viewpoint | None, corners: list[np.ndarray]) -> None:
     """Let the page and the picture begin with a camera, by default with a view of all that moves, wherever it goes."""
     points = np.hstack([np.empty((3, 0)), *corners])
     if camera is None and points.size and np.isfinite(points).all():
@@ -410,7 +458,7 @@ def _set_camera(meshcat: Meshcat, still: Still, camera: Camera | None, corners: 
         meshcat.SetCameraPose(camera.position, camera.target)
 
 
-def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Camera | None) -> Still:
+def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Viewpoint | None) -> Still:
     """Record the motions, and return a picture of them."""
     end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[_Stage](), Still()
     corners: list[np.ndarray] = []

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType
 
+from vtbdrake.common.summary_html import png_of
 from vtbdrake.optimization.boundary import why_no_boundary
+from vtbdrake.optimization.parameter import short_address
 from vtbdrake.rollout import Quality, RolloutResult
 
 if TYPE_CHECKING:
@@ -31,6 +30,10 @@ class Picture(Figure):
     """A matplotlib Figure that pyplot does not know.
 
     pyplot would keep it in memory, open a window on a desktop, and in a notebook show it beside the returned value.
+
+    Args:
+        width: The width, in inches.
+        height: The height, in inches.
     """
 
     def __init__(self, width: float, height: float) -> None:
@@ -41,27 +44,13 @@ class Picture(Figure):
         return png_of(self)
 
 
-def png_of(figure: Figure, *, dpi: float = 100) -> bytes:
-    """Return a figure as PNG."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
-
-
-def summary_html(title: str, rows: Mapping[str, object], figure: Figure | None = None) -> str:
-    """Return HTML for a notebook: a title, a table of names and values, and a figure beside it."""
-    cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows.items())
-    image = "" if figure is None else image_html(figure)
-    return f"<div><b>{escape(title)}</b><table>{cells}</table>{image}</div>"
-
-
-def image_html(figure: Figure) -> str:
-    """Return the HTML element of a figure, with its pixels."""
-    return f'<img src="data:image/png;base64,{b64encode(png_of(figure, dpi=80)).decode()}">'
-
-
 def label(name: str, unit: str) -> str:
-    """Return an axis label such as ``sim.sys.payload.mass [kg]``; without brackets if there is no unit."""
+    """Return an axis label such as ``sim.sys.payload.mass [kg]``; without brackets if there is no unit.
+
+    Args:
+        name: The name of the quantity, such as an address.
+        unit: Its unit; empty or ``"1"`` for numbers without one.
+    """
     return name if unit in ("", "1") else f"{name} [{unit}]"
 
 
@@ -132,7 +121,16 @@ def _qualities(rollouts: Sequence[RolloutResult]) -> np.ndarray:
 def draw_trajectory(
     axes: Axes, rollout: RolloutResult, *, color: ColorType, style: int = 0, width: float = 1.4, name: str | None = None
 ) -> None:
-    """Draw f' over time, with t* as a marker; a failed rollout ends with a cross."""
+    """Draw f' over time, with t* as a marker; a failed rollout ends with a cross.
+
+    Args:
+        axes: The axes to draw into, with time in seconds as x.
+        rollout: The rollout, with its samples of the quality or of the cost.
+        color: Colour of line and marker.
+        style: Number of the style of the line and of the marker, see `STYLES` and `MARKERS`, modulo their numbers.
+        width: Width of the line in points.
+        name: Its name in the legend; None: it has no entry.
+    """
     times = rollout.times[: rollout.quality.size]
     steps = "steps-post" if np.unique(rollout.quality).size <= 2 else "default"
     (line,) = axes.plot(times, rollout.quality, color=color, lw=width, label=name, drawstyle=steps)
@@ -145,7 +143,15 @@ def draw_trajectory(
 
 
 def draw_t_star(axes: Axes, t_star: float, height: float, *, color: ColorType, style: int = 0) -> None:
-    """Mark t*."""
+    """Mark t*.
+
+    Args:
+        axes: The axes to draw into.
+        t_star: The time t*, in seconds.
+        height: The y of the mark.
+        color: Colour of the mark.
+        style: Number of its form, see `MARKERS`, modulo their number.
+    """
     mark: dict[str, Any] = {"marker": MARKERS[style % len(MARKERS)], "mec": "black", "mew": 0.6, "ms": 6}
     axes.plot(t_star, height, color=color, zorder=3, clip_on=False, gid="t_star", **mark)
 
@@ -162,6 +168,14 @@ def draw_bars(
     """Draw two-valued trajectories as bars at ``heights``: thin at the lower value of f', thick at the upper one.
 
     t* is marked where h is the upper value. A failed rollout ends with a cross.
+
+    Args:
+        axes: The axes to draw into, with time in seconds as x.
+        rollouts: The rollouts, whose f' takes only two values, see `is_two_valued`.
+        heights: The y of each bar, shape (rollouts,).
+        colors: Colour of each bar.
+        styles: Number of the form of each t*, see `MARKERS`.
+        words: The words for a quality, or for a cost, in the legend.
     """
     values = _qualities(rollouts)
     lower, upper = (values.min(), values.max()) if values.size else (0.0, 0.0)
@@ -187,13 +201,25 @@ def draw_bars(
 
 
 def draw_threshold(axes: Axes, threshold: float) -> None:
-    """Draw f_m as a line, if it is finite."""
+    """Draw f_m as a line, if it is finite.
+
+    Args:
+        axes: The axes to draw into, with f' or the cost as y.
+        threshold: The threshold f_m; infinite: none.
+    """
     if np.isfinite(threshold):
         axes.axhline(threshold, color=THRESHOLD, lw=1, ls=(0, (4, 2)), gid="threshold", zorder=1)
 
 
 def keys(words: _Words, *, threshold: float = np.inf, exceedances: bool = False, failed: bool = False) -> list[Line2D]:
-    """Return the legend entries that all rollouts share."""
+    """Return the legend entries that all rollouts share.
+
+    Args:
+        words: The words for a quality, or for a cost.
+        threshold: The threshold; infinite, as by default, it has no entry.
+        exceedances: Whether the samples that exceed the threshold, G1, are marked.
+        failed: Whether a rollout has failed.
+    """
     entries = [_key("t*", marker="o", color="white", mec="black", ls="")]
     if exceedances:
         entries.append(_key(f"G₁: {words.symbol} {words.beyond} {words.limit}", color="0.6", lw=6, alpha=0.5))
@@ -212,16 +238,7 @@ def describe(values: object) -> str:
     """Return elements of s0 as text such as ``mass = 45, friction = 0.8``, with the last words of their addresses."""
     if not isinstance(values, dict) or not values:
         return "as the scenario is"
-    return ", ".join(f"{_short(address, values)} = {_number(value)}" for address, value in values.items())
-
-
-def _short(address: str, addresses: Iterable[str]) -> str:
-    words = address.split(".")
-    for count in range(1, len(words)):
-        tail = words[-count:]
-        if sum(other.split(".")[-count:] == tail for other in addresses) == 1:
-            return ".".join(tail)
-    return address
+    return ", ".join(f"{short_address(address, values)} = {_number(value)}" for address, value in values.items())
 
 
 def _number(value: object) -> str:
@@ -250,7 +267,12 @@ def worst(sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_landscape(axes: Axes, sweep: Sweep) -> None:
-    """Draw h as an image on a full grid, else as coloured points, with contour lines, failures and the best point."""
+    """Draw h as an image on a full grid, else as coloured points, with contour lines, failures and the best point.
+
+    Args:
+        axes: The axes to draw into; their figure gets a colour bar.
+        sweep: A sweep over two parameters.
+    """
     words = _Words.of(minimize=sweep.minimize[0])
     points, h = worst(sweep)
     x, y = np.unique(points[:, 0]), np.unique(points[:, 1])
@@ -320,7 +342,15 @@ def _edges(centers: np.ndarray, *, log: bool) -> np.ndarray:
 
 
 def mark_best(axes: Axes, x: float, y: float, *, text: str | None = None, size: float = 18) -> None:
-    """Mark the best point with a star."""
+    """Mark the best point with a star.
+
+    Args:
+        axes: The axes to draw into.
+        x: The x of the best point.
+        y: The y of the best point.
+        text: Its name in the legend; None: it has no entry.
+        size: Size of the star in points.
+    """
     axes.plot(x, y, "*", color="#d6604d", ms=size, mec="white", clip_on=False, zorder=4, label=text, gid="best")
 
 
@@ -328,9 +358,9 @@ def _draw_best(axes: Axes, sweep: Sweep, words: _Words) -> None:
     several = len(sweep.minimize) > 1
     if several or sweep.risk is None or not any(evaluation.feasible for evaluation in sweep.evaluations):
         return
-    point, best = sweep.best()
-    text = ", ".join(f"{value:.4g}" for value in point.values())
-    mark_best(axes, *point.values(), text=f"s⁰* = [{text}], {'c' if words.symbol == 'c' else 'h'} = {best:.4g}")
+    best = sweep.best
+    text = ", ".join(f"{value:.4g}" for value in best.point)
+    mark_best(axes, *best.point, text=f"s⁰* = [{text}], {'c' if words.symbol == 'c' else 'h'} = {best.value:.4g}")
 
 
 _BOUNDARY = "#f4a582"
@@ -349,7 +379,7 @@ def plot_sweep(sweep: Sweep, *, boundary: Boundary | None = None) -> Figure:
 
     Args:
         sweep: The sweep to draw.
-        boundary: The boundary to shade; by default that of the sweep, if there is one.
+        boundary: The boundary to shade; by default the sweep's, if there is one.
 
     Raises:
         ValueError: There are more than two parameters, or no rollouts.
@@ -397,7 +427,7 @@ def plot_quality(rollouts: Sequence[RolloutResult], *, quality: Quality | None =
         ValueError: There is no rollout, or one has no quality.
     """
     if not rollouts or any(rollout.quality.size == 0 for rollout in rollouts):
-        raise ValueError("a quality trajectory is that of a rollout with a quality and at least one sample")
+        raise ValueError("a quality trajectory needs a rollout with a quality and at least one sample")
     words = _QUALITY
     if quality is not None:
         words = _Words.of(minimize=quality.minimize, name=quality.name, unit=quality.unit)

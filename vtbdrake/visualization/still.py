@@ -10,16 +10,18 @@ from PIL import Image
 from pydrake.geometry import HalfSpace, Mesh, Rgba, Shape
 from pydrake.math import RigidTransform
 
+from vtbdrake.common.failures import one_line
 from vtbdrake.components.rendering import RenderingError, check_rendering
-from vtbdrake.failures import one_line
-from vtbdrake.visualization.camera import FIELD_OF_VIEW, Camera
+from vtbdrake.visualization.viewpoint import FIELD_OF_VIEW, Viewpoint
 
-# Each pixel of a picture is the mean of so many squared, which smooths edges.
+# Each pixel of a picture is the mean of this number of points squared, which smooths edges.
 _POINTS = 2
 # Meshcat's camera sees what is nearer than this, in m.
 _FARTHEST = 100.0
-# The colour behind the scene, and how bright the light from the camera and that from above are.
-_BACKGROUND, _LIGHTS = (0.95, 0.95, 1.0), (0.7, 0.5)
+# Colour behind the scene.
+_BACKGROUND = (0.95, 0.95, 1.0)
+# Intensities of the light from the camera and of the light from above.
+_LIGHTS = (0.7, 0.5)
 
 
 class Still:
@@ -29,17 +31,27 @@ class Still:
         camera: From where they are looked at; None where there is nothing to look at.
     """
 
-    def __init__(self, camera: Camera | None = None) -> None:
+    def __init__(self, camera: Viewpoint | None = None) -> None:
         self.camera = camera
         self._shapes: list[tuple[Shape, RigidTransform, Rgba]] = []
 
     def add(self, shape: Shape, X_WG: RigidTransform, color: Rgba) -> None:
-        """Add a shape; half spaces, which Meshcat does not show, are left out."""
+        """Add a shape; half spaces, which Meshcat does not show, are left out.
+
+        Args:
+            shape: The shape.
+            X_WG: Its pose in the world.
+            color: Its colour, with alpha as the opacity.
+        """
         if not isinstance(shape, HalfSpace):
             self._shapes.append((shape, X_WG, color))
 
     def render(self, *, width: int = 640, height: int = 400) -> NDArray[np.uint8]:
         """Return the picture, shape (height, width, 3).
+
+        Args:
+            width: Width of the picture in pixels.
+            height: Height of the picture in pixels.
 
         Raises:
             RenderingError: This machine cannot render, or not one of the shapes.
@@ -90,7 +102,12 @@ class Still:
         return np.asarray(Image.fromarray(image[..., :3]).reduce(_POINTS))
 
     def png(self, *, width: int = 640, height: int = 400) -> bytes:
-        """Return the picture as PNG; raises as `render` does."""
+        """Return the picture as PNG; raises as `render` does.
+
+        Args:
+            width: Width of the picture in pixels.
+            height: Height of the picture in pixels.
+        """
         file = io.BytesIO()
         Image.fromarray(self.render(width=width, height=height)).save(file, "png", optimize=True)
         return file.getvalue()

@@ -20,6 +20,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.tri import Triangulation
 
 from vtbdrake.optimization import Trial
+from vtbdrake.optimization.importance import importances
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.records import BROKEN, DROPPED, FEASIBLE
 from vtbdrake.visualization.plots import FAILED, Picture, draw_mesh, finish, label, mark_best
@@ -34,12 +35,19 @@ _DROPPED = "0.6"
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a study, grouped by their outcome."""
+    """The points of a study, grouped by their outcome.
 
-    feasible: tuple[Trial, ...]  # they have a value and keep all constraints
-    broken: tuple[Trial, ...]  # they have a value, but break a constraint
-    dropped: tuple[Trial, ...]  # by racing; their value is only known to be no better than their bound
-    failed: tuple[Trial, ...]  # a simulation failed
+    Attributes:
+        feasible: They have a value and keep all constraints.
+        broken: They have a value, but break a constraint.
+        dropped: Racing dropped them; their value is only known to be no better than their bound.
+        failed: A simulation of them failed.
+    """
+
+    feasible: tuple[Trial, ...]
+    broken: tuple[Trial, ...]
+    dropped: tuple[Trial, ...]
+    failed: tuple[Trial, ...]
 
     @classmethod
     def of(cls, study: Study) -> Points:
@@ -64,6 +72,11 @@ class Points:
         """Return the best point in one quality at each of the places, which have shape (n, k) for n points.
 
         One that keeps the constraints is better than one that does not, and this better than one without a value.
+
+        Args:
+            place: Function of n points that returns their places, shape (n, k).
+            quality: Number of the quality.
+            sign: 1.0 if larger values are better, -1.0 for a cost.
         """
         groups = (self.feasible, self.broken, self.dropped, self.failed)
         trials = [trial for group in groups for trial in group]
@@ -79,7 +92,12 @@ class Points:
         return Points(feasible, broken, dropped, failed)
 
     def best(self, study: Study, quality: int) -> Trial | None:
-        """Return the best point in one quality; None if no point keeps the constraints and is allowed."""
+        """Return the best point in one quality; None if no point keeps the constraints and is allowed.
+
+        Args:
+            study: The study.
+            quality: Number of the quality.
+        """
         sign = study.signs[quality]
         return max(self.candidates(study), key=lambda trial: sign * trial.values[quality], default=None)
 
@@ -90,31 +108,41 @@ class Points:
 
 
 def values(trials: Sequence[Trial], quality: int) -> np.ndarray:
-    """Return the values of one quality, shape (n,)."""
+    """Return the values of one quality, shape (n,).
+
+    Args:
+        trials: The n points.
+        quality: Number of the quality.
+    """
     return np.array([trial.values[quality] for trial in trials], dtype=float)
 
 
-def name(study: Study, quality: int) -> str:
-    """Return the name of a quality; h if its function has none."""
-    function_name = study.names[quality]
-    return function_name if function_name.isidentifier() else "h(s⁰)"
-
-
 def quality_label(study: Study, quality: int) -> str:
-    """Return an axis label such as ``energy (cost, worst of 5 conditions)``."""
+    """Return an axis label such as ``energy [J] (cost, worst of 5 conditions)``.
+
+    Args:
+        study: The study.
+        quality: Number of the quality.
+    """
     described = study.record["problem"]
     conditions = len(described["conditions"])
     remarks = ["cost"] if study.directions[quality] == "minimize" else []
     if conditions > 1:
-        # Of a repr: Worst(), CVaR(level=0.2).
+        # From a repr: Worst(), CVaR(level=0.2).
         risk = described["risk"].removesuffix("()")
         remarks.append(f"{risk.lower() if risk.isalpha() else risk} of {conditions} conditions")
-    return f"{name(study, quality)} ({', '.join(remarks)})" if remarks else name(study, quality)
+    name = label(study.names[quality], study.quality_units[quality])
+    return f"{name} ({', '.join(remarks)})" if remarks else name
 
 
 @dataclass(frozen=True)
 class Scale:
-    """The axis of a parameter: numbers as they are, options side by side."""
+    """The axis of a parameter: numbers as they are, options side by side.
+
+    Attributes:
+        dimension: The parameter.
+        unit: Its unit.
+    """
 
     dimension: Dimension
     unit: str
@@ -131,7 +159,13 @@ class Scale:
         return np.array(positions, dtype=float)
 
     def set_up(self, axes: Axes, which: str, *, width: int = 60) -> None:
-        """Set label (wrapped after about ``width`` letters), scale and ticks of the axis ``x`` or ``y``."""
+        """Set label (wrapped after about ``width`` letters), scale and ticks of the axis ``x`` or ``y``.
+
+        Args:
+            axes: The axes whose axis is set up.
+            which: ``x`` or ``y``.
+            width: Number of letters after which the label is wrapped.
+        """
         axis = axes.xaxis if which == "x" else axes.yaxis
         if isinstance(self.dimension, Choice):
             axis.set_ticks(range(len(self.dimension.options)), [str(option) for option in self.dimension.options])
@@ -168,6 +202,14 @@ def draw_points(
 
     A failed one is a cross at the bottom, one that was dropped a triangle at its bound, or at the edge if that is
     infinite.
+
+    Args:
+        axes: The axes to draw into.
+        study: The study of the points, which tells the direction of the quality.
+        points: The points.
+        x: Function of n points that returns their places, shape (n,).
+        quality: Number of the quality, the y of the points.
+        style: Keyword arguments of matplotlib's ``scatter`` for the feasible points, such as ``color``.
     """
     style = {"s": 22, "zorder": 3, "linewidths": 0, **style}
     axes.scatter(x(points.feasible), values(points.feasible, quality), gid="kept", **style)
@@ -195,7 +237,14 @@ _BROKEN_ON_A_MAP: dict[str, Any] = {**BROKEN_STYLE, "mec": "#f4a582", "ms": 7, "
 
 
 def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]:
-    """Mark the points over two parameters that have no valid value, and return legend entries."""
+    """Mark the points over two parameters that have no valid value, and return legend entries.
+
+    Args:
+        axes: The axes to draw into.
+        points: The points.
+        x: The axis of the first parameter.
+        y: The axis of the second one.
+    """
     marks = _marks(points, broken=_BROKEN_ON_A_MAP, dropped=("dropped by racing", _DROPPED_STYLE))
     for gid, trials, style, _ in marks:
         axes.plot(x.places(trials), y.places(trials), gid=gid, **style)
@@ -203,7 +252,12 @@ def draw_remarks(axes: Axes, points: Points, x: Scale, y: Scale) -> list[Line2D]
 
 
 def point_keys(study: Study, points: Points) -> list[Line2D]:
-    """Return the legend entries of the marks that `draw_points` makes."""
+    """Return the legend entries of the marks that `draw_points` makes.
+
+    Args:
+        study: The study of the points, which tells the direction of the quality.
+        points: The points; groups without any have no entry.
+    """
     dropped = "dropped by racing: no better than this", _dropped_style(study, 0)
     return _keys(_marks(points, broken=BROKEN_STYLE, dropped=dropped))
 
@@ -272,6 +326,15 @@ def draw_slice(
     """Draw one quality over one parameter, with the best point.
 
     Points are coloured by their order unless ``style`` has a color.
+
+    Args:
+        axes: The axes to draw into.
+        study: The study.
+        points: Its points.
+        scale: The axis of the parameter.
+        quality: Number of the quality, the y of the points.
+        width: Number of letters after which the label of the parameter is wrapped.
+        style: Keyword arguments of matplotlib's ``scatter`` for the feasible points.
     """
     if "color" not in style:
         style["c"] = [trial.number for trial in points.feasible]
@@ -364,7 +427,7 @@ def _legend_with_best(
     if best is not None:
         (star,) = (line for line in axes.get_lines() if line.get_gid() == "best")
         at = ", ".join(_text(best.parameters[address]) for address in addresses)
-        star.set_label(f"s⁰* = [{at}], {name(study, quality)} = {best.values[quality]:.4g}")
+        star.set_label(f"s⁰* = [{at}], {study.names[quality]} = {best.values[quality]:.4g}")
         handles = [star, *handles]
     if handles:
         where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13)}
@@ -464,14 +527,11 @@ def plot_slices(study: Study) -> Figure:
 def plot_importances(study: Study) -> Figure:
     """Plot how much each parameter decides whether a point is among the best tenth, for every quality.
 
-    See `vtbdrake.optimization.optuna_bridge.importances`.
+    See `vtbdrake.optimization.importance.importances`.
 
     Raises:
-        ModuleNotFoundError: Optuna is not installed.
         ValueError: There are too few points with a value, or they all have the same.
     """
-    from vtbdrake.optimization.optuna_bridge import importances
-
     shares = importances(study)
     figure = Picture(8.0, 0.6 + len(shares) * (0.8 + 0.4 * len(study.parameters)))
     points = Points.of(study)
@@ -483,7 +543,7 @@ def plot_importances(study: Study) -> Figure:
         axes.set_xlim(0.0, 1.1 * max(shares[quality].values()))
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         axes.set_title(
-            f"{name(study, quality)}: what decides whether a point is among the best tenth", fontsize="medium"
+            f"{study.names[quality]}: what decides whether a point is among the best tenth", fontsize="medium"
         )
         finish(axes)
         axes.grid(False, axis="y")
@@ -509,7 +569,7 @@ def plot_pareto(study: Study) -> Figure:
         _draw_pair(axes, study, points, (i, j))
         front_xy = np.array([[trial.values[i], trial.values[j]] for trial in front]).reshape(-1, 2)
         front_xy = front_xy[np.argsort(front_xy[:, 0], kind="stable")]
-        # Of three qualities the front is a surface, whose edge is not what a line would show.
+        # With three qualities the front is a surface, whose edge is not what a line would show.
         line = {"ls": "-" if count == 2 else "none", "drawstyle": "steps-pre" if study.signs[i] > 0.0 else "steps-post"}
         axes.plot(
             *front_xy.T, color=BEST, marker="o", ms=6, mec="white", mew=0.6, lw=1.0, zorder=4, gid="front", **line

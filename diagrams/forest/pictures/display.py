@@ -15,24 +15,28 @@ from numpy.typing import ArrayLike
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
 from vtbdrake.cli import BadInputError
 from vtbdrake.cli.options import option, scenario_argument, timeout_option, url_option
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.extras import extra_module
+from vtbdrake.common.failures import one_line
 from vtbdrake.components.localization.planar import transform
 from vtbdrake.components.localization.unit import DOUBTFUL, LOST, SEARCHING, TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.control.bridge import BridgeError
-from vtbdrake.failures import one_line
+from vtbdrake.drake_workarounds.kept_meshcats import DEATH, is_running
 from vtbdrake.monitoring.live.client import watch
 from vtbdrake.testbed import Scenario
 from vtbdrake.visualization import make_meshcat, show_world_model
-from vtbdrake.visualization.world_model import text_strokes
+from vtbdrake.visualization.world_model_drawing import text_strokes
 from vtbdrake_diagrams.forest.scenario import CarrierScenario
 
-POSITION, HEADING, COVARIANCE, STATUS = (
-    f"dps.env.pose.{name}" for name in ("position", "heading", "covariance", "status")
-)
-FOUND_AT, LANDMARKS = "dps.env.localizer.pose", "dps.env.localizer.landmarks"
+POSITION = "dps.env.pose.position"
+HEADING = "dps.env.pose.heading"
+COVARIANCE = "dps.env.pose.covariance"
+STATUS = "dps.env.pose.status"
+FOUND_AT = "dps.env.localizer.pose"
+LANDMARKS = "dps.env.localizer.landmarks"
 WATCHED = (POSITION, HEADING, COVARIANCE, STATUS, FOUND_AT, LANDMARKS)
 """The addresses that the display reads."""
 
@@ -46,11 +50,22 @@ _LOOKS = {
     DOUBTFUL: ("doubtful", Rgba(0.9, 0.62, 0.0, 1.0)),
     LOST: ("lost", Rgba(0.84, 0.37, 0.0, 1.0)),
 }
-_TRUNK, _ELLIPSE = Rgba(0.0, 0.45, 0.7, 1.0), Rgba(0.8, 0.47, 0.65, 0.8)
-_TRUNK_HEIGHT, _LETTERS, _MARKER = 1.5, 1.0, 0.25
+# Colour of the landmarks of the last scan.
+_TRUNK = Rgba(0.0, 0.45, 0.7, 1.0)
+# Colour of the ellipse of the position.
+_ELLIPSE = Rgba(0.8, 0.47, 0.65, 0.8)
+# Height of the cylinders of the landmarks, in m.
+_TRUNK_HEIGHT = 1.5
+# Height of the letters over the carrier, in m.
+_LETTERS = 1.0
+# Radius of the spheres that mark the landmarks of the map, in m.
+_MARKER = 0.25
+# Height of the carrier's roof, in m.
 _ROOF = 1.0
-# The position of the view relative to the carrier in m, and the intensity of the ambient light.
-_VIEW, _AMBIENT = (0.0, -14.0, 26.0), 3.0
+# Position of the view relative to the carrier, in m.
+_VIEW = (0.0, -14.0, 26.0)
+# Intensity of the ambient light.
+_AMBIENT = 3.0
 
 
 class DriverDisplay:
@@ -128,6 +143,34 @@ class DriverDisplay:
         self._meshcat.SetTransform("display/status", RigidTransform(self._place + np.array([0.0, 0.0, 3.0])))
 
 
+class _Shown:
+    """A display in a Meshcat; if that dies, in the next one.
+
+    Attributes:
+        url: The address of the Meshcat.
+    """
+
+    def __init__(self, world_map: WorldModel) -> None:
+        self._map = world_map
+        self._begin()
+
+    def _begin(self) -> None:
+        self._meshcat = make_meshcat()
+        self._display = DriverDisplay(self._meshcat, self._map)
+        self.url = self._meshcat.web_url()
+
+    def show(self, values: Mapping[str, ArrayLike]) -> None:
+        """Show the present values of the unit."""
+        try:
+            self._display.show(values)
+        except RuntimeError:
+            if is_running(self._meshcat):
+                raise
+            click.echo(DEATH, err=True)
+            self._begin()
+            self._display.show(values)
+
+
 def status_text(status: int, covariance: Array) -> str:
     """Return the status in words, and with a pose the larger semi-axis of the ellipse of the position.
 
@@ -167,16 +210,25 @@ def main(scenario: Scenario, url: str, every: int, timeout: float) -> None:
         raise BadInputError(
             f"{type(scenario).__name__} has no localization unit: give a ForestScenario or PlainScenario"
         )
+    extra_module("uvicorn", purpose="the driver's display", extra="web")
+    from vtbdrake.web.serving.host import Host
+
+    shown = _Shown(scenario.global_map())
+    host = Host(lambda: shown.url)
+
+    def print_next() -> None:
+        click.echo(f"for another browser: {host.address(used=print_next)}")
+
     try:
-        meshcat = make_meshcat()
-        display = DriverDisplay(meshcat, scenario.global_map())
-        click.echo(f"the display is at {meshcat.web_url()}")
+        click.echo(f"the display is at {host.address(used=print_next)}")
         for _, values in watch(url, WATCHED, every=every, timeout=timeout):
-            display.show(values)
+            shown.show(values)
     except KeyboardInterrupt:
         return
     except (ValueError, OSError, BridgeError) as error:
         raise BadInputError(one_line(error)) from error
+    finally:
+        host.close()
 
 
 def program() -> None:

@@ -15,7 +15,7 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from PIL import Image
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import deskewed
 from vtbdrake.components.localization.landmarks import map_landmarks
 from vtbdrake.components.localization.planar import transform
@@ -30,12 +30,16 @@ INSTANTS = np.arange(0.95, 7.0, 1.0)
 DEVIATIONS = 3.0
 """The size of the ellipses in standard deviations."""
 
-# The position of the camera in B in m, and the angle in rad by which it looks down.
-_PLACE, _DOWN = (-5.5, 0.0, 4.0), 0.35
+# Position of the camera in B, in m.
+_PLACE = (-5.5, 0.0, 4.0)
+# Angle by which the camera looks down, in rad.
+_DOWN = 0.35
 # Half of the edge length of the area that is drawn around the carrier, in m.
 _REACH = 16.0
-# Colours of Okabe and Ito's palette.
-_SEEN, _POSE = "#0072b2", "#d55e00"
+# Colour of what is seen, from Okabe and Ito's palette.
+_SEEN = "#0072b2"
+# Colour of the pose, from the same palette.
+_POSE = "#d55e00"
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ BOUNDED = "poor"
 LEAST_LOCALIZED = 0.9
 """The least share of the scans that must have a pose, with each map."""
 LARGEST_RATIO = 1.1
-"""The largest ratio of the error with that map to that of the best estimate on the same maps, see `BestError`."""
+"""The largest ratio of the error with that map to the error of the best estimate on the same maps, see `BestError`."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def localization(full: bool) -> Answer:
         + "; ".join(_summary(name, score) for name, score in scores_by_map.items())
         + f". Neighbours on the poor map share their errors: over many such maps, the best unbiased estimate by the "
         f"trees within {REACH:g} m of the path so far errs by {best.least:.2f} m (RMS); on these very maps the unit's "
-        f"error is {best.ratio:.2f} times that of this estimate ({best.interval[0]:.2f} to {best.interval[1]:.2f} with "
+        f"error is {best.ratio:.2f} times as large ({best.interval[0]:.2f} to {best.interval[1]:.2f} with "
         f"95 % over forests; at most {LARGEST_RATIO:g}). Over LCM, fed by another process, "
         + ("the pose is the same." if machine.agrees else f"the pose DIFFERS by {machine.difference:.1e}."),
     )

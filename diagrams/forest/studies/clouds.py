@@ -2,7 +2,7 @@
 
 The clouds are merged from many scans or along a path, so they show trunks from all sides. A scan that is cut out of
 them (`virtual_scan`) has the points that a scanner at one place would see: bark, branches, undergrowth and the noise of
-ranges are those of the recording. The stems that are the reference (`rings`) are circles around hollow rings of points,
+ranges come from the recording. The stems that are the reference (`rings`) are circles around hollow rings of points,
 seen from all sides at several heights: nothing of the detector takes part.
 """
 
@@ -17,27 +17,43 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
-# The edge length (m) of the cells whose lowest points are the ground, how many of them are compared, and how far (m)
-# one may lie above the median of its neighbours.
-_CELL, _NEIGHBOURS, _STEP = 1.0, 9, 0.3
+# Edge length of the cells whose lowest points are the ground, in m.
+_CELL = 1.0
+# Number of cells, the cell itself among them, whose median the ground of a cell is compared with.
+_NEIGHBOURS = 9
+# The ground of a cell lies at most this far above that median, in m.
+_STEP = 0.3
 
-# A point hides what is farther away by more than `_THICKNESS` within this half width and half height around it, in m.
+# A point hides what is farther away by more than `_THICKNESS` within this half width and half height around it.
 # Clouds are thin: 60 points per square metre of bark are 0.13 m apart. Trunks are upright, so the height is larger.
-_HALF_WIDTH, _HALF_HEIGHT, _THICKNESS = 0.06, 0.3, 0.15
+# Half width, in m.
+_HALF_WIDTH = 0.06
+# Half height, in m.
+_HALF_HEIGHT = 0.3
+# Thickness, in m.
+_THICKNESS = 0.15
 
-# The slices in which rings are searched for: their height over the ground and their thickness, in m.
-_SLICES, _SLICE = (0.9, 1.3, 1.7, 2.1, 2.5), 0.4
-# A ring: the half width of its line (m), its radii (m), the number of points, and the number of slices that show it.
-_LINE, _RADII, _LEAST_SLICES = 0.02, (0.03, 0.5), 3
+# Heights over the ground of the slices in which rings are searched for, in m.
+_SLICES = (0.9, 1.3, 1.7, 2.1, 2.5)
+# Thickness of a slice, in m.
+_SLICE = 0.4
+# Half width of the line of a ring, in m.
+_LINE = 0.02
+# Least and largest radius of a ring, in m.
+_RADII = (0.03, 0.5)
+# Number of slices that must show a ring.
+_LEAST_SLICES = 3
 _SECTORS = 20
 # Circles through triples of points near each other, per point.
 _TRIES = 30
 
 
-FULL, PARTIAL = 0.6, 0.35
-"""The shares of a circle on which a full ring has points, and one that was seen from one side."""
+FULL = 0.6
+"""The share of a circle on which a full ring has points."""
+PARTIAL = 0.35
+"""The share of a circle on which a ring has points that was seen from one side."""
 
 
 @dataclass(frozen=True, eq=False)

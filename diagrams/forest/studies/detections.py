@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import chord, compose, inverse, rotations, transform, wrap
 from vtbdrake_diagrams.forest.world.stand import Stand
@@ -168,7 +168,7 @@ def gathered(
     """Return the detections along a drive, merged to landmarks in the last H, and the indices of their trunks.
 
     Each trunk gives one landmark, at the mean of its positions by dead reckoning: the association is assumed perfect.
-    Its covariance is that of one detection plus the drift since the trunk was seen.
+    Its covariance is one detection's plus the drift since the trunk was seen.
 
     Args:
         wood: The trunks.

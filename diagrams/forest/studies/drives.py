@@ -2,12 +2,12 @@
 
 ``python -m vtbdrake_diagrams.forest.studies.drives [--forests N] [--bias B] [--full]`` simulates the carrier in each
 forest once, with its scanner, 50 m far or 500 m, and records what its DPS detects, and its odometry. From these, one
-unit per map localizes, as that of the DPS would. ``--stereo`` gives the carrier a pair of cameras instead of the
+unit per map localizes, as the DPS's would. ``--stereo`` gives the carrier a pair of cameras instead of the
 scanner, ``--simulated`` takes simulated detections (`detections`), ``--plain`` drives among rocks instead of trees.
 
 The criteria, fixed before any of the forests from `SEED` on was driven:
 
-* Errors of position and heading are those of all scans at which the unit is tracking, from the first fix to the end,
+* Errors of position and heading are taken over all scans at which the unit is tracking, from the first fix to the end,
   over all forests; nothing is left out.
 * The normalized estimation error squared (NEES) has 3 degrees of freedom. Its mean is compared with its 95 % bounds at
   places `INDEPENDENT` m of path apart, the last one of each drive among them: nearer ones share trees, and with them
@@ -31,8 +31,8 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.dead_reckoning import carrier_pose_at
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import wrap
@@ -187,8 +187,8 @@ def simulated_drive(
         stand: The stand, in which the circle has a radius of a third of its smaller extent.
         seed: Determines the start of the drive, false trunks, detections and drift.
         length: The length of the drive in m.
-        detector: The performance of the detector; by default that of `Detector`.
-        odometry: The drift of the dead reckoning; by default that of `Odometry`.
+        detector: The performance of the detector; by default `Detector`.
+        odometry: The drift of the dead reckoning; by default `Odometry`.
     """
     detector, odometry = detector or Detector(), odometry or Odometry()
     rng = np.random.default_rng([seed, 8])
@@ -382,7 +382,7 @@ def best_estimates(
 
 @dataclass(frozen=True)
 class BestError:
-    """The errors of a unit beside those of the best estimate, `best_estimates`, at the same scans.
+    """The errors of a unit beside the errors of the best estimate, `best_estimates`, at the same scans.
 
     Attributes:
         least: RMS error of the best estimate over all maps of this kind, in m.
@@ -401,7 +401,7 @@ class BestError:
 def against_best(
     tracks: Mapping[int, Track], name: str, *, scenario: Callable[[int], CarrierScenario] | None = None
 ) -> BestError:
-    """Compare the errors of a unit with those of the best estimate on the same maps.
+    """Compare the errors of a unit with the errors of the best estimate on the same maps.
 
     Args:
         tracks: The tracks by the seed of their scenario.

@@ -118,7 +118,7 @@ def recorded_pairs(seed: int, tables: tuple[dict[str, Any], dict[str, Any]]) -> 
 
 
 def _thinned(landmarks: Landmarks, rng: np.random.Generator) -> Landmarks:
-    """Return landmarks of which up to a third are left out."""
+    """Return landmarks; up to a third are left out."""
     return landmarks.select(rng.random(len(landmarks)) > rng.uniform(0.0, 0.33))
 
 

@@ -17,8 +17,8 @@ true errors of all routes, and in the end the gains of the choices. The criteria
   The choice cannot profit from properties of the map in use alone, such as the trees that this map lacks by chance. Its
   gain with the map in use, one draw per forest, is printed, too.
 * The error of a scan is at most `UNKNOWN`, and `UNKNOWN` without a pose.
-* The gain of a forest is the error of the route in use, or the mean error of all routes, less that of the chosen one.
-  Its standard error is that over the forests.
+* The gain of a forest is the error of the route in use, or the mean error of all routes, less the error of the chosen
+  one. Its standard error is that over the forests.
 * A carrier that is not localized after `FOUND` s cannot choose. Its forest is printed, and left out.
 """
 
@@ -31,8 +31,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.unit import TRACKING
 from vtbdrake.components.world_model import WorldModel
 from vtbdrake.reasoning import Decision, Reasoner
@@ -85,7 +85,7 @@ class RouteScenario(ForestScenario):
     density: float = 600.0
     map: str = "remote"
     speed: float = 2.0
-    # Whether the simulated forest is that of the map, without clutter, as in a mental copy.
+    # Whether the simulated forest is the map's, without clutter, as in a mental copy.
     is_imagined: bool = field(default=False, kw_only=True)
 
     def validate(self) -> None:
@@ -162,7 +162,7 @@ class RouteAnswer:
 
     @property
     def choice(self) -> int:
-        """The number of the route that was chosen; that of the route in use if the decision sets none."""
+        """The number of the route that was chosen; the number of the route in use if the decision sets none."""
         return round(float(self.decision.values.get(ROUTE, self.in_use)))
 
     @property

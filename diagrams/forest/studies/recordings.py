@@ -30,8 +30,16 @@ FOLDER = Path(os.environ.get("VTBDRAKE_RECORDINGS", Path(__file__).parents[4] / 
 _COMPRESSED = {b"\xfd7zXZ": lzma.decompress, b"BZh": bz2.decompress, b"\x1f\x8b": gzip.decompress}
 
 # Types of R's serialized objects.
-_SYMBOL, _PAIRS, _CHARACTERS, _LOGICAL, _INTEGER, _REAL, _STRING, _LIST = 1, 2, 9, 10, 13, 14, 16, 19
-_NIL, _REFERENCE = 254, 255
+_SYMBOL = 1
+_PAIRS = 2
+_CHARACTERS = 9
+_LOGICAL = 10
+_INTEGER = 13
+_REAL = 14
+_STRING = 16
+_LIST = 19
+_NIL = 254
+_REFERENCE = 255
 
 
 def stems(table: dict[str, Any], plot: int, *, deviation: float, diameter: float) -> Landmarks:

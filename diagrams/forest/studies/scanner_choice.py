@@ -19,8 +19,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.visualization.plots import Picture, draw_mesh, finish, mark_best
 from vtbdrake_diagrams.forest.scenario import ForestScenario

@@ -16,8 +16,8 @@ import click
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from vtbdrake.arrays import Array
 from vtbdrake.cli.output import table
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks

@@ -4,7 +4,7 @@
 the detections (`detections`), and reports how often the matching of constellations was sure and right, sure and wrong,
 or not sure. Nothing moves: a rollout of a `TrialScenario` is one trial.
 
-The criteria, fixed before any result was seen, are those of the file:
+The criteria, fixed before any result was seen, are in the file:
 
 * Places and headings are uniform in a stand of 1 ha; in the cases ``inside``, at least `MARGIN` from its edge, and in
   the cases ``edge`` nearer, where fewer trees are within reach: there are none outside of the stand.
@@ -25,11 +25,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, wrap
-from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, Scenario, VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.studies.detections import Detector, Odometry, Wood, arc, gathered
@@ -85,8 +85,8 @@ def run(case: Case, *, seed: int, detector: Detector | None = None, odometry: Od
     Args:
         case: The kind of trial.
         seed: Determines stand, map, place and detections.
-        detector: The detector; by default that of `Detector`, with a share of false trunks from 0.3 to 0.4.
-        odometry: The drift of the dead reckoning; by default that of `Odometry`.
+        detector: The detector; by default `Detector`, with a share of false trunks from 0.3 to 0.4.
+        odometry: The drift of the dead reckoning; by default `Odometry`.
     """
     rng = np.random.default_rng([seed, 7])
     stand = _stand(case, seed)

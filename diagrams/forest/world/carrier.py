@@ -19,7 +19,7 @@ length. In a steady curve, u = sigma w / |V|: F is proportional to the slip angl
 C sigma; at rest, the tyre is a spring, and holds the machine on a slope. F is at most mu N (Coulomb).
 
 Drive and steering are ideal but not instantaneous: treads run at the speeds that the machine's geometry prescribes
-(Ackermann: the front wheels steer, and their axes meet that of the rear ones), while speed and curvature follow the
+(Ackermann: the front wheels steer, and their axes meet the rear axis), while speed and curvature follow the
 driver's commands at limited rates. So wheels slip as forces demand, and the wheel odometry is wrong by this slip.
 """
 
@@ -45,7 +45,7 @@ from pydrake.systems.framework import (
     DiscreteValues,
 )
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.components.sensors.sampled import SampledSensor
 from vtbdrake.state import AddressedSystem, Quantity
@@ -56,7 +56,8 @@ INSTANCE = "carrier"
 # The scanner's mast ends at this distance below the scanner's origin, in m.
 _BELOW_SCANNER = 0.12
 
-_GREEN, _BLACK = np.array([0.2, 0.45, 0.25, 1.0]), np.array([0.1, 0.1, 0.1, 1.0])
+_GREEN = np.array([0.2, 0.45, 0.25, 1.0])
+_BLACK = np.array([0.1, 0.1, 0.1, 1.0])
 
 
 @dataclass(frozen=True)

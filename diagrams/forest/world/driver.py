@@ -13,9 +13,10 @@ from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake_diagrams.forest.world.carrier import quaternion_matrix
 from vtbdrake_diagrams.forest.world.routes import Route
 
-# The distance along the route of the point that the driver steers to, and the distance from the route beyond which
-# the driver looks for it again, in m.
-_LOOK_AHEAD, _LOST = 3.0, 2.5
+# Distance along the route of the point that the driver steers to, in m.
+_LOOK_AHEAD = 3.0
+# Distance from the route beyond which the driver looks for it again, in m.
+_LOST = 2.5
 # Two routes are the same road where they are nearer to each other than this, in m.
 _SAME_ROAD = 0.2
 
@@ -33,7 +34,7 @@ class Driver(AddressedSystem):
         - controls
 
     ``state`` is the plant's [q; v], ``route`` the number of the advised route. ``controls`` are the speed (m/s) and the
-    curvature (1/m, to the left) of the path of the middle of the rear axle. The curvature is that of pure pursuit: of
+    curvature (1/m, to the left) of the path of the middle of the rear axle. The curvature follows pure pursuit: of
     the circle through a point some metres ahead on the route (Coulter, "Implementation of the pure pursuit path
     tracking algorithm", CMU-RI-TR-92-01, 1992).
 

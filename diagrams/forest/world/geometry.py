@@ -13,7 +13,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.meshes import Surface, surface_mesh
 from vtbdrake.components.textures import grain, tiled_mesh
 from vtbdrake_diagrams.forest.world.ground import Ground
@@ -23,19 +23,16 @@ from vtbdrake_diagrams.forest.world.vegetation import Vegetation, branches, crow
 # The ground goes on around a stand by this distance, in m.
 _MARGIN = 15.0
 
-# The extents of grained images in m: of bark, which is stretched upwards, and of everything else.
-_BARK_TILE, _TILE = (2.0, 40.0), (5.0, 5.0)
+# Extents of the grained image of bark, which is stretched upwards, in m.
+_BARK_TILE = (2.0, 40.0)
+# Extents of all other grained images, in m.
+_TILE = (5.0, 5.0)
 
-_SOIL, _BARK, _NEEDLES, _DEAD, _LEAVES = (
-    np.array(color)
-    for color in (
-        (0.35, 0.3, 0.2, 1.0),
-        (0.36, 0.27, 0.2, 1.0),
-        (0.15, 0.32, 0.17, 1.0),
-        (0.4, 0.37, 0.33, 1.0),
-        (0.3, 0.5, 0.2, 1.0),
-    )
-)
+_SOIL = np.array([0.35, 0.3, 0.2, 1.0])
+_BARK = np.array([0.36, 0.27, 0.2, 1.0])
+_NEEDLES = np.array([0.15, 0.32, 0.17, 1.0])
+_DEAD = np.array([0.4, 0.37, 0.33, 1.0])
+_LEAVES = np.array([0.3, 0.5, 0.2, 1.0])
 
 
 def add_surface(

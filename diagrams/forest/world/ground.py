@@ -9,13 +9,18 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.meshes import Surface
-from vtbdrake.settings import check_settings, setting
 
-# Wave lengths in m of hills and of bumps, and the numbers of their waves.
-_HILLS, _BUMPS = (40.0, 150.0), (2.5, 8.0)
-_HILL_WAVES, _BUMP_WAVES = 16, 48
+# Least and largest wave length of hills, in m.
+_HILLS = (40.0, 150.0)
+# Least and largest wave length of bumps, in m.
+_BUMPS = (2.5, 8.0)
+# Number of waves that make the hills.
+_HILL_WAVES = 16
+# Number of waves that make the bumps.
+_BUMP_WAVES = 48
 
 # The stream of random numbers; `stand` has others.
 _GROUND = 2

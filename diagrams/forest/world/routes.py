@@ -10,18 +10,23 @@ from math import atan2, cos, pi, sin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 # The stream of random numbers; `stand` and `ground` have others.
 _ROADS = 3
 
-# The distance of the points of a route, and the radius of its bends, in m.
-_STEP, _BEND = 0.25, 6.0
+# Distance of the points of a route, in m.
+_STEP = 0.25
+# Radius of its bends, in m.
+_BEND = 6.0
 # The distance of the outer roads from the border of the stand, in m.
 _BORDER = 8.0
-# Roads wind: the length of the waves that displace them in m, the standard deviation of the displacement in m, and the
-# number of waves.
-_WINDING, _ASIDE, _WAVES = 60.0, 0.8, 6
+# Roads wind: length of the waves that displace them, in m.
+_WINDING = 60.0
+# Standard deviation of the displacement, in m.
+_ASIDE = 0.8
+# Number of waves.
+_WAVES = 6
 
 
 @dataclass(frozen=True, eq=False)

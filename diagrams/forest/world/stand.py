@@ -16,15 +16,17 @@ from math import exp, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array
-from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
+from vtbdrake.components.world_model import AttributeValue, WorldModel, WorldObject, position_estimate
 from vtbdrake_diagrams.forest.world.routes import Route, distances, strip_roads
 
 HECTARE = 1e4
 
 # Streams of random numbers: trees, maps and storms of one seed are independent.
-_TREES, _MAP, _STORM = 0, 1, 10
+_TREES = 0
+_MAP = 1
+_STORM = 10
 
 # Coefficients of Näslund's curve h = 1.3 m + d² / (a + b d)² with d in cm, assumed: 20 m at 30 cm.
 _NAESLUND = (1.2, 0.19)
@@ -35,12 +37,18 @@ _LARGEST_COVERAGE = 0.45
 KINDS = ("natural", "clustered", "plantation", "windthrown")
 """The kinds of stands, see `Stand`."""
 
-# A clustered stand has so many clusters per hectare, of this radius in m.
-_CLUSTERS, _CLUSTER_RADIUS = 60.0, 6.0
-# A storm leaves so many gaps per hectare, of this radius in m, which may overlap [assumed].
-_GAPS, _GAP_RADIUS = 3.0, 25.0
-# The distance of the rows of a plantation, and the standard deviation per axis with which trees are planted, in m.
-_ROWS, _JITTER = 2.5, 0.15
+# Clusters per hectare of a clustered stand.
+_CLUSTERS = 60.0
+# Radius of a cluster, in m.
+_CLUSTER_RADIUS = 6.0
+# Gaps per hectare that a storm leaves, which may overlap [assumed].
+_GAPS = 3.0
+# Radius of a gap, in m [assumed].
+_GAP_RADIUS = 25.0
+# Distance of the rows of a plantation, in m.
+_ROWS = 2.5
+# Standard deviation per axis with which trees are planted in a row, in m.
+_JITTER = 0.15
 # The number of attempts to place one tree.
 _ATTEMPTS = 2_000
 
@@ -78,7 +86,7 @@ class Stand:
     """A rectangular stand on flat ground from (0, 0) to (length, width). The same seed gives the same stand.
 
     Diameters follow a Weibull distribution (with the shape 1 it is exponential, with 3.6 nearly normal) that is cut off
-    at the least and the largest diameter. Positions are those of a hard-core process: trees are placed at random one
+    at the least and the largest diameter. Positions follow a hard-core process: trees are placed at random one
     after the other, and a place too close to an earlier tree is given up. In a ``natural`` stand all places are equally
     likely. In a ``clustered`` one, they lie in discs around points that are placed at random: a Matérn cluster process
     (Matérn, "Spatial Variation", 1960) with a hard core. In a ``plantation``, trees stand in rows along x, 2.5 m apart,
@@ -143,31 +151,24 @@ class Stand:
 
     def trees(self) -> WorldModel:
         """Return the true trees: exact positions, trunk diameters and heights in m."""
-        rng = np.random.default_rng([self.seed, _TREES])
-        places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
-        diameters = self.diameters(rng.random(self.count))
-        is_free = distances(self.routes(), places) > 0.5 * (self.road_width + diameters)
-        objects = (
-            _tree(f"tree-{k}", places[k], diameters[k], source=f"stand {self.seed}")
-            for k in np.flatnonzero(is_free & ~self._felled(places))
-        )
-        return WorldModel(objects)
+        source = f"stand {self.seed}"
+        return WorldModel(_tree(f"tree-{k}", *tree, source=source) for k, *tree in zip(*self._grown(), strict=True))
 
     def map(self, errors: MapErrors, *, seed: int = 0) -> WorldModel:
         """Return a map of the trees with errors; its identities do not show which tree is meant.
 
-        Its covariances are those of the errors of position, per tree: a world model cannot contain correlations.
+        Its covariances describe the errors of position, per tree: a world model cannot contain correlations.
 
         Args:
             errors: The errors of the map.
             seed: Determines the errors, together with the seed of the stand.
         """
         rng = np.random.default_rng([self.seed, _MAP, seed])
-        truth = tuple(self.trees())
+        _, true_places, true_diameters = self._grown()
         places, diameters = surveyed(
             rng,
-            np.array([tree.p_WoOo_W[:2] for tree in truth]).reshape(-1, 2),
-            np.array([tree.number("trunk_diameter", unit="m") for tree in truth]),
+            true_places,
+            true_diameters,
             errors=errors,
             area=(self.length, self.width),
             false_diameters=self.diameters,
@@ -176,6 +177,15 @@ class Stand:
             _tree(f"map-{k}", place, diameter, errors=errors, source=f"map {seed} of stand {self.seed}")
             for k, (place, diameter) in enumerate(zip(places, diameters, strict=True))
         )
+
+    def _grown(self) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return the numbers (n,), the places (n, 2) and the trunk diameters (n,) of the true trees, in m."""
+        rng = np.random.default_rng([self.seed, _TREES])
+        places = self._planted(rng) if self.kind == "plantation" else self._places(rng)
+        diameters = self.diameters(rng.random(self.count))
+        is_free = distances(self.routes(), places) > 0.5 * (self.road_width + diameters)
+        rows = np.flatnonzero(is_free & ~self._felled(places))
+        return rows, places[rows], diameters[rows]
 
     def _places(self, rng: np.random.Generator) -> Array:
         """Return places of a hard-core process, (count, 2)."""
@@ -287,8 +297,8 @@ def _tree(identity: str, place: Array, diameter: float, *, errors: MapErrors | N
         "tree",
         position_estimate([*place, 0.0], deviation=[position, position, 0.0]),
         attributes={
-            "trunk_diameter": Quantity(diameter, "m", share * diameter),
-            "height": Quantity(tree_height(diameter), "m"),
+            "trunk_diameter": AttributeValue(diameter, "m", share * diameter),
+            "height": AttributeValue(tree_height(diameter), "m"),
         },
         source=source,
     )

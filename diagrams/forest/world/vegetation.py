@@ -10,26 +10,44 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.meshes import Surface, copies, unit_cone, unit_sphere
 from vtbdrake.components.world_model import WorldModel
-from vtbdrake.settings import check_settings, setting
 from vtbdrake_diagrams.forest.world.ground import Ground
 
 BREAST_HEIGHT = 1.3
 """The height over the ground in m at which the diameter of a trunk is measured."""
 
-# The number of facets of a trunk, and its depth in the ground in m.
-_FACETS, _ROOTED = 24, 0.5
-# The height at which a crown begins, and its diameter, as shares of the tree's height.
-_CROWN_BASE, _CROWN_DIAMETER = 0.45, 0.2
-# Dead branches: ranges of the heights where they leave the trunk, of lengths and radii in m; their elevation in rad.
-_BRANCH_HEIGHT, _BRANCH_LENGTH, _BRANCH_RADIUS, _BRANCH_ELEVATION = (0.4, 5.0), (0.3, 1.3), (0.004, 0.012), 0.35
-# A bush: the number of its blades, and ranges of its radius and height and of the width of a blade, in m.
-_BLADES, _BUSH_RADIUS, _BUSH_HEIGHT, _BLADE_WIDTH = 30, (0.2, 0.6), (0.3, 1.3), (0.01, 0.06)
+# Number of facets of a trunk.
+_FACETS = 24
+# Depth of a trunk in the ground, in m.
+_ROOTED = 0.5
+# Height at which a crown begins, as a share of the tree's height.
+_CROWN_BASE = 0.45
+# Diameter of a crown, as a share of the tree's height.
+_CROWN_DIAMETER = 0.2
+# Range of the heights where dead branches leave the trunk, in m.
+_BRANCH_HEIGHT = (0.4, 5.0)
+# Range of their lengths, in m.
+_BRANCH_LENGTH = (0.3, 1.3)
+# Range of their radii, in m.
+_BRANCH_RADIUS = (0.004, 0.012)
+# Their elevation, in rad.
+_BRANCH_ELEVATION = 0.35
+# Number of blades of a bush.
+_BLADES = 30
+# Range of the radii of bushes, in m.
+_BUSH_RADIUS = (0.2, 0.6)
+# Range of their heights, in m.
+_BUSH_HEIGHT = (0.3, 1.3)
+# Range of the widths of their blades, in m.
+_BLADE_WIDTH = (0.01, 0.06)
 
 # Streams of random numbers; `stand`, `ground`, `routes` and `plain` have others.
-_BRANCHES, _UNDERGROWTH, _LEAN = 4, 5, 8
+_BRANCHES = 4
+_UNDERGROWTH = 5
+_LEAN = 8
 
 # A flat, pointed leaf in the plane of x and z.
 _BLADE: Surface = (np.array([(-0.5, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 1.0)]), np.array([(0, 1, 2)]))

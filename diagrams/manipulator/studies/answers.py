@@ -30,11 +30,15 @@ from vtbdrake_diagrams.manipulator.studies.trials import (
 
 LAWS = {"impedance": "cartesian_impedance", "admittance": "admittance"}
 
-# Masses, friction and other parameters of the machine differ from those of the simulation.
-PERTURB, SEED = 0.05, 7
+# Masses, friction and other parameters of the machine differ from the DPS's by up to this fraction.
+PERTURB = 0.05
+# Seed by which they are drawn.
+SEED = 7
 
-# The largest tracking error of the tip, RMS, in m; and the largest ratio of that on the machine to that in simulation.
-TOLERANCE, RATIO = 0.005, 2.0
+# Largest tracking error of the tip, RMS, in m.
+TOLERANCE = 0.005
+# Largest ratio of the tracking error on the machine to the one in simulation.
+RATIO = 2.0
 
 # Cycles for which the whole testbed commands the machine, in the short version; fewer show nothing.
 COMPARED = 3000

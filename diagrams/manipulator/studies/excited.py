@@ -8,11 +8,11 @@ import casadi
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from vtbdrake.common.settings import setting
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.casadi_system import CasadiSystem, clamp
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.deployment import Deployment
-from vtbdrake.settings import setting
-from vtbdrake.spline import Spline
 from vtbdrake.testbed import Interface, Signal
 from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.dps import SENSOR_SIGNALS, gravity_torque
@@ -71,7 +71,7 @@ class ExcitedArmScenario(ManipulatorScenario):
 def make_dps(spline: Spline, *, period: float = 0.001, compile: bool = True) -> Diagram:
     """Return the DPS: ``env`` perceives, ``reference`` follows the plan, ``impl`` controls.
 
-    Ports are those of `vtbdrake_diagrams.manipulator.dps.make_dps`, with the command ``plan`` in place of ``motion``.
+    Ports are as in `vtbdrake_diagrams.manipulator.dps.make_dps`, with the command ``plan`` in place of ``motion``.
 
     Args:
         spline: The curve of a plan.

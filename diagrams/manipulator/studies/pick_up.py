@@ -31,7 +31,8 @@ from vtbdrake_diagrams.manipulator.arm import JOINTS, Arm
 from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 
-MASS, CENTER = "sim.sys.arm.tool.mass", "sim.sys.arm.tool.center_of_mass"
+MASS = "sim.sys.arm.tool.mass"
+CENTER = "sim.sys.arm.tool.center_of_mass"
 PARAMETERS = (Parameter(MASS, 0.05, 10.0), *(Parameter(f"{CENTER}[{k}]", -0.5, 0.5) for k in range(3)))
 KNOWN_AS = {MASS: "dps.tool.mass", **{f"{CENTER}[{k}]": f"dps.tool.center[{k}]" for k in range(3)}}
 
@@ -47,8 +48,12 @@ TOLERANCE = {
 # For the calibration: the encoders' noise, and a disturbance of 0.05 N m that is correlated over 0.05 s.
 FIT_NOISE = Noise(np.full(JOINTS, 1e-5), np.full(JOINTS, 0.05), 0.05)
 
-SECONDS, SETTLE = 2.0, 0.2  # s, of the samples, and of what is left out after the alarm
-_PATIENCE = 300.0  # s that the machine or the calibration may take for an answer
+# Duration of the samples for the calibration, in s.
+SECONDS = 2.0
+# Time after the alarm that is left out of them, in s.
+SETTLE = 0.2
+# Time that the machine or the calibration may take for an answer, in s.
+_PATIENCE = 300.0
 # Joint 2 must come so close to its reference, in rad.
 LARGEST_ERROR = 2.5e-3
 STIFFNESS = "dps.impl.stiffness[1]"
@@ -80,7 +85,7 @@ class Outcome(NamedTuple):
         refit: The new model.
         to_alarm: Time in s of the DPS from the pick-up to the alarm.
         to_samples: To the last of the samples that the model was fitted to.
-        mass_error, center_error: Of the new model, in kg and m.
+        mass_error, center_error: Errors of the new model, in kg and m.
         alarms: Number of alarms that were active before the model was taken, and a second afterwards.
     """
 
@@ -116,7 +121,7 @@ def arm_loop(scenario: ManipulatorScenario, values: Mapping[str, Any], **options
 def watched(
     loop: Runtime, scenario: ManipulatorScenario, **options: Any
 ) -> Iterator[tuple[ResidualMonitor, ModelRefit]]:
-    """Watch a loop by residuals, and refit the tool after an alarm; ``options`` are those of `ModelRefit`.
+    """Watch a loop by residuals, and refit the tool after an alarm; see `ModelRefit` for ``options``.
 
     The residuals are computed in the loop's process, which the machine waits for, so that a trial can be repeated.
     """

@@ -1,6 +1,6 @@
 """Self-test of the arm's calibration: payload, friction, reflected inertia and delay of machines, hidden from it.
 
-``python -m vtbdrake_diagrams.manipulator.studies.self_test`` prints it. The motion is that of `excitation`; the
+``python -m vtbdrake_diagrams.manipulator.studies.self_test`` prints it. The motion comes from `excitation`; the
 encoders have a resolution, and torques that no log contains act on the joints.
 """
 
@@ -19,8 +19,10 @@ from vtbdrake.state.variables import text_table
 from vtbdrake_diagrams.manipulator.arm import JOINTS
 from vtbdrake_diagrams.manipulator.studies.excited import PLAN, ExcitedArmScenario
 
-POSITION, TORQUE = "joint_position", "joint_torque"
-PAYLOAD, DELAY = "sim.sys.arm.tool.mass", "sim.act.drives.delay"
+POSITION = "joint_position"
+TORQUE = "joint_torque"
+PAYLOAD = "sim.sys.arm.tool.mass"
+DELAY = "sim.act.drives.delay"
 RESOLUTION = 2.0 * np.pi / 2**20
 """The resolution of the encoders, in rad: 20 bits."""
 DISTURBANCE = 0.05
@@ -81,7 +83,7 @@ def group_table(result: SelfTest) -> str:
 @click.command()
 @click.option("--seconds", default=10.0, show_default=True, help="The duration of a log, in seconds.")
 @click.option("--trials", default=10, show_default=True, help="The number of hidden truths.")
-@click.option("--disturbance", default=DISTURBANCE, show_default=True, help="Of each joint's torque, in N m.")
+@click.option("--disturbance", default=DISTURBANCE, show_default=True, help="Deviation of each joint's torque, in N m.")
 @click.option("--seed", default=0, show_default=True, help="The seed of truths and disturbances.")
 def main(seconds: float, trials: int, disturbance: float, seed: int) -> None:
     """Calibrate simulated arms whose numbers are hidden from the calibration, and print how near it came."""

@@ -29,7 +29,7 @@ PROGRAM = (Motion.SWING, Motion.CIRCLE, Motion.PRESS)
 FREE = (Motion.SWING, Motion.CIRCLE)
 
 _STEP = 1e-4  # s, of the prediction's integration
-_AT_REST = 1.0  # N/s; a force that changes less is that of a rest
+_AT_REST = 1.0  # N/s; a force that changes less belongs to a rest
 
 
 def trial_scenario(law: str) -> ManipulatorScenario:
@@ -160,8 +160,8 @@ class LawAlongX:
     ) -> NDArray[np.float64]:
         """Return the force on the wall while the reference of the tip moves as ``along_x``, shape (n,), in N.
 
-        Without inertia that of two springs in series; else of the mass against the wall, which pushes back by Hunt and
-        Crossley's k d (1 + c d').
+        Without inertia the stiffness of two springs in series; else of the mass against the wall, which pushes back by
+        Hunt and Crossley's k d (1 + c d').
         """
         beyond = along_x - (scenario.wall_distance - Arm().ball_radius)
         k, c = scenario.wall_stiffness, scenario.wall_dissipation

@@ -12,9 +12,9 @@ import click
 import numpy as np
 
 from vtbdrake.cli.output import table
+from vtbdrake.common.validity_domain import ValidityDomain
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.rollout import RolloutResult, RolloutRunner, RolloutTask
-from vtbdrake.validity_domain import ValidityDomain
 from vtbdrake_diagrams.manipulator.arm import Arm
 from vtbdrake_diagrams.manipulator.motions import Motion
 from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
@@ -22,9 +22,14 @@ from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 FEATURES = ("dps.env.joint_position", "dps.env.joint_velocity", "dps.joint_torque")
 """The features of a state of the arm, for the validity domain of its model."""
 
-WINDOW, HORIZON = 0.1, 8.0  # s
+# Duration of a window of the domain, in s.
+WINDOW = 0.1
+# Duration of a motion, in s.
+HORIZON = 8.0
+# Shares of the calibration's windows that the domain holds.
 QUANTILES = (0.95, 1.0)
-_SWING = np.array([0.6, 0.3, -0.4, 0.4, 0.5, -0.3, 0.6])  # rad
+# Amplitude of the motion of each joint, in rad.
+_SWING = np.array([0.6, 0.3, -0.4, 0.4, 0.5, -0.3, 0.6])
 
 # What differs from the recorded motions: factors of speed and amplitude, the tool's mass in kg, the home pose in rad.
 CASES: Mapping[str, Mapping[str, Any]] = {
@@ -75,8 +80,8 @@ class Shares(NamedTuple):
     """Shares of windows outside a domain, and of recordings that are said to leave it.
 
     Attributes:
-        outside: Of the windows.
-        departures: Of the recordings.
+        outside: Share of the windows.
+        departures: Share of the recordings.
         feature: The one that was named most often.
     """
 

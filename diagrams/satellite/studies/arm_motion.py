@@ -12,13 +12,13 @@ from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import AffineSystem, MatrixGain, ZeroOrderHold
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.compiled_plant import momentum_world, rotation_angle
 from vtbdrake.components.sensors import ErrorModel, JointEncoders
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.optimization.parameter import Parameter
 from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.spline import Spline
 from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, JOINT_NAMES, Servicer
 from vtbdrake_diagrams.satellite.plant import plant_config
@@ -32,8 +32,10 @@ PERIOD = 0.02
 """The sample period of sensors and DPS in s."""
 BASE = "sim.sys.servicer.base.position"
 """The address of the base's pose: quaternion [w, x, y, z] of R_WB, then p_WoBo_W in m, shape (7,)."""
-PLAN, CANDIDATE = "u.plan", "dps.planner.candidate"
-"""The addresses of the plan [t_begin, knots in rad]: the command, or what the DPS decides itself."""
+PLAN = "u.plan"
+"""The address of the commanded plan [t_begin, knots in rad]."""
+CANDIDATE = "dps.planner.candidate"
+"""The address of the plan that the DPS decides itself, likewise [t_begin, knots in rad]."""
 
 SAMPLE_PERIOD = 0.1
 """The sample period of the quality in s."""
@@ -52,7 +54,7 @@ class ArmMotionScenario(Scenario):
 
     The plan is the command ``u.plan``; or, with ``onboard``, the decision of a reasoner that is a part of the DPS,
     ``dps.planner``. Until something else is decided, the plan is the straight path in joint space, which begins after
-    ``thinking_time``; if that exceeds a limit, the arm stays. The world is that of the capture, without the target. A
+    ``thinking_time``; if that exceeds a limit, the arm stays. The world is the capture's, without the target. A
     mental copy has no forces: there, the base moves as momentum demands.
     """
 
@@ -60,7 +62,7 @@ class ArmMotionScenario(Scenario):
     # Joint positions in rad, one per joint of the arm.
     start: list[float] = field(default_factory=lambda: list(Servicer().stowed))
     goal: list[float] = field(default_factory=lambda: list(REACHING))
-    # Of the move, in seconds; and the knots of its plan.
+    # Duration of the move, in seconds; and the knots of its plan.
     duration: float = 20.0
     knots: int = 9
     # Whether the DPS decides the plan itself; and in a mental copy of it, where it does not reason again.

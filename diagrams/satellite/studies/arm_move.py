@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.compiled_plant import BaseMotion, BaseReaction, MomentumModel, base_poses
 from vtbdrake.components.compiled_plant.links import Expression
-from vtbdrake.spline import Spline
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINT_NAMES, ARM_JOINTS, Servicer
 from vtbdrake_diagrams.satellite.plant import add_servicer
 from vtbdrake_diagrams.satellite.studies.clearance import CLEARANCE, ArmClearance
@@ -45,9 +45,10 @@ REACH = 1.2
 _STEPS_PER_PIECE = 6
 # Where the bar is in the middle of the arm's workspace, the gripper looking ahead (rad).
 REACHING = (0.0, 0.9, 0.0, 1.9, 0.0, 1.0, 0.0)
-# Instants per step of the integration at which solvers see the clearance; and by how much they keep more of it, in m,
-# because of what lies between.
-_INSTANTS_PER_STEP, _MARGIN = 2, 0.005
+# Instants per step of the integration at which solvers see the clearance.
+_INSTANTS_PER_STEP = 2
+# Clearance that they keep beside what is asked for, because of what lies between these instants, in m.
+_MARGIN = 0.005
 # The share of the rate limits that solvers use: the servos of the full testbed add up to 6 % to the rates of a plan.
 _RATE_SHARE = 0.95
 # The accuracy of the least clearance of a plan, in m.
@@ -73,7 +74,7 @@ class MoveSpace:
         Args:
             duration: The duration of a move in seconds.
             knots: The number of knots of a plan; all but the two at each end are free.
-            servicer: The satellite; by default that of the testbed.
+            servicer: The satellite; by default the testbed's.
 
         Raises:
             ValueError: No knot is free.

@@ -19,20 +19,26 @@ from numpy.typing import NDArray
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver, SolverInterface, SolverOptions
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS
 from vtbdrake_diagrams.satellite.studies.arm_move import FEASIBILITY, RESTING, Move, move_space
 
-GOOD_ENOUGH, GOOD_SHARE = 2e-3, 0.02
-"""The deviation q at which no further start is tried: in rad, and as a share of that on the straight path."""
+GOOD_ENOUGH = 2e-3
+"""The deviation q at which no further start is tried, in rad."""
+GOOD_SHARE = 0.02
+"""The deviation q at which no further start is tried, as a share of the deviation on the straight path."""
 
 # The standard deviation of the starts from the straight path, in rad.
 _SPREAD = 0.2
 # The deviation q in rad at which CasADi's solver stops: the full testbed differs by more.
 _TARGET = 5e-4
-# Scale of the cost for the solvers, and their tolerance and patience.
-_SCALE, _TOLERANCE, _ITERATIONS = 1e2, 1e-4, 60
+# Factor of the cost for the solvers.
+_SCALE = 1e2
+# Tolerance of the solvers, relative to the scaled cost.
+_TOLERANCE = 1e-4
+# Largest number of their iterations.
+_ITERATIONS = 60
 
 
 @dataclass(frozen=True)

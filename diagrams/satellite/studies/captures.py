@@ -3,7 +3,7 @@
 ``vtbdrake campaign captures.yaml``, in the folder of this module, simulates 40 captures whose tumble rates are drawn
 from [0, `LARGEST_TUMBLE`], with camera and scanner in the loop, and reports how often they succeed.
 
-The criteria of success, fixed before any result was seen, are those of the file:
+The criteria of success, fixed before any result was seen, are in the file:
 
 * The bar is held: the supervisor is in its mode ``hold``, and the bar is in truth between the fingers' pads, no further
   than 6 cm from the middle of the hand along it, than 2 cm along the direction of approach, and than 1 cm from one
@@ -21,7 +21,7 @@ import casadi
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.state.systems import pose_from_array, pose_later
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, JOINT_NAMES, Target

@@ -35,7 +35,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame
 from pydrake.systems.framework import DiagramBuilder
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.compiled_plant import MomentumModel
 from vtbdrake.components.compiled_plant.links import Expression
 from vtbdrake_diagrams.satellite.bodies import (
@@ -163,7 +163,7 @@ def _function(name: str, q: Expression, values: Sequence[Expression]) -> casadi.
 
 
 def _from_base(s: Servicer, p: Expression) -> dict[str, Expression]:
-    """Return the signed distances of a point p_BoP_B from box, panels and yoke, of which the panels are mirrored."""
+    """Return the signed distances of a point p_BoP_B from box, panels (mirrored) and yoke."""
     yoke = (0.06, s.box[1] + 2 * s.panel_gap, 0.06)
     mirrored = casadi.vertcat(p[0], casadi.fabs(p[1]) - s.panel_centers[0], p[2])
     return {"the base": _from_box(p, s.box), "a panel": _from_box(mirrored, s.panel), "the yoke": _from_box(p, yoke)}
@@ -198,7 +198,8 @@ def _length(a: Expression) -> Expression:
 def _wrist(s: Servicer, angle: Expression) -> Expression:
     """Return a lower bound of the distance of link 7 from link 5, two tubes as they are drawn, for joint 6.
 
-    Both have their axes in one plane. The bound is the largest gap along the axis of link 5, along that of link 7, and
+    Both have their axes in one plane. The bound is the largest gap along the axis of link 5, along the axis of link 7,
+    and
     across the axis of link 5: up to 90 deg the second, beyond it the third, which ends near 110 deg.
     """
     length, fore, hand = s.lengths[5], _TUBE * s.radii[4], _TUBE * s.radii[6]

@@ -10,9 +10,9 @@ time is not bought with accuracy.
 The choices that influence the answer were fixed before the candidates were judged:
 
 * the lights, `LIGHTS`;
-* the candidates, `CANDIDATES`, the first of which are the defaults of the robot;
+* the candidates, `CANDIDATES`; the first are the defaults of the robot;
 * the starts: candidates are chosen on `CHOSEN_ON`, and the choice is compared with the default on others, `CHECKED_ON`,
-  of which no capture had been looked at before;
+  whose captures had not been looked at before;
 * the accuracy that a choice must keep, `ACCURACY`;
 * a capture that has not succeeded by `HORIZON`, or is aborted, costs `FAILURE`.
 
@@ -20,7 +20,7 @@ These choices replace earlier ones, twice, and starts that had been looked at ar
 no wheels: most failures were not due to the light, but to the arm's reaction, which turned the base until the target
 left the image. Then the arm was as abrupt as its gains made it: wheels saturated, twice the speed was the answer, and
 the bar was perceived 17 mm off. Now the arm moves as the wheels allow (see `ArmController`), accuracy is a constraint,
-and pixels saturate as those of a camera do, so that long exposures cost markers in full sun: after they had failed on
+and pixels saturate as a camera's do, so that long exposures cost markers in full sun: after they had failed on
 the start for the choice, the candidates of 1.5 and 2 and the lower threshold were added. Gains of 2/s are left out:
 with them the arm asks the wheels for more than they have, and some captures are aborted.
 
@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.rollout import Executor, ProcessExecutor
 from vtbdrake.state.systems import pose_from_array, pose_to_array
 from vtbdrake.visualization.plots import Picture, finish
@@ -63,14 +63,15 @@ ACCURACY = 0.006
 """The largest mean error of the perceived bar at the grip, in any light, in m: half of what the supervisor allows the
 gripper to be off (``grip_tolerance``), since that comes on top."""
 SAMPLE_PERIOD = 0.2
-"""Of the cost, in s."""
+"""Sample period of the cost, in s."""
 RECORDED = ("sim.sys.servicer.base.pose", "sim.sys.target.body.pose", "dps.impl.relative.relative")
 """What the error of the bar is found from: the true poses, and a `Relative`."""
 
 TELLING = 0.5
 """The least difference of mean times that means anything, in s: the cost has a period of 0.2 s."""
 
-_DIRECTION, _LAMP = "sim.env.light.direction", "sim.sense.docking_camera.lamp"
+_DIRECTION = "sim.env.light.direction"
+_LAMP = "sim.sense.docking_camera.lamp"
 
 
 def _beside(angle_deg: float) -> tuple[float, float, float]:
@@ -86,8 +87,10 @@ LIGHTS: dict[str, dict[str, Any]] = {
 }
 """The conditions by name."""
 
-CHOSEN_ON, CHECKED_ON = (21,), (121, 122, 123)
-"""Start poses (seeds) for the choice, and for the comparison."""
+CHOSEN_ON = (21,)
+"""Start poses (seeds) for the choice."""
+CHECKED_ON = (121, 122, 123)
+"""Start poses (seeds) for the comparison."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,7 @@ def time_to_grip(mode: float, time: float) -> float:
 
 
 def condition(light: str, seed: int) -> dict[str, Any]:
-    """Return a light, and what makes the capture start as that of a scenario with this seed does."""
+    """Return a light, and the values that make the capture start as in a scenario with this seed."""
     scenario = LightingScenario()
     start = random_start(seed, tumble=np.radians(scenario.tumble_deg), distance=scenario.distance)
     return {
@@ -383,7 +386,7 @@ def lighting(full: bool) -> Answer:
         interval=None,
         paper="none given",
         holds=answer.holds,
-        note=f"Compared with the default from {count} start poses, other than those of the choice; without success "
+        note=f"Compared with the default from {count} start poses, other than the choice's; without success "
         f"{FAILURE:g} s; {1e3 * ACCURACY:g} mm allowed. By default: {_table(answer.checked, 0)}. With the choice: "
         f"{_table(answer.checked, 1)}. "
         + (

@@ -8,7 +8,7 @@ The choices that influence the answer were fixed before the first placement was 
 
 * the placements by hand, `BY_HAND`: above the arm, on either side, in a corner, and beside the foot of the arm, all but
   the first aimed at the place where the bar is gripped;
-* the captures, `SEEDS`: the first start poses of the scenario, all of which succeed;
+* the captures, `SEEDS`: the first start poses of the scenario, which all succeed;
 * the time that counts: from the start until the base and the target rest against each other, `HORIZON`;
 * the light: the scenario's own;
 * the least difference that counts: `TELLING` markers. The count is a whole number, and its mean varies by some tenths.
@@ -31,7 +31,7 @@ from matplotlib.patches import Circle
 from numpy.typing import ArrayLike
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Sweep
 from vtbdrake.rollout import Executor, ProcessExecutor, RolloutResult, RolloutRunner
 from vtbdrake.state import NamedVector, Quantity
@@ -65,8 +65,10 @@ FEW = 3
 TELLING = 0.3
 """The least difference of mean counts that means anything, in markers."""
 
-# On the front face, 2 cm before it, as far as the camera's housing fits.
-_X, _REACH = 0.62, 0.45
+# Place of the camera along x of B, in m: 2 cm before the front face.
+_X = 0.62
+# Largest distance from the middle of the face at which the camera's housing fits on it, in m.
+_REACH = 0.45
 # How far the view may turn away from straight ahead, in rad.
 _TURN = 0.5
 # How far the camera stays away from the axis of the arm's foot, in m.
@@ -147,7 +149,7 @@ def scenario() -> SatelliteScenario:
 
 
 def capture(seed: int) -> dict[str, Any]:
-    """Return what makes the capture start as that of a scenario with this seed does."""
+    """Return the values that make the capture start as in a scenario with this seed."""
     defaults = scenario()
     return random_start(seed, tumble=np.radians(defaults.tumble_deg), distance=defaults.distance).values()
 
@@ -268,7 +270,7 @@ def find_mount(*, seeds: Sequence[int], candidates: int, grid: int, executor: Ex
     """Search the best placement, compare it with those by hand, and with a grid over the position.
 
     Args:
-        seeds: Of the captures.
+        seeds: Seeds of the captures.
         candidates: How many placements the search tries.
         grid: The number of points of the grid per side.
         executor: Runs the rollouts.

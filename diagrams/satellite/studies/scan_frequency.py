@@ -23,13 +23,13 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from scipy.stats import binom
 
 import vtbdrake as vtb
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.scan import Scan
+from vtbdrake.common.settings import setting
 from vtbdrake.components.perception.target_tracker import TargetTracker
 from vtbdrake.components.sensors import ErrorModel, Imu
 from vtbdrake.components.sensors.laser_scanner import LaserScanner, LaserScannerConfig, connect_laser_scanner
 from vtbdrake.rollout import Executor, ProcessExecutor
-from vtbdrake.scan import Scan
-from vtbdrake.settings import setting
 from vtbdrake.state.systems import pose_from_array
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.visualization.plots import Picture, finish
@@ -46,7 +46,7 @@ APPROACH = 16.0
 CLOSING_SPEED = 0.1
 """At which speed the target comes closer, in m/s [assumed: usual for the last metres of a rendezvous]."""
 LAST_DISTANCE = 2.3
-"""The distance of its centre from that of the base in the end, in m: within the reach of the arm."""
+"""The distance of its centre from the base's centre in the end, in m: within the reach of the arm."""
 SETTLING = 8.0
 """When the error begins to count, in s: by then the track must have begun."""
 SCANNER = LaserScannerConfig(rays_per_second=12_000.0, azimuth=1.7, elevation=1.0, divergence=0.002)
@@ -58,8 +58,10 @@ TOLERANCE = (Servicer().opening - Target().bar_radius) / 2.0
 """The error that a grip allows, in m: half of the clearance between bar and finger. The arm may need the other half."""
 FREQUENCIES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """The scan frequencies of the grid, in Hz."""
-RAW, DESKEWED = (1.0, 2.0, 4.0), (0.5, 1.0, 2.0, 16.0)
-"""Cells of the short version, with scans as they come and with de-skewed ones."""
+RAW = (1.0, 2.0, 4.0)
+"""Frequencies of the short version with scans as they come, in Hz."""
+DESKEWED = (0.5, 1.0, 2.0, 16.0)
+"""Frequencies of the short version with de-skewed scans, in Hz."""
 TUMBLES = (0.5, 1.0, 2.0, 4.0)
 """The tumble rates, in deg/s: up to the 3 deg/s at which captures must succeed, and one beyond. The short version takes
 every other one."""

@@ -1,6 +1,6 @@
 """Application R2: which trajectory of the arm disturbs the base least, and is it so in the full testbed?
 
-``python -m vtbdrake_diagrams.satellite.studies.trajectory [FILE]`` moves the arm from its stowed pose to that of a
+``python -m vtbdrake_diagrams.satellite.studies.trajectory [FILE]`` moves the arm from its stowed pose to the pose of a
 capture, on the straight path and on the plan that the DPS decides on board, and plots the deviation of the base. With
 ``--pairs N`` it asks for N random pairs of start and goal instead, and prints the factors.
 """
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.compiled_plant import rotation_angle
 from vtbdrake.optimization import Problem
 from vtbdrake.rollout.executor import cores
@@ -43,10 +43,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# How far starts are from the stowed pose, and goals from the middle of the workspace, at most; in rad.
-_START_SPREAD, _GOAL_SPREAD = 0.2, 0.6
-# Fixed before the pairs were drawn: the factor that answers the question; how many pairs are asked, and their seed.
-_FACTOR, _PAIRS, _PAIRS_FULL, _SEED = 10.0, 100, 400, 2027
+# Largest distance of a start from the stowed pose, in rad.
+_START_SPREAD = 0.2
+# Largest distance of a goal from the middle of the workspace, in rad.
+_GOAL_SPREAD = 0.6
+# The factor that answers the question, fixed before the pairs were drawn.
+_FACTOR = 10.0
+# Number of pairs in the short version.
+_PAIRS = 100
+# Number of pairs in the long version.
+_PAIRS_FULL = 400
+# Seed by which they are drawn.
+_SEED = 2027
 # Starts of the solver for a pair.
 _STARTS = 2
 # What the servos add to the rates of the plan, and to its largest deviation; shares.
@@ -229,7 +237,7 @@ class Comparison:
 
     @property
     def turns_within(self) -> bool:
-        """Return whether the deviation on the way is that of the straight path at most."""
+        """Return whether the deviation on the way is at most the straight path's."""
         return self.best.largest <= (1.0 + _OVERSHOOT) * self.straight.largest
 
 
@@ -367,7 +375,7 @@ def plot(courses: dict[str, Course]) -> Figure:
 
 @click.command()
 @click.argument("figure", default="arm_trajectory.png")
-@click.option("--pairs", type=click.IntRange(min=10), help="Ask for so many random motions instead, and print them.")
+@click.option("--pairs", type=click.IntRange(min=10), help="Ask for N random motions instead, and print them.")
 @click.option("--seed", default=_SEED, show_default=True, help="Seed of the random motions.")
 def main(figure: str, pairs: int | None, seed: int) -> None:
     """Simulate the straight path and the decision on board, and write the plot FIGURE."""

@@ -6,7 +6,7 @@ infinite, and t_m is 300 s. The robot asks its own testbed: the rollouts begin a
 The world differs from the map, see `differing`: its ground is wavy, its friction and the robot's mass are others.
 Friction decides which slope is too steep. The robot knows a range of it, and reasons with the lower end (`CAUTION`), so
 that only headings count as passable which are so for all of the range. Among boulders, a decimetre can make the
-difference; so each heading can be tried from several samples of the belief, of which the worst counts.
+difference; so each heading can be tried from several samples of the belief; the worst counts.
 
 ``python -m vtbdrake_diagrams.space_climber.studies.crater`` draws h over a fine grid of headings (Figure 6), and
 compares a continuous search with it.
@@ -56,7 +56,7 @@ STANDING = 2.0
 FRICTION_RANGE = (0.9, 1.1)
 MASS_RANGE = (0.9, 1.1)
 WAVINESS = 0.03
-# Of the believed pose: standard deviations of x and y in m, and of yaw in rad.
+# Standard deviations of the believed pose: x and y in m, yaw in rad.
 POSE_UNCERTAINTY = (0.1, 0.1, 0.0, 0.0, 0.0, 0.02)
 CAUTION = FRICTION_RANGE[0]
 
@@ -284,10 +284,10 @@ def decide_and_climb(seed: int, difference: int, **options: Any) -> Case:
 
 
 @click.command()
-@click.option("--seed", default=0, show_default=True, help="Of the crater.")
-@click.option("--step", default=1.5, show_default=True, help="Of the grid of headings, in deg.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the crater.")
+@click.option("--step", default=1.5, show_default=True, help="Step of the grid of headings, in deg.")
 @click.option("--candidates", default=24, show_default=True, help="How many headings the continuous search tries.")
-@click.option("--horizon", default=HORIZON, show_default=True, help="Of every rollout, in s.")
+@click.option("--horizon", default=HORIZON, show_default=True, help="Horizon of every rollout, in s.")
 @click.option("--figure", default="headings.png", show_default=True, help="File of the picture.")
 def main(seed: int, step: float, candidates: int, horizon: float, figure: str) -> None:
     """Draw h over the heading in the robot's model of a crater, and search continuously with CEM."""

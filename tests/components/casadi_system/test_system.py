@@ -119,7 +119,7 @@ def test_state_and_parameters_are_variables_by_address():
 def test_autodiff_carries_the_analytic_derivatives():
     system = CasadiSystem(_law(), parameters={"gain": [3.0, 4.0]}).ToAutoDiffXd()
     q, v = np.array([0.3, -0.4]), np.array([1.0, 2.0])
-    # Derivatives by three decision variables, of which the third also moves a gain.
+    # Derivatives by three decision variables; the third one also moves a gain.
     dq, dv = np.array([[1.0, 0.0, 2.0], [0.5, 1.0, 0.0]]), np.array([[0.0, 3.0, 0.0], [1.0, 0.0, 1.0]])
     context = _in_context(
         system, q=InitializeAutoDiff(q, gradient=dq).ravel(), v=InitializeAutoDiff(v, gradient=dv).ravel()

@@ -116,7 +116,7 @@ def states(plant: MultibodyPlant, count: int = 5):
 
 
 def simulate(plant: MultibodyPlant, context, u: np.ndarray, steps: int) -> np.ndarray:
-    """The state after each step of Drake, from that of a context, which stays as it is, shape (steps, nx)."""
+    """The state after each step of Drake, from the state of a context, which stays as it is, shape (steps, nx)."""
     simulator = Simulator(plant, context.Clone())
     own = simulator.get_mutable_context()
     found = []

@@ -1,4 +1,4 @@
-"""The equations of motion in CasADi are those of Drake."""
+"""The equations of motion in CasADi are Drake's."""
 
 from __future__ import annotations
 

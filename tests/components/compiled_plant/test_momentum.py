@@ -12,8 +12,8 @@ from pydrake.systems.analysis import Simulator
 from scipy.integrate import solve_ivp
 
 from tests.components.compiled_plant.plants import cart_pole, floating, inertia
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.compiled_plant import BaseReaction, MomentumModel, UnsupportedPlantError, momentum_world
-from vtbdrake.spline import Spline
 
 SPLINE = Spline("bspline", 8, 3.0)
 STEPS = 60

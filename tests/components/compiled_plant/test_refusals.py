@@ -1,4 +1,4 @@
-"""What cannot be compiled is refused by name."""
+"""Plants that cannot be compiled are refused by name."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def drive(
     start=None,
     odometry=ODOMETRY,
 ) -> Drive:
-    """Simulate a drive; with ``elsewhere``, the map is that of the stand with that seed."""
+    """Simulate a drive; with ``elsewhere``, the map shows the stand with that seed."""
     rng = np.random.default_rng([seed, 11])
     stand = Stand(seed=seed, density=density, length=SIZE, width=SIZE)
     mapped = stand if elsewhere is None else Stand(seed=elsewhere, density=density, length=SIZE, width=SIZE)

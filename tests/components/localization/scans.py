@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 BREAST = 1.3
 
@@ -51,7 +51,7 @@ class Scene:
             eye: Where the rays come from, (3,).
             noise: Standard deviation of the ranges in m.
             turn: By what the rays are turned about z, in rad.
-            seed: Of the noise.
+            seed: The seed of the noise.
             rows: How many rows of rays there are.
         """
         c, s = np.cos(turn), np.sin(turn)

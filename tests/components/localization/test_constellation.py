@@ -73,6 +73,7 @@ def test_deviations_of_pairs_are_those_of_drawn_distances():
         np.testing.assert_allclose(pairs.deviations, np.std(np.diff(here - mapped)), rtol=0.01)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", [0, 1])
 def test_exhaustive_search_finds_the_same_pose(seed):
     rng = np.random.default_rng(seed)
@@ -115,17 +116,19 @@ def test_diameters_that_are_said_to_be_exact_are_used():
     fix = ConstellationMap(mapped).locate(seen_here)
     unknown = ConstellationMap(landmarks(places)).locate(landmarks(local[near]))
     assert fix.is_sure and np.abs(error(fix, X_WH)) == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
-    # Each diameter of 10 mm deviation among those of 0.1 to 0.6 m adds about ln(0.5 / (sqrt(2 pi) sqrt(2) 0.01)).
+    # Each diameter of 10 mm deviation among diameters of 0.1 to 0.6 m adds about ln(0.5 / (sqrt(2 pi) sqrt(2) 0.01)).
     gain = (fix.log_likelihood - unknown.log_likelihood) / near.sum()
     assert gain == pytest.approx(np.log(0.5 / (np.sqrt(4.0 * pi) * 0.01)), rel=0.2)
 
 
+@pytest.mark.slow
 def test_places_of_a_stand_are_recognized():
     for seed, name in enumerate(("accurate", "remote", "poor")):
         trial = run(Case("natural", 600.0, name, "inside"), seed=7000 + seed)
         assert trial.is_sure and trial.is_right
 
 
+@pytest.mark.slow
 def test_other_stands_are_not_recognized():
     """Many poses nearly match in a plantation; the log-likelihood of the best one leads by 8 to 21."""
     for kind, name, seed in (
@@ -154,6 +157,7 @@ def test_covariance_of_matches_without_doubt():
     np.testing.assert_allclose(fix.covariance, variance * np.linalg.inv(J.T @ J), rtol=0.05, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent_with_errors():
     nees = []
     for seed in range(25):
@@ -180,10 +184,10 @@ def test_displacement_that_neighbours_share_stays_unknown():
     fix = ConstellationMap(mapped, correlation=40.0).locate(local)
     assert fix.is_sure
     np.testing.assert_allclose(error(fix, X_WH), [*shift, 0.0], atol=0.25)
-    # The errors have the variance s² = 0.49 m². Of a Gaussian field, the Laplacian tells half of it at most: their
+    # The errors have the variance s² = 0.49 m². The Laplacian of a Gaussian field tells half of it at most: their
     # covariance is -2 s²/L², the variance of the Laplacian is 8 s²/L⁴.
     assert (np.diagonal(fix.covariance)[:2] > 0.245).all() and (np.diagonal(fix.covariance)[:2] < 0.5).all()
-    # The map may be turned by half the curl of its errors, of which each slope has the deviation s/L.
+    # The map may be turned by half the curl of its errors, where each slope has the deviation s/L.
     assert fix.covariance[2, 2] == pytest.approx(0.5 * (0.7 / 40.0) ** 2, rel=0.2)
 
 
@@ -200,7 +204,7 @@ def test_places_on_ten_hectares_are_recognized():
 
 
 def test_large_coordinates_change_nothing():
-    stand = Stand(seed=1, density=600.0)
+    stand = Stand(seed=1, density=600.0, length=60.0, width=60.0)
     there = map_landmarks(stand.map(ACCURATE))
     local = seen(stand.trees().positions()[:, :2], [30.0, 40.0, 2.0], np.random.default_rng(1), reach=20.0)
     far = np.array([500_000.0, 5_600_000.0, 0.0])
@@ -263,6 +267,7 @@ def test_maps_and_parameters_are_checked():
         ConstellationMap(landmarks(np.eye(3, 2)), correlation=np.nan)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("correlation", [0.0, 40.0])
 def test_landmarks_that_fit_nowhere_are_not_sure(correlation):
     stand = Stand(seed=3, length=60.0, width=60.0)

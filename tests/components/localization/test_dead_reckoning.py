@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.localization.dead_reckoning import (
     MOTION,
     POSE,
@@ -19,7 +20,6 @@ from vtbdrake.components.localization.dead_reckoning import (
     history_size,
 )
 from vtbdrake.components.localization.planar import compose, inverse
-from vtbdrake.scan import Scan
 
 T = 0.02
 G = np.array([0.0, 0.0, -9.81])
@@ -161,7 +161,7 @@ def test_bias_of_gyros_is_learned_at_rest():
     samples = drive.samples()
     rng = np.random.default_rng(3)
     samples[:, :3] += bias + 1e-3 * rng.normal(size=(len(samples), 3))
-    # Of about 170 samples, with four deviations.
+    # From about 170 samples, with four deviations.
     np.testing.assert_allclose(value(samples[:200], "gyro_bias"), bias, atol=4e-3 / np.sqrt(170))
     heading = drive.angles[548 * 20, 2]
     with_rest = motion_of(samples[:550])[5] - heading
@@ -299,7 +299,7 @@ def test_drift_grows_as_a_random_walk_does():
         poses[:, 2] += turn + heading * rng.normal(size=len(poses))
     sampled = np.cov(poses.T)
     expected = drift.covariance(mean, steps * T_step)
-    # Of an arc of 0.8 rad, whose chord the model takes.
+    # An arc of 0.8 rad, whose chord the model takes.
     np.testing.assert_allclose(np.sqrt(np.diag(expected)), np.sqrt(np.diag(sampled)), rtol=0.12)
     normalized = np.linalg.solve(expected, sampled)
     assert np.linalg.eigvals(normalized).real == pytest.approx(1.0, abs=0.3)

@@ -7,11 +7,11 @@ from pydrake.math import RigidTransform, RotationMatrix
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import compose, inverse, transform, wrap
 from vtbdrake.components.localization.tracking import Tracker
-from vtbdrake.components.world_model import Quantity, WorldModel, WorldObject, position_estimate
+from vtbdrake.components.world_model import AttributeValue, WorldModel, WorldObject, position_estimate
 from vtbdrake.state.codecs import codec_of
 from vtbdrake_diagrams.forest.world.stand import REMOTE, Stand
 
-DIAMETER = Quantity(0.3, "m", 0.02)
+DIAMETER = AttributeValue(0.3, "m", 0.02)
 
 
 def some(n=5, seed=0):
@@ -98,11 +98,14 @@ def test_bad_landmarks_are_rejected():
     with pytest.raises(ValueError, match="the tree t7 has an infinite variance in the plane"):
         map_landmarks(WorldModel([nowhere]))
     for diameter in (-0.3, 0.0, 31.0):
-        tree = WorldObject("t", "tree", position_estimate(np.zeros(3)), {"trunk_diameter": Quantity(diameter, "m")})
+        tree = WorldObject(
+            "t", "tree", position_estimate(np.zeros(3)), {"trunk_diameter": AttributeValue(diameter, "m")}
+        )
         with pytest.raises(ValueError, match=f"of the tree t is {diameter:g} m, but must be .* at most 20 m: are its"):
             map_landmarks(WorldModel([tree]))
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("deviation", "bounds"), [(0.0, (8.0, np.inf)), (1.3 * 0.05, (2.0, 4.2))])
 def test_leaning_trunks_need_their_deviation(deviation, bounds):
     """The map has the feet of 30 trees to 3 cm; they lean by 0.05 rad, and are seen at breast height to 1 cm."""

@@ -54,7 +54,7 @@ def test_rocks_are_found_on_uneven_ground():
         widths.append((rocks.diameters[which] - 2.0 * scene.ellipsoids[truth, 4]) / rocks.diameter_deviations[which])
     assert found >= 0.85 * shown
     assert right >= 0.97 * claimed
-    # With consistent covariances, the mean is 2 for two coordinates. Of some rocks only the top is seen.
+    # With consistent covariances, the mean is 2 for two coordinates. Some rocks show their top alone.
     assert 0.5 < np.concatenate(nees).mean() < 2.5
     assert np.mean(np.abs(np.concatenate(widths)) < 2.0) > 0.85
 

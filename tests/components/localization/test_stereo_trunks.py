@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from scipy.optimize import brentq
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.stereo_trunks import StereoTrunkDetectorConfig, detect_stereo_trunks
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
@@ -148,7 +148,7 @@ def test_diameter_is_known_if_both_cameras_see_all_of_the_trunk(is_left: bool) -
         return 320.0 + 400.0 * np.tan(np.arctan(slope) + np.array([-half, half]))
 
     known = []
-    # By so many pixels the trunk lies within what both cameras see. Two pixels beside it must be seen, too.
+    # The number of pixels by which the trunk lies within what both cameras see. Two pixels beside it must be seen, too.
     for inside in (0.0, 4.0):
         column, edge = (120.0 / distance + inside, 0) if is_left else (640.0 - inside, 1)
         slope = brentq(lambda slope, edge=edge, column=column: edges(slope)[edge] - column, -1.0, 1.0)
@@ -214,7 +214,7 @@ def test_rendered_trunks_are_found_within_their_covariances() -> None:
         errors = found.positions[:, None] - trees[:, :2]
         each = np.einsum("nmi,nij,nmj->nm", errors, np.linalg.inv(found.covariances), errors)
         squares.extend(each.min(axis=1))
-    # Of a chi-square distribution with two degrees of freedom, the median is 1.4, and 14 is exceeded once in 1,000.
+    # A chi-square distribution with two degrees of freedom has the median 1.4, and 14 is exceeded once in 1,000.
     assert 0.2 < np.median(squares) < 2.5
     assert np.mean(np.array(squares) > 14.0) < 0.1
 

@@ -46,6 +46,19 @@ def scores(errors, *, drives, first=0, bias=0.0, **settings):
 BOUNDS = (1.92, 4.32)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_drive_ends_within_its_covariance(seed):
+    one = drive(seed, ACCURATE)
+    tracker, states = tracked(one, correlation=ACCURATE.correlation)
+    last = states[-1]
+    assert nees(last.pose, last.pose_covariance, one.poses[-1]) < chi2.ppf(0.99, 3)
+    assert np.hypot(*error(last.pose, one.poses[-1])[:2]) < 0.1
+    assert 0.0 < last.distortion < chi2.ppf(0.999, 6) and not tracker.is_doubtful(last)
+    factors = [state.drift for state in states]
+    assert min(factors) == 1.0 and np.mean(factors) < 1.5
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("bias", [0.0, 0.02])
 def test_errors_with_the_accurate_map_are_as_estimated(bias):
     errors, squares = scores(ACCURATE, drives=16, bias=bias)
@@ -54,12 +67,14 @@ def test_errors_with_the_accurate_map_are_as_estimated(bias):
     assert np.sqrt((errors[:, 2] ** 2).mean()) < np.radians(0.2)
 
 
+@pytest.mark.slow
 def test_errors_with_the_remote_map_are_as_estimated():
     errors, squares = scores(REMOTE, drives=16)
     assert BOUNDS[0] < squares.mean() < BOUNDS[1]
     assert np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean()) < 0.15
 
 
+@pytest.mark.slow
 def test_a_bias_without_a_state_is_inconsistent():
     _, squares = scores(ACCURATE, drives=8, bias=0.05, bias_deviation=1e-6)
     assert squares.mean() > BOUNDS[1]
@@ -204,12 +219,25 @@ def test_drift_follows_what_a_scan_says(change, before, expected, rounding):
     assert health.drift_after(first, after) == pytest.approx(expected)
 
 
+# A car with a steering angle for a gyro: five to ten times the drift of the model.
+STEERED = Odometry(scale=0.05, position=0.1, heading=0.01)
+
+
+def test_worse_dead_reckoning_than_assumed_raises_the_drift():
+    one = drive(0, ACCURATE, odometry=STEERED)
+    tracker, states = tracked(one)
+    assert not tracker.is_lost(states[-1])
+    assert nees(states[-1].pose, tracker.pose_covariance(states[-1]), one.poses[-1]) < chi2.ppf(0.99, 3)
+    assert 3.0 < np.mean([state.drift for state in states[5:]]) < 50.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_worse_dead_reckoning_than_assumed_is_noticed(share):
-    """A car with a steering angle for a gyro: five to ten times the drift of the model, and scans with few trees."""
+    """With all trees, and with few trees in each scan."""
     squares, drifts = [], []
     for seed in range(8):
-        one = drive(seed, ACCURATE, odometry=Odometry(scale=0.05, position=0.1, heading=0.01))
+        one = drive(seed, ACCURATE, odometry=STEERED)
         rng = np.random.default_rng(seed)
         thin = replace(one, scans=[scan.select(rng.random(len(scan)) < share) for scan in one.scans])
         tracker, states = tracked(thin)
@@ -220,11 +248,13 @@ def test_worse_dead_reckoning_than_assumed_is_noticed(share):
     assert 3.0 < np.median(drifts) < 50.0
 
 
+@pytest.mark.slow
 def test_dead_reckoning_as_assumed_is_believed():
     factors = [state.drift for seed in range(8) for state in tracked(drive(seed, ACCURATE))[1]]
     assert min(factors) == 1.0 and np.mean(factors) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE, POOR])
 def test_right_maps_seem_no_more_distorted_than_by_chance(errors):
     """At most chi-square distributed with 6 degrees of freedom; less, as what is not known yet is not corrected."""
@@ -247,6 +277,7 @@ DISTORTIONS = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", DISTORTIONS)
 def test_distorted_maps_make_the_pose_doubtful(kind):
     one = drive(3, ACCURATE, reach=18.0)
@@ -263,15 +294,15 @@ def test_distorted_maps_make_the_pose_doubtful(kind):
 
 def test_a_displaced_or_turned_map_is_not_distorted():
     one = drive(3, ACCURATE, reach=18.0)
-    middle = one.map.positions.mean(axis=0)
+    middle, same = one.map.positions.mean(axis=0), tracked(one)[1]
     for X in ([3.0, -2.0, 0.0], [0.0, 0.0, 0.5]):
         around = np.array([*middle, 0.0])
         X_WV = compose(compose(around, X), inverse(around))
         moved = replace(one, map=one.map.seen_from(X_WV), poses=np.array([compose(X_WV, pose) for pose in one.poses]))
-        (_, states), (_, same) = tracked(moved), tracked(one)
-        assert states[-1].distortion == pytest.approx(same[-1].distortion, rel=1e-3)
+        assert tracked(moved)[1][-1].distortion == pytest.approx(same[-1].distortion, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_fusing_the_map_in_each_scan_is_inconsistent():
     once, afresh = [], []
     for seed in range(8):
@@ -369,6 +400,7 @@ def test_the_filter_equals_batch_least_squares(correlation):
     assert abs(state.range_bias - bias) < 3.0 * np.sqrt(covariance[3, 3])
 
 
+@pytest.mark.slow
 def test_correlated_errors_of_the_map_are_expected():
     _, squares = scores(POOR, drives=16, first=16)
     assert BOUNDS[0] < squares.mean() < BOUNDS[1]
@@ -408,6 +440,7 @@ def test_the_heading_is_no_more_certain_than_the_map_allows():
     assert nees(state.pose, found, truth) < chi2.ppf(0.999, 3)
 
 
+@pytest.mark.slow
 def test_landmarks_that_pass_the_gate_have_smaller_errors():
     """A map's largest errors are not matched: with all of its variance, the pose would seem worse than it is."""
     rng, n, deviation, noise, count = np.random.default_rng(3), 36, 0.3, 0.01, 300
@@ -466,6 +499,7 @@ def test_landmarks_without_a_known_place_are_not_used():
         Tracker(one.map, largest_deviation=0.05)
 
 
+@pytest.mark.slow
 def test_the_map_is_used_once_on_a_closed_route():
     """No estimate by a map of n trees is better than s^2 / n, however often the carrier comes by."""
     rng = np.random.default_rng(4)

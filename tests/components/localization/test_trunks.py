@@ -68,14 +68,15 @@ def test_trunks_are_where_they_stand():
     for low, high, limit in ((3.0, 8.0, 0.005), (8.0, 20.0, 0.01)):
         some = errors[(errors[:, 0] > low) & (errors[:, 0] < high)]
         assert len(some) >= 50
-        # Of the position, and of the diameter, which algebraic fits make 2 to 5 cm too small.
+        # Errors of the position, and of the diameter, which algebraic fits make 2 to 5 cm too small.
         assert np.abs(some[:, 1:4].mean(axis=0)).max() < limit
     nees = errors[:, 4]
-    # Of two coordinates; the expected mean is 2, and 95 % lie below 5.99.
+    # Two coordinates: the expected mean is 2, and 95 % lie below 5.99.
     assert 1.7 < nees.mean() < 2.3
     assert np.mean(nees < 5.99) > 0.94
 
 
+@pytest.mark.slow
 def test_variances_reach_the_bound_of_the_ranges():
     scenes = [ring(seed, count=12, distance=(5.0, 5.0)) for seed in range(20)]
     for scene in scenes:
@@ -163,7 +164,7 @@ def test_edges_and_the_prior_tell_as_much_as_their_variances(roughness):
 
 
 def test_without_measurements_the_lean_is_that_of_the_prior():
-    # Along the ray, only ranges tell it. Its variance is the curvature of that of the position over the height.
+    # Along the ray, only ranges tell it. Its variance is the curvature, over the height, of the position's.
     points, _ = Scene(EYE[None, :2] + [[6.0, 0.0]], np.array([0.3])).scan(EYE)
     detector = replace(EXACT, range_noise=0.5, lean=0.01)
     variances = [
@@ -214,6 +215,7 @@ def test_the_lean_aside_displaces_no_far_trunk():
     np.testing.assert_allclose(trunks.diameters[which], 0.25, atol=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bushes", "recall", "precision"), [(0, 0.95, 0.99), (100, 0.93, 0.97)])
 def test_stands_on_uneven_ground(bushes, recall, precision):
     shown = found = claimed = right = 0
@@ -221,7 +223,7 @@ def test_stands_on_uneven_ground(bushes, recall, precision):
         scene = stand(seed, bushes=bushes)
         points, hit = scene.scan(EYE, noise=0.02, seed=seed)
         trunks = detect_trunks(points, TrunkDetectorConfig(), p_HoLo_H=EYE)
-        # Those in sight: by at least ten points in a slice that is a little smaller than that of the detector.
+        # Those in sight: by at least ten points in a slice that is a little smaller than the detector's.
         over = points[:, 2] - hills(points[:, :2])
         counts = np.bincount(hit[(hit >= 0) & (over > 0.9) & (over < 2.5)], minlength=len(scene.places))
         counts = counts[: len(scene.places)]
@@ -263,7 +265,7 @@ def test_hidden_edges_are_found_behind_the_carrier_too():
 
 
 def test_branches_beside_a_trunk_do_not_widen_it():
-    # Of one row each, 15 cm to both sides of the trunk, at its distance.
+    # Points of one row each, 15 cm to both sides of the trunk, at its distance.
     place = EYE[:2] + np.array([4.0, 0.0])
     points, _ = Scene(place[None], np.array([0.2])).scan(EYE, noise=0.01)
     rows = np.repeat([1.1, 1.9], 12)

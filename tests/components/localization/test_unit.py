@@ -1,4 +1,5 @@
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -22,6 +23,12 @@ from vtbdrake_diagrams.forest.world.stand import ACCURATE, REMOTE
 pytestmark = pytest.mark.one_python
 
 
+@cache
+def unit_on(seed):
+    """Return the unit on the accurate map of a drive that reaches far."""
+    return unit_for(drive(seed, ACCURATE, reach=18.0).map)
+
+
 def unit_for(landmarks, locator=None):
     return LocalizationUnit(locator or ConstellationMap(landmarks), Tracker(landmarks))
 
@@ -37,7 +44,7 @@ def run(unit, scans, reckoned, state=None, first=0):
 
 def test_a_carrier_without_a_guess_is_found_and_tracked():
     one = drive(3, ACCURATE, reach=18.0)
-    answers, state = run(unit_for(one.map), one.scans, one.reckoned)
+    answers, state = run(unit_on(3), one.scans, one.reckoned)
     is_tracking = [answer.status == TRACKING for answer in answers]
     first = is_tracking.index(True)
     assert first < 10 and all(is_tracking[first:]) and state.losses == 0
@@ -48,6 +55,7 @@ def test_a_carrier_without_a_guess_is_found_and_tracked():
     np.testing.assert_array_equal(answers[-1].X_OH, one.reckoned[-1])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_a_kidnapped_carrier_is_lost_and_found_again(errors):
     one, other = drive(3, errors, reach=18.0), drive(3, errors, reach=18.0, step=0.5, scans=60, start=(20.0, 40.0))
@@ -71,24 +79,26 @@ def test_a_kidnapped_carrier_is_lost_and_found_again(errors):
 def test_a_doubtful_pose_is_back_with_the_next_good_scan():
     one, other = drive(3, ACCURATE, reach=18.0), drive(3, ACCURATE, reach=18.0, step=0.5, start=(20.0, 40.0))
     scans = [*one.scans[:20], *other.scans[:2], *one.scans[22:]]
-    answers, state = run(unit_for(one.map), scans, one.reckoned)
+    answers, state = run(unit_on(3), scans, one.reckoned)
     assert [answer.status for answer in answers[19:23]] == [TRACKING, DOUBTFUL, DOUBTFUL, TRACKING]
     assert state.losses == 0
     assert nees(answers[22].pose, answers[22].covariance, one.poses[22]) < 25.0
 
 
+@pytest.mark.slow
 def test_a_pose_on_a_sheared_map_becomes_doubtful():
     """A shear of 1 % displaces what is seen by two deviations of the map at most, but by metres along 200 m."""
     one = drive(3, ACCURATE, reach=18.0)
     places = one.map.positions
     sheared = replace(one.map, positions=places + 0.01 * (places - places.mean(axis=0))[:, ::-1])
-    right, _ = run(unit_for(one.map), one.scans, one.reckoned)
+    right, _ = run(unit_on(3), one.scans, one.reckoned)
     wrong, state = run(unit_for(sheared), one.scans, one.reckoned)
     assert DOUBTFUL not in [answer.status for answer in right]
     assert wrong[-1].status == DOUBTFUL and not state.track.failures
     assert np.isnan(wrong[-1].pose).all() and np.isinf(wrong[-1].covariance[0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_unit_never_tracks_on_the_map_of_another_place(errors):
     for seed in range(2):
@@ -125,9 +135,10 @@ def test_matching_is_tried_after_some_metres_or_seconds(speed, calls):
     assert tried == calls
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("errors", [ACCURATE, REMOTE])
 def test_a_wrong_first_pose_is_soon_lost(errors):
-    for seed in range(4):
+    for seed in range(2):
         one = drive(seed, errors)
         wrong = Wrong(compose(one.poses[0], [9.0, -7.0, 1.0]), np.diag([0.2, 0.2, 0.02]) ** 2)
         unit = unit_for(one.map, wrong)
@@ -142,7 +153,7 @@ def test_narrow_views_begin_with_all_gathered_landmarks():
     """Each scan shows three landmarks, fewer than a track begins with."""
     one = drive(3, ACCURATE, reach=18.0)
     narrow = [scan.select(np.arange(3 * k, 3 * k + 3) % len(scan)) for k, scan in enumerate(one.scans)]
-    unit = unit_for(one.map)
+    unit = unit_on(3)
     assert {answer.status for answer in run(unit, narrow, one.reckoned)[0]} == {SEARCHING}
     answers, _ = run(replace(unit, begins_with_submap=True), narrow, one.reckoned)
     assert answers[-1].status == TRACKING
@@ -151,7 +162,7 @@ def test_narrow_views_begin_with_all_gathered_landmarks():
 
 def test_bad_times_and_poses_are_ignored_and_counted():
     one = drive(3, ACCURATE, reach=18.0)
-    unit = unit_for(one.map)
+    unit = unit_on(3)
     answers, state = run(unit, one.scans[:15], one.reckoned[:15])
     bad = [
         ([np.nan, 0.0, 0.0], 9.0),
@@ -170,7 +181,7 @@ def test_bad_times_and_poses_are_ignored_and_counted():
 
 
 def test_impossible_settings_are_refused():
-    unit = unit_for(drive(3, ACCURATE, reach=18.0).map)
+    unit = unit_on(3)
     for settings, message in (
         ({"submap_length": 0.0}, "submap_length must be a finite number above 0 m, not 0.0"),
         ({"try_every": (2.0, -1.0)}, r"try_every\[1\] must be a number of at least 0 m, s, not -1"),
@@ -182,7 +193,7 @@ def test_impossible_settings_are_refused():
 
 def test_no_trees_in_sight_is_no_error():
     one = drive(3, ACCURATE, reach=18.0)
-    unit = unit_for(one.map)
+    unit = unit_on(3)
     answers, _ = run(unit, [Landmarks.empty()] * 5, one.reckoned[:5])
     assert {answer.status for answer in answers} == {SEARCHING}
     scans = [*one.scans[:12], *[Landmarks.empty()] * 8, *one.scans[20:]]
@@ -210,7 +221,7 @@ def test_scale_of_the_wheels_is_estimated_and_in_the_covariance():
 
 def test_the_memory_survives_as_arrays():
     one = drive(3, ACCURATE, reach=18.0)
-    unit = unit_for(one.map)
+    unit = unit_on(3)
     straight, _ = run(unit, one.scans, one.reckoned)
     state, names = unit.start(), set(UNIT_STATE_CODEC.encode(unit.start()))
     for k, scan in enumerate(one.scans):

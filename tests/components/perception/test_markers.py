@@ -154,6 +154,7 @@ def photographed() -> tuple[Diagram, Camera]:
     return builder.Build(), camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [1.8, 2.6, 4.0])
 def test_errors_of_poses_are_as_large_as_their_covariances_say(photographed: tuple, distance: float) -> None:
     diagram, camera = photographed
@@ -200,12 +201,14 @@ def errors_and_covariance(distance: float, *, count: int, noise: float) -> tuple
     return np.array(errors), exactly.covariance
 
 
+@pytest.mark.slow
 def test_covariance_is_that_of_many_noisy_poses() -> None:
     errors, covariance = errors_and_covariance(3.0, count=400, noise=0.05)
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), errors.T)
     assert np.cov(whitened) == pytest.approx(np.eye(6), abs=0.3)
 
 
+@pytest.mark.slow
 def test_depth_error_grows_with_the_square_of_distance() -> None:
     near, far = (errors_and_covariance(z, count=150, noise=0.02)[0][:, 5].std() for z in (4.0, 12.0))
     assert far / near == pytest.approx(9.0, rel=0.25)
@@ -266,6 +269,7 @@ def test_prediction_tells_two_poses_apart() -> None:
     assert sum(distance > 40.0 for distance in found) <= 1
 
 
+@pytest.mark.slow
 def test_covariance_covers_both_tilts_of_a_front_view() -> None:
     found = flat_poses(5.0, (0.0, 0.2))
     assert len(found) > 200

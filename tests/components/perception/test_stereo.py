@@ -23,7 +23,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.perception.stereo import StereoCamera, StereoMatcher
 from vtbdrake.components.textures import grain, textured_mesh
 
@@ -73,7 +73,7 @@ class Scene:
         return self.scene_graph.get_query_output_port().Eval(self.context)
 
     def image(self, x: float) -> ImageRgba8U:
-        """What a camera at [x, 0, 0] sees."""
+        """Return the image of a camera at [x, 0, 0]."""
         core = RenderCameraCore("vtk", INFO, ClippingRange(0.05, 50.0), RigidTransform())
         return self.query.RenderColorImage(ColorRenderCamera(core), self.world, RigidTransform([x, 0.0, 0.0]))
 

@@ -69,7 +69,8 @@ def run(seed: int, *, late: bool) -> float:
     return distance(model.predict(track, 4.0), X, w, v)
 
 
-@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("late", [True, False])
 def test_errors_agree_with_the_covariance_over_many_runs(late: bool) -> None:
     runs = 60
     mean = np.mean([run(seed, late=late) for seed in range(runs)])
@@ -133,6 +134,7 @@ def bounds(seeds: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("rate_deg", [3.0, 10.0])
 @pytest.mark.parametrize("body", INERTIAS)
 def test_errors_agree_with_the_covariance_of_a_body_of_known_inertia(body: str, rate_deg: float) -> None:
@@ -144,6 +146,7 @@ def test_errors_agree_with_the_covariance_of_a_body_of_known_inertia(body: str, 
     assert consistency(MotionModel(inertia=inertia), inertia, rate_deg=rate_deg, seeds=10) < bounds(10)[1]
 
 
+@pytest.mark.slow
 def test_late_estimates_of_an_asymmetric_body_agree_with_the_covariance() -> None:
     seeds, inertia = 40, INERTIAS["skew"]
     low, high = bounds(seeds)
@@ -151,6 +154,7 @@ def test_late_estimates_of_an_asymmetric_body_agree_with_the_covariance() -> Non
     assert low < consistency(quiet, inertia, rate_deg=10.0, seeds=seeds, late=True) < high
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("rate_deg", [3.0, 10.0])
 def test_rate_noise_of_the_docstring_covers_a_body_of_unknown_inertia(rate_deg: float) -> None:
     inertia, high = INERTIAS["long"], bounds(20)[1]

@@ -313,6 +313,7 @@ def test_threads_that_share_a_diagram_see_identical_bytes() -> None:
     assert noisy_images(noisy(seed=6)) != expected
 
 
+@pytest.mark.slow
 def test_other_process_sees_identical_bytes() -> None:
     code = "import hashlib; from tests.components.sensors.test_camera import *; "
     code += "print(hashlib.sha256(noisy_images(noisy())).hexdigest())"
@@ -383,10 +384,6 @@ def test_camera_inside_a_body_is_refused() -> None:
         ({"photon_noise": -1.0}, "standard deviation"),
         ({"supersampling": 0}, "whole number of points"),
         ({"errors": ErrorModel(bias=1.0)}, "no bias"),
-        (
-            {"errors": ErrorModel(latency=-1)},
-            "latency must be a whole number of at least 0 periods, not -1",
-        ),
     ],
 )
 def test_impossible_cameras_are_refused(wrong: dict, match: str) -> None:
@@ -396,7 +393,8 @@ def test_impossible_cameras_are_refused(wrong: dict, match: str) -> None:
 
 def test_parameters_end_where_a_camera_does() -> None:
     camera = Scene(errors=ErrorModel(latency=1, max_latency=4)).camera
-    bounds = {element.name: element.bounds for element in camera.variables if element.name != "pose"}
+    parameters = [element for element in camera.variables if element.group == "parameter"]
+    bounds = {element.name: element.bounds for element in parameters if element.name != "pose"}
     lower, upper = bounds.pop("intrinsics")
     # The optical axis meets the image; a focal length is a pixel at least.
     np.testing.assert_array_equal(lower, [1.0, 1.0, 0.0, 0.0])
@@ -469,7 +467,14 @@ def posts(count: int = 40) -> list[tuple[np.ndarray, np.ndarray]]:
     return list(zip(centers, np.column_stack((widths, widths, heights)), strict=True))
 
 
-@pytest.mark.parametrize("direction", [(0.3, 0.5, -0.8), (-0.5, 0.5, -0.4), (0.2, 1.0, -0.15)])
+@pytest.mark.parametrize(
+    "direction",
+    [
+        pytest.param((0.3, 0.5, -0.8), marks=pytest.mark.slow),
+        pytest.param((-0.5, 0.5, -0.4), marks=pytest.mark.slow),
+        (0.2, 1.0, -0.15),
+    ],
+)
 def test_shadows_on_ground_up_to_the_horizon_are_right_to_a_pixel(direction: tuple[float, ...]) -> None:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)

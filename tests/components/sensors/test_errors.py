@@ -182,20 +182,24 @@ def test_channels_of_a_stream_are_independent() -> None:
 
 
 @pytest.mark.parametrize(
-    "errors",
+    ("name", "value"),
     [
-        ErrorModel(noise=-1.0),
-        ErrorModel(bias=np.nan),
-        ErrorModel(drift=np.inf),
-        ErrorModel(quantization=-0.1),
-        ErrorModel(latency=-1),
-        ErrorModel(latency=1.5),  # type: ignore[arg-type]
-        ErrorModel(dropout=1.1),
-        ErrorModel(seed=-1),
+        ("noise", -1.0),
+        ("bias", np.nan),
+        ("drift", np.inf),
+        ("quantization", -0.1),
+        ("latency", -1),
+        ("latency", 1.5),
+        ("dropout", 1.1),
+        ("seed", -1),
     ],
 )
-def test_impossible_errors_are_refused(errors: ErrorModel) -> None:
-    with pytest.raises(ValueError, match=r"Ramp.errors.\w+ must be"):
+def test_impossible_errors_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"ErrorModel.{name} must be .*, not {value}"):
+        ErrorModel(**{name: value})
+    errors = ErrorModel()
+    setattr(errors, name, value)
+    with pytest.raises(ValueError, match=rf"Ramp.errors.{name} must be .*, not {value}"):
         Ramp(errors)
 
 
@@ -204,7 +208,7 @@ def test_seed_is_at_most_what_a_double_counts_to() -> None:
     (seed,) = [element for element in sensor.variables if element.name == "seed"]
     assert seed.bounds == (0.0, 2.0**53)
     with pytest.raises(ValueError, match=r"seed must be"):
-        Ramp(ErrorModel(seed=2**53 + 1))
+        ErrorModel(seed=2**53 + 1)
 
 
 def test_noise_of_a_sensor_that_has_none_is_refused() -> None:

@@ -15,6 +15,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.environment import Haze
 from vtbdrake.components.ray_casting import TOLERANCE, RayCaster
 from vtbdrake.components.sensors import ErrorModel
@@ -25,12 +26,11 @@ from vtbdrake.components.sensors.laser_scanner import (
     raster,
     raster_size,
 )
-from vtbdrake.scan import Scan
 from vtbdrake.state import collect
 from vtbdrake.state import snapshot as snapshots
 
 CONFIG = LaserScannerConfig(frequency=5.0, rays_per_second=5_000.0, azimuth=0.6, elevation=0.4)
-# Of sums of Embree's 32 bits and of the integration of the motion.
+# Errors of sums of Embree's 32 bits and of the integration of the motion.
 EXACT = 2e-5
 
 
@@ -285,7 +285,7 @@ def test_grazing_rays_drop_out_the_sooner_the_farther() -> None:
     for distance in (3.0, 6.0):
         config = replace(CONFIG, max_range=7.0, reflectivity=0.8, azimuth=0.7, elevation=0.7)
         scan = world(Sphere(1.0), config=config).scans(0.2, X_WT=at(distance))[-1]
-        # Of all rays that hit: those with a cosine of at least r^2 / (0.8 max_range^2).
+        # The rays that hit, with a cosine of at least r^2 / (0.8 max_range^2).
         fired = raster(*raster_size(config), 0.7, 0.7)
         along = distance * fired[:, 0]
         below = along**2 - distance**2 + 1.0

@@ -192,7 +192,8 @@ def test_units_are_those_of_the_joints() -> None:
     Parser(plant).AddModelsFromUrl("package://drake/examples/multibody/cart_pole/cart_pole.sdf")
     plant.Finalize()
     cart, pole = (plant.GetJointByName(name) for name in ("CartSlider", "PolePin"))
-    assert JointEncoders(plant, [cart, pole], period=PERIOD).variables[0].unit == "m, rad"
+    encoders = JointEncoders(plant, [cart, pole], period=PERIOD)
+    assert encoders.variables[0].unit == "m, rad" and encoders.entry_names == (cart.name(), pole.name())
     assert JointTachometers(plant, [pole, cart], period=PERIOD).variables[0].unit == "rad/s, m/s"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,11 +112,9 @@ KINDS = [
 Make = Callable[..., LeafSystem]
 
 
-def readings(make: Make, names: Sequence[str], *, root: str = "", **options: int) -> dict[str, np.ndarray]:
-    """Return what sensors of these names show at every tick, less the mean, (ticks, n)."""
-    world = World()
-    sensors = {name: world.builder.AddNamedSystem(name, make(world, **options)) for name in names}
-    for sensor in sensors.values():
+def simulation(world: World, sensors: Sequence[LeafSystem], *, root: str = "") -> Simulator:
+    """Return a simulation of the world with these sensors in it."""
+    for sensor in sensors:
         if isinstance(sensor, Camera):
             connect_camera(world.builder, sensor, world.scene_graph)
         elif isinstance(sensor, LaserScanner):
@@ -126,16 +125,30 @@ def readings(make: Make, names: Sequence[str], *, root: str = "", **options: int
     diagram.set_name(root)
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
-    for sensor in sensors.values():
+    for sensor in sensors:
         if isinstance(sensor, LaserScanner):  # From outside of the arm: its pose is its first parameter.
             pose = sensor.GetMyMutableContextFromRoot(context).get_mutable_numeric_parameter(0)
             pose.SetFromVector([-2.0, *pose.value()[1:]])
+    return simulator
+
+
+def numbers(value: Any) -> np.ndarray:
+    """Return the numbers of a measurement: an array, an image or a scan."""
+    return np.array(getattr(value, "data", getattr(value, "ranges", value)), dtype=float).ravel()
+
+
+def readings(make: Make, names: Sequence[str], *, root: str = "", **options: int) -> dict[str, np.ndarray]:
+    """Return what sensors of these names show at every tick, less the mean, (ticks, n)."""
+    world = World()
+    sensors = {name: world.builder.AddNamedSystem(name, make(world, **options)) for name in names}
+    simulator = simulation(world, list(sensors.values()), root=root)
+    context = simulator.get_context()
     shown: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for k in range(TICKS):
         simulator.AdvanceTo((k + 1.5) * PERIOD)
         for name, sensor in sensors.items():
             value = sensor.get_output_port(0).Eval(sensor.GetMyContextFromRoot(context))
-            shown[name].append(np.array(getattr(value, "data", getattr(value, "ranges", value)), dtype=float).ravel())
+            shown[name].append(numbers(value))
     arrays = {name: np.array(values, dtype=float) for name, values in shown.items()}
     return {name: array - array.mean(axis=0) for name, array in arrays.items()}
 

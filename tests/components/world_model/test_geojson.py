@@ -11,9 +11,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model import (
+    AttributeValue,
     GeoJsonError,
     LocalFrame,
-    Quantity,
     Relation,
     WorldModel,
     WorldObject,
@@ -33,7 +33,7 @@ def model() -> WorldModel:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     X = RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), [120.0, -35.0, 1.5])
-    attributes = {"trunk_diameter": Quantity(0.31, "m", 0.02), "species": Quantity("Picea abies")}
+    attributes = {"trunk_diameter": AttributeValue(0.31, "m", 0.02), "species": AttributeValue("Picea abies")}
     rock = WorldObject("rock-1", "rock", PoseEstimate.of(X, root @ root.T, time=5.5), source="survey")
     tree = WorldObject(
         "tree-1",
@@ -146,7 +146,7 @@ def test_geopandas_reads_and_writes_it(tmp_path: Path) -> None:
     assert table.crs.to_epsg() in (4326, 4979)  # WGS84 without and with heights, by version
     assert table["class"].tolist() == ["rock", "tree"] and table["id"].tolist() == ["rock-1", "tree-1"]
     assert table["trunk_diameter"].tolist()[1] == 0.31
-    # In the projection that is made for the place, their distance is that of the model.
+    # In the projection that is made for the place, they are as far apart as in the model.
     first, second = table.to_crs(table.estimate_utm_crs()).geometry
     assert first.distance(second) == pytest.approx(np.hypot(110.0, 55.0), rel=1e-3)
     table.to_file(copy, driver="GeoJSON", COORDINATE_PRECISION=15)
@@ -163,7 +163,7 @@ def test_file_of_other_programs_needs_frame_and_units(tmp_path: Path) -> None:
     }
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
     (tree,) = load_geojson(path, frame=FRAME, units={"dbh": "m"})
-    assert tree.identity == "7" and dict(tree.attributes) == {"dbh": Quantity(0.2, "m")}
+    assert tree.identity == "7" and dict(tree.attributes) == {"dbh": AttributeValue(0.2, "m")}
     assert np.allclose(tree.p_WoOo_W, 0.0, atol=1e-6)
     (tree,) = load_geojson(path, frame=FRAME, units={"dbh": "m"}, deviation=0.3)
     assert np.diag(tree.pose.covariance).tolist() == pytest.approx([np.inf] * 3 + [0.09] * 3)
@@ -267,10 +267,10 @@ def test_file_remains_if_saving_fails(tmp_path: Path) -> None:
     save_geojson(model(), path, frame=FRAME)
     before = path.read_text()
     place = position_estimate([0.0, 0.0, 0.0])
-    named = WorldObject("t", "tree", place, attributes={"hits": Quantity(1.0)})
+    named = WorldObject("t", "tree", place, attributes={"hits": AttributeValue(1.0)})
     with pytest.raises(ValueError, match="hits of t has the name of another property"):
         save_geojson(WorldModel([named]), path, frame=FRAME)
-    mixed = [WorldObject(u, "tree", place, attributes={"age": Quantity(1.0, u)}) for u in ("s", "m")]
+    mixed = [WorldObject(u, "tree", place, attributes={"age": AttributeValue(1.0, u)}) for u in ("s", "m")]
     with pytest.raises(ValueError, match="age of m is in m, of others in s"):
         save_geojson(WorldModel(mixed), path, frame=FRAME)
     assert path.read_text() == before and list(tmp_path.iterdir()) == [path]

@@ -8,12 +8,19 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.components.perception.estimate import PoseEstimate
-from vtbdrake.components.world_model import Part, Quantity, WorldModel, WorldObject, add_to_plant, position_estimate
+from vtbdrake.components.world_model import (
+    AttributeValue,
+    Part,
+    WorldModel,
+    WorldObject,
+    add_to_plant,
+    position_estimate,
+)
 from vtbdrake.components.world_model.geometry import tree_parts
 
 
-def metres(**values: float) -> dict[str, Quantity]:
-    return {name: Quantity(value, "m") for name, value in values.items()}
+def metres(**values: float) -> dict[str, AttributeValue]:
+    return {name: AttributeValue(value, "m") for name, value in values.items()}
 
 
 def tree(identity: str, xyz: list[float], **fields: object) -> WorldObject:

@@ -24,6 +24,11 @@ CART, POLE = "sim.sys.cart_pole.cart_slider", "sim.sys.cart_pole.pole_pin"
 DRAKES = "package://drake/examples/multibody/cart_pole/cart_pole.sdf"
 
 
+# Set after the construction, which refuses it.
+IMPOSSIBLE = ErrorModel()
+IMPOSSIBLE.dropout = 2.0
+
+
 def continuous() -> CartPoleScenario:
     return CartPoleScenario(
         plant_config=MultibodyPlantConfig(time_step=0.0), simulator_config=SimulatorConfig(accuracy=1e-9)
@@ -171,7 +176,7 @@ def test_it_can_run_on_its_machine() -> None:
         ({"force_limit": -1.0}, "force_limit must be a finite number above 0 N"),
         ({"order": "quintic"}, "one of zero, linear, cubic, bspline"),
         ({"knots": 1}, "at least 2 knots, not 1"),
-        ({"position_errors": ErrorModel(dropout=2.0)}, "position_errors.dropout must be a number from 0 to 1, not 2.0"),
+        ({"position_errors": IMPOSSIBLE}, "position_errors.dropout must be a number from 0 to 1, not 2.0"),
     ],
 )
 def test_bad_fields_are_refused(fields: dict, message: str) -> None:

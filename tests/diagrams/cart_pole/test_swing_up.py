@@ -24,6 +24,7 @@ def test_the_cost_is_zero_upright_in_the_middle() -> None:
     assert all(cost(UPRIGHT + step) > 0.0 for step in 1e-3 * np.eye(4))
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_the_pole_is_swung_up_and_kept_upright() -> None:
     scenario = CartPoleScenario()
@@ -47,7 +48,7 @@ def test_the_same_seed_decides_the_same_and_another_one_does_not() -> None:
     swings = []
     for seed in (1, 1, 2):
         with make_reasoner(scenario, rollouts=8, seed=seed, executor="serial") as reasoner:
-            swings.append(swing_up(reasoner, scenario, seconds=0.5))
+            swings.append(swing_up(reasoner, scenario, seconds=0.3))
     np.testing.assert_array_equal(swings[0].states, swings[1].states)
     assert not np.array_equal(swings[0].states, swings[2].states)
 
@@ -70,6 +71,7 @@ def test_a_mental_copy_as_fine_predicts_the_true_future() -> None:
     assert decision.quality == pytest.approx(np.trapezoid(costs, times), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
     swing = swing_up_onboard(CartPoleScenario(onboard=True), seconds=3.3)
@@ -77,6 +79,7 @@ def test_the_dps_swings_up_the_pole_with_a_reasoner_on_board() -> None:
     assert np.abs(swing.states[:, 0]).max() < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_over_lcm_the_dps_decides_for_a_machine_process(tmp_path: Path) -> None:
     scenario = CartPoleScenario(onboard=True, rollouts=8)

@@ -26,8 +26,10 @@ def test_cube_falls_freely_and_comes_to_rest(name: str) -> None:
     assert np.linalg.norm(testbed.read(context, reality.VELOCITY)) < 0.01
 
 
-def test_real_tosses_tell_friction() -> None:
-    tosses = reality.recordings(recordings("contactnets_cube/0.pt")[0].parent)[::23]
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("stride", [46, 23])
+def test_real_tosses_tell_friction(stride: int) -> None:
+    tosses = reality.recordings(recordings("contactnets_cube/0.pt")[0].parent)[::stride]
     right, wrong = (reality.errors(tosses, CubeTossScenario(friction=mu), executor="serial") for mu in (0.18, 0.10))
     position, rotation, seconds = np.median(right, axis=0)
     assert position < 20.0 and rotation < 30.0 and 0.1 < seconds < 0.8

@@ -12,12 +12,12 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, State
 from pydrake.systems.primitives import ZeroOrderHold
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.localization.dead_reckoning import deskewed
 from vtbdrake.components.localization.landmarks import Landmarks, map_landmarks
 from vtbdrake.components.localization.planar import inverse, transform
 from vtbdrake.components.localization.unit import LocalizationUnit
 from vtbdrake.components.world_model import WorldModel
-from vtbdrake.scan import Scan
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import VirtualTestbedBuilder
 from vtbdrake_diagrams.forest.dps import AXLE, PERIOD

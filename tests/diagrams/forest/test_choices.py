@@ -1,6 +1,7 @@
 """Tests of the choices of a scanner and of a route: their criteria, and the problems that are solved."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import DOUBTFUL, TRACKING
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies import next_route
+from vtbdrake_diagrams.forest.studies import next_route, scanner_choice
 from vtbdrake_diagrams.forest.studies.drives import Drive, Track, localize, simulated_drive
 from vtbdrake_diagrams.forest.studies.next_route import (
     COUNTED,
@@ -57,7 +58,8 @@ def test_the_best_scanner_has_the_least_mean_error() -> None:
     assert len(plot_answer(answer).axes) == 2
 
 
-def test_problem_has_the_number_of_beams() -> None:
+def test_problem_has_the_number_of_beams(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scanner_choice, "ForestScenario", partial(ForestScenario, length=40.0, width=40.0))
     problem = scanner_problem(BEAMS[0], seeds=[3, 4])
     assert problem.scenario.scanner.rows == BEAMS[0] != ForestScenario().scanner.rows
     assert [condition["scenario.seed"] for condition in problem.conditions] == [3, 4]

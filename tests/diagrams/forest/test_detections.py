@@ -80,7 +80,7 @@ def test_drift_of_dead_reckoning_is_the_one_assumed() -> None:
 
 def test_gathered_landmarks_are_nearly_consistent() -> None:
     poses, squares = arc([30.0, 40.0, 0.2], length=40.0, curvature=0.01, step=2.0), []
-    for seed in range(12):
+    for seed in range(4):
         wood = Wood.of(Stand(seed=seed), false=0.35, rng=rng(seed))
         found, which = gathered(wood, poses, Detector(), Odometry(), rng(seed + 100))
         assert len(set(which)) == len(found)

@@ -104,6 +104,7 @@ def test_simulated_drive_stays_in_the_stand() -> None:
     assert np.diff(drive.times) == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     scenario = ForestScenario(seed=5, density=500.0, undergrowth=0.0)
     drive = recorded_drive(scenario, length=1.5)
@@ -115,7 +116,7 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     testbed.write(context, {"sim.act.driver.speed": 0.0})
     simulator.AdvanceTo(STANDING + 0.2)
     testbed.write(context, {"sim.act.driver.speed": scenario.speed})
-    # The result of the last scan is shown some periods later, and before that of the next.
+    # The result of the last scan is shown some periods later, and before the result of the next.
     simulator.AdvanceTo(drive.times[-1] + scenario.localizer_latency + 0.08)
     pose = testbed.read(context, "dps.env.localizer.pose")
     assert found.is_localized[-1] and drive.travelled[-1] == pytest.approx(1.5, abs=0.3)
@@ -123,6 +124,7 @@ def test_recorded_drive_gives_what_the_dps_itself_finds() -> None:
     np.testing.assert_allclose(pose, drive.truth[-1], atol=0.2)
 
 
+@pytest.mark.slow
 def test_recorded_cameras_see_trees_where_they_are() -> None:
     scenario = ForestScenario(seed=1, perception="stereo", length=60.0, width=60.0, start=12.0)
     drive = recorded_drive(scenario, length=0.2)
@@ -133,7 +135,7 @@ def test_recorded_cameras_see_trees_where_they_are() -> None:
         errors = landmarks.positions[:, np.newaxis] - trees
         inverses = np.linalg.inv(landmarks.covariances)
         squares += np.einsum("nti,nij,ntj->nt", errors, inverses, errors).min(axis=1).tolist()
-    # The trees are 13 to 18 m away. Of the squares of normal errors in two dimensions, 99 % are below 9.2, half below
+    # The trees are 13 to 18 m away. 99 % of the squares of normal errors in two dimensions are below 9.2, half below
     # 1.4.
     assert len(squares) >= 20
     assert np.mean(np.array(squares) < 9.2) > 0.8

@@ -15,6 +15,7 @@ from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors
 POOR = MAPS["poor"]
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_unit_over_lcm_finds_the_simulated_pose() -> None:
     found = over_lcm(ForestScenario(seed=1, length=50.0, width=50.0, start=12.0), cycles=40)
@@ -73,6 +74,7 @@ def straight(*, claimed: int = 20, offset: float = 0.0) -> Track:
     return Track(drive, truth + np.array([offset, 0.0, 0.0]), np.tile(np.eye(3), (20, 1, 1)), status)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_best_estimates_on_maps_err_as_expected_over_many_maps() -> None:
     """The RMS over 40 maps of one stand against the formula of Gauss and Markov."""

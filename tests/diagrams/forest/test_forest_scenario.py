@@ -13,17 +13,17 @@ from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.ray_casting import Hits, RayCaster
 from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig, raster, raster_size
 from vtbdrake.components.world_model import (
+    AttributeValue,
     LocalFrame,
-    Quantity,
     WorldModel,
     WorldObject,
     position_estimate,
     save_geojson,
 )
-from vtbdrake.scan import Scan
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.forest.scenario import CarrierScenario, ForestScenario
 from vtbdrake_diagrams.forest.world.geometry import add_ground, add_surface
@@ -44,7 +44,7 @@ AT_REST = SpatialVelocity(np.zeros(3), np.zeros(3))
 
 
 def tree(x: float, y: float, diameter: float = 0.3, height: float = 20.0) -> WorldObject:
-    attributes = {"trunk_diameter": Quantity(diameter, "m"), "height": Quantity(height, "m")}
+    attributes = {"trunk_diameter": AttributeValue(diameter, "m"), "height": AttributeValue(height, "m")}
     return WorldObject(f"tree at {x}", "tree", position_estimate([x, y, 0.0]), attributes=attributes)
 
 
@@ -144,6 +144,7 @@ def drive() -> tuple[VirtualTestbed, list[Scan], np.ndarray]:
     return testbed, scans, np.array(rows)
 
 
+@pytest.mark.slow
 def test_scanner_sees_ground_and_trunks(drive: tuple[VirtualTestbed, list[Scan], np.ndarray]) -> None:
     _, scans, rows = drive
     # An empty one first, then five per second; 16 beams.
@@ -214,7 +215,7 @@ def test_carrier_stands_where_it_is_believed_to_be(drive: tuple[VirtualTestbed, 
     )}  # fmt: skip
     x, y, height, *rpy = read["sys.carrier.base.pose"]
     w, v = read["sys.carrier.base.velocity"][:3], read["sys.carrier.base.velocity"][3:]
-    # The pose is that of the present, and all else one period old.
+    # The pose is the present one, and all else one period old.
     assert [x, y] == pytest.approx(place - 0.02 * v[:2], abs=1e-4)
     assert rpy == pytest.approx([0.05, -0.02, heading - 0.02 * 0.1])
     assert height == pytest.approx(scenario.ground().height(x, y), abs=0.1)

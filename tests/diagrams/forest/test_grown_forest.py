@@ -28,7 +28,7 @@ def exact(places: np.ndarray, diameters: np.ndarray) -> Landmarks:
 
 
 def grown(seed: int, *, seedlings: float = 0.4, years: int = 70) -> Landmarks:
-    """Return the trees of a square stand with exact places and diameters, from so many seedlings per m^2."""
+    """Return the trees of a square stand with exact places and diameters, from a number of seedlings per m^2."""
     rng = np.random.default_rng([seed, 77])
     places = rng.uniform(0.0, SIDE, (rng.poisson(seedlings * SIDE**2), 2))
     diameters, vigour = rng.uniform(0.005, 0.02, len(places)), rng.lognormal(np.log(0.0032), 0.3, len(places))
@@ -45,7 +45,7 @@ def grown(seed: int, *, seedlings: float = 0.4, years: int = 70) -> Landmarks:
 
 
 def trial(seed: int, map_name: str, *, place: str = "inside") -> Trial:
-    """Locate one scan, a third of which is of no trees, on a map of the stand, or of another one (``outside``)."""
+    """Locate a scan where a third of the landmarks are no trees, on a map of the stand, or of another (``outside``)."""
     rng, errors = np.random.default_rng([seed, 78]), MAPS[map_name]
     trees, mapped = grown(seed), grown(seed + 1000 if place == "outside" else seed)
     others = round(len(trees) * FALSE / (1.0 - FALSE))
@@ -76,6 +76,7 @@ def test_grown_stand_is_like_those_of_published_plots() -> None:
         assert nearest.mean() > 1.05 * 0.5 * SIDE / np.sqrt(len(one))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("map_name", ["accurate", "remote"])
 def test_places_in_a_grown_forest_are_recognized(map_name: str) -> None:
     found = [trial(seed, map_name) for seed in range(10)]
@@ -85,6 +86,7 @@ def test_places_in_a_grown_forest_are_recognized(map_name: str) -> None:
     assert np.nanmean([one.nees for one in found]) < 4.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("map_name", ["accurate", "remote"])
 def test_another_grown_forest_is_not_recognized(map_name: str) -> None:
     assert not any(trial(seed, map_name, place="outside").is_sure for seed in range(5))

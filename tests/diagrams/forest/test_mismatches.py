@@ -1,5 +1,7 @@
 """Scans on maps that do not show their places are never sure; stems of real scans on the maps of their plots are."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -14,12 +16,14 @@ needs_rioja = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 def test_simulated_scans_are_not_sure_on_wrong_maps() -> None:
     matched = list(pairs(20, seed=3, recordings=False))
     assert {pair.kind for pair in matched} == {"mirrored", "other"}
     assert not any(pair.fix.is_sure for pair in matched)
 
 
+@pytest.mark.slow
 @needs_rioja
 def test_stems_of_real_scans_are_not_sure_on_wrong_maps() -> None:
     matched = [pair for pair in pairs(40, seed=4) if pair.kind in ("recorded", "mixed")]
@@ -39,10 +43,12 @@ def test_a_mirrored_plot_of_forty_metres_is_not_its_own_image() -> None:
 
 
 @needs_rioja
-def test_real_scans_are_sure_on_the_maps_of_their_plots() -> None:
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("plots", [(1, 6, 11, 16), range(1, 17)], ids=len)
+def test_real_scans_are_sure_on_the_maps_of_their_plots(plots: Sequence[int]) -> None:
     scans, inventories = rioja()
     headings = []
-    for plot in range(1, 17):
+    for plot in plots:
         inventory = stems(inventories, plot, deviation=0.3, diameter=0.03)
         fix = ConstellationMap(inventory).locate(stems(scans, plot, deviation=0.1, diameter=0.03))
         assert fix.is_sure

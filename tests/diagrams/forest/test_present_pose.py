@@ -9,11 +9,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.unit import TRACKING
-from vtbdrake.scan import Scan
 from vtbdrake_diagrams.forest.perception import SHOWN, PresentPose, ScanLandmarks, moved, shown
 
 X_WH, MOTION = np.array([3.0, -2.0, 2.5]), np.array([1.2, 0.3, 0.4])
@@ -28,7 +28,7 @@ def test_covariance_is_carried_along_as_derivatives_say() -> None:
         np.column_stack([(compose(*at(h)) - pose) / step for h in step * np.eye(3)])
         for at in (lambda h: (X_WH + h, MOTION), lambda h: (X_WH, MOTION + h))
     )
-    # The errors of the motion are those of its end in the frame of its beginning.
+    # The errors of the motion are the errors of its end, in the frame of its beginning.
     expected = by_pose @ C @ by_pose.T + by_motion @ drift.covariance(MOTION, 2.0) @ by_motion.T
     np.testing.assert_allclose(covariance, expected, rtol=1e-4)
 

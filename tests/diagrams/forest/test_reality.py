@@ -21,6 +21,7 @@ from vtbdrake_diagrams.forest.studies.recordings import rioja, stems
 pytestmark = pytest.mark.one_python
 
 
+@pytest.mark.slow
 def test_scans_of_la_rioja_are_located_among_all_its_trees() -> None:
     (path,) = recordings("fortls_rioja/Rioja.data.RData")
     scans, inventories = rioja(path.parents[1])

@@ -28,6 +28,7 @@ def driven() -> tuple[VirtualTestbed, Context]:
     return testbed, context
 
 
+@pytest.mark.slow
 def test_carrier_localizes_itself_by_images(driven: tuple[VirtualTestbed, Context]) -> None:
     testbed, context = driven
     assert testbed.read(context, "dps.env.pose.status") == TRACKING
@@ -39,6 +40,7 @@ def test_carrier_localizes_itself_by_images(driven: tuple[VirtualTestbed, Contex
     assert abs(wrap(float(testbed.read(context, "dps.env.pose.heading")) - yaw)) < np.radians(1.5)
 
 
+@pytest.mark.slow
 def test_landmarks_stand_where_trees_are(driven: tuple[VirtualTestbed, Context]) -> None:
     testbed, context = driven
     rows = testbed.read(context, "dps.env.localizer.landmarks").reshape(SHOWN, 3)

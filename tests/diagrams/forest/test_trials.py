@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import vtbdrake_diagrams.forest.studies
+from vtbdrake.campaigns import Campaign
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.testing import Campaign
 from vtbdrake_diagrams.forest.studies.trials import Case, judged, run
 
 pytestmark = pytest.mark.one_python
@@ -44,8 +44,9 @@ def campaign() -> Campaign:
     return Campaign.load(Path(vtbdrake_diagrams.forest.studies.__path__[0]) / "trials.yaml")
 
 
+@pytest.mark.slow
 def test_a_rollout_of_the_campaign_is_a_trial(campaign: Campaign) -> None:
-    # Seeds of development; those of the file are for the command alone.
+    # Seeds of development; the seeds of the file are for the command alone.
     names = ("natural 600 accurate inside", "plantation 1000 remote inside")
     conditions = {name: {**campaign.conditions[name], "sim.sys.trial.first": 0} for name in names}
     criteria = {name: replace(c, conditions=[]) for name, c in campaign.criteria.items()}
@@ -70,13 +71,15 @@ def test_no_two_conditions_share_a_stand(campaign: Campaign) -> None:
     assert judged_conditions == inside
 
 
+@pytest.mark.slow
 def test_places_inside_are_found_and_others_are_not_claimed() -> None:
-    # Seeds of development; those of the command are for the command alone.
+    # Seeds of development; the command's seeds are for the command alone.
     assert all(run(INSIDE, seed=seed).is_right for seed in range(3))
     for case in (replace(INSIDE, place="outside"), Case("plantation", 1000.0, "remote", "outside")):
         assert not any(run(case, seed=seed).is_sure for seed in range(2))
 
 
+@pytest.mark.slow
 def test_a_drive_tells_more_of_a_plantation_than_one_place() -> None:
     rows = Case("plantation", 1000.0, "remote", "inside")
     assert not run(rows, seed=0).is_sure

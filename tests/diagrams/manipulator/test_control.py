@@ -5,6 +5,8 @@ Without Coulomb friction where statics are looked at: an arm at rest under it st
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from pydrake.multibody.tree import JacobianWrtVariable
@@ -17,9 +19,14 @@ from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
 
 T = 0.001
+FIRST_LAW, *FURTHER_LAWS = LAWS
 ARM = Arm()
-TESTBEDS = {law: ManipulatorScenario(law=law).build() for law in LAWS}
 SMOOTH = {"sim.act.drives.coulomb": np.zeros(7)}
+
+
+@cache
+def built(law: str) -> VirtualTestbed:
+    return ManipulatorScenario(law=law).build()
 
 
 class Run:
@@ -55,7 +62,7 @@ class Run:
 
     @property
     def jacobian(self) -> np.ndarray:
-        """Of the tip's [w; v]."""
+        """Errors of the tip's [w; v]."""
         tip, world = self.plant.GetFrameByName("tip"), self.plant.world_frame()
         return self.plant.CalcJacobianSpatialVelocity(
             self.plant_context, JacobianWrtVariable.kV, tip, np.zeros(3), world, world
@@ -79,31 +86,31 @@ def wanted_tip(run: Run, motion: int, t: float) -> np.ndarray:
     ("law", "motion", "tolerance"),
     [
         ("joint_impedance", Motion.SWING, 0.002),
-        ("joint_impedance", Motion.CIRCLE, 0.002),
-        ("cartesian_impedance", Motion.SWING, 0.006),
-        ("cartesian_impedance", Motion.CIRCLE, 0.006),
-        ("admittance", Motion.SWING, 0.002),
-        ("admittance", Motion.CIRCLE, 0.002),
+        pytest.param("cartesian_impedance", Motion.CIRCLE, 0.006, marks=pytest.mark.slow),
+        pytest.param("joint_impedance", Motion.CIRCLE, 0.002, marks=pytest.mark.slow),
+        pytest.param("cartesian_impedance", Motion.SWING, 0.006, marks=pytest.mark.slow),
+        pytest.param("admittance", Motion.SWING, 0.002, marks=pytest.mark.slow),
+        pytest.param("admittance", Motion.CIRCLE, 0.002, marks=pytest.mark.slow),
     ],
 )
 def test_motions_are_tracked_in_free_space(law: str, motion: int, tolerance: float) -> None:
     """With friction and current loops that the DPS does not know of, to which a soft law yields more."""
-    run = Run(TESTBEDS[law], motion)
+    run = Run(built(law), motion)
     for t in np.arange(1, 12) * 0.2:
         run.advance(t)
         assert np.linalg.norm(run.tip - wanted_tip(run, motion, t)) < tolerance
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [FIRST_LAW, *(pytest.param(law, marks=pytest.mark.slow) for law in FURTHER_LAWS)])
 def test_without_friction_motions_are_tracked_closely(law: str) -> None:
-    run = Run(TESTBEDS[law], Motion.CIRCLE, **SMOOTH, **{"sim.act.drives.viscous": np.zeros(7)})
+    run = Run(built(law), Motion.CIRCLE, **SMOOTH, **{"sim.act.drives.viscous": np.zeros(7)})
     for t in np.arange(1, 8) * 0.2:
         run.advance(t)
         assert np.linalg.norm(run.tip - wanted_tip(run, Motion.CIRCLE, t)) < 0.0005
 
 
 def test_pushed_joint_impedance_yields_by_torque_over_stiffness() -> None:
-    run = Run(TESTBEDS["joint_impedance"], **SMOOTH)
+    run = Run(built("joint_impedance"), **SMOOTH)
     push = np.array([0.0, 2.0, 0.0, 10.0, -15.0, -20.0])
     run.testbed.write(run.context, {"sim.env.push.wrench": push})
     run.advance(2.0)
@@ -112,8 +119,9 @@ def test_pushed_joint_impedance_yields_by_torque_over_stiffness() -> None:
     assert np.abs(expected).max() > 0.01
 
 
+@pytest.mark.slow
 def test_pushed_cartesian_impedance_yields_by_force_over_stiffness() -> None:
-    run = Run(TESTBEDS["cartesian_impedance"], **SMOOTH)
+    run = Run(built("cartesian_impedance"), **SMOOTH)
     force = np.array([30.0, -20.0, 25.0])
     before = run.tip
     run.testbed.write(run.context, {"sim.env.push.wrench": [0, 0, 0, *force]})
@@ -122,7 +130,7 @@ def test_pushed_cartesian_impedance_yields_by_force_over_stiffness() -> None:
 
 
 def test_pushed_admittance_moves_like_its_mass_damper_and_spring() -> None:
-    run = Run(TESTBEDS["admittance"], **SMOOTH)
+    run = Run(built("admittance"), **SMOOTH)
     run.advance(0.2)  # the first readings of sensors have passed
     before = run.tip
     force, axis = 15.0, 1
@@ -140,13 +148,13 @@ def test_pushed_admittance_moves_like_its_mass_damper_and_spring() -> None:
     np.testing.assert_allclose((run.tip - before)[axis], force / K, rtol=2e-3)
 
 
-@pytest.mark.parametrize("law", ["cartesian_impedance", "admittance"])
+@pytest.mark.parametrize("law", ["cartesian_impedance", pytest.param("admittance", marks=pytest.mark.slow)])
 def test_force_on_the_wall_is_that_of_two_springs_in_series(law: str) -> None:
     scenario = ManipulatorScenario(law=law, wall=True)
     run = Run(scenario.build(), Motion.PRESS, **SMOOTH)
     start = run.tip
     gap = scenario.wall_distance - ARM.ball_radius - start[0]
-    run.advance(3.9)  # the tip waits from 2 s to 4 s
+    run.advance(3.0)  # the tip waits from 2 s to 4 s
     k_law, k_wall = run.read("dps.impl.stiffness")[3], scenario.wall_stiffness
     expected = k_law * k_wall / (k_law + k_wall) * (run.read("dps.impl.press_depth") - gap)
     assert expected > 15.0
@@ -158,10 +166,11 @@ def test_force_on_the_wall_is_that_of_two_springs_in_series(law: str) -> None:
     np.testing.assert_allclose(run.read("dps.env.external_torque"), outside, atol=0.02 * np.abs(outside).max())
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("turn", [[0.0] * 7, [0.3, -0.2, 0.5, 0.4, -0.8, 0.6, 1.0]])
 def test_resting_arm_senses_its_tools_weight_and_no_contact(turn: list[float]) -> None:
     q = np.array(ARM.home) + turn
-    run = Run(TESTBEDS["joint_impedance"])
+    run = Run(built("joint_impedance"))
     positions = {f"sim.sys.arm.{name}.position": value for name, value in zip(JOINT_NAMES, q, strict=True)}
     reference = dict.fromkeys(("dps.impl.start", "dps.impl.reference", "dps.impl.home"), q)
     run.testbed.write(run.context, {**positions, **reference})
@@ -173,8 +182,8 @@ def test_resting_arm_senses_its_tools_weight_and_no_contact(turn: list[float]) -
 
 
 def test_work_of_the_drives_becomes_energy() -> None:
-    """Kinetic and potential energy, that of the rotors included, against the integral of torque times velocity."""
-    run = Run(TESTBEDS["joint_impedance"], Motion.SWING)
+    """Kinetic (also the rotors') and potential energy against the integral of torque times velocity."""
+    run = Run(built("joint_impedance"), Motion.SWING)
 
     def energy() -> float:
         v = run.plant.GetVelocities(run.plant_context)
@@ -195,7 +204,7 @@ def test_work_of_the_drives_becomes_energy() -> None:
 
 def test_controllers_model_stays_when_the_arm_becomes_heavier() -> None:
     """It sags by the weight that the DPS does not know of, over the stiffness."""
-    run = Run(TESTBEDS["joint_impedance"], **SMOOTH)
+    run = Run(built("joint_impedance"), **SMOOTH)
     run.testbed.write(run.context, {"sim.sys.arm.link_4.mass": ARM.masses[3] + 1.0})
     run.advance(1.5)
     context = run.plant.CreateDefaultContext()

@@ -21,6 +21,7 @@ def numbers(text, begin):
     return [float(number) for number in re.findall(r"-?\d+\.?\d*", line.strip().removeprefix(begin))]
 
 
+@pytest.mark.slow
 def test_simulation_is_reported_beside_what_the_machine_did(capsys):
     with Hub(port=0) as hub:
         demo = Demo(LAWS[0], hub)
@@ -100,7 +101,7 @@ def test_demo_goes_from_the_simulation_to_a_machine_that_dies_and_comes_back(cap
     for law, simulated, _ in at_rest:
         assert law > 10.0
         assert simulated == pytest.approx(law, rel=0.05)
-    if "With so many latches" not in text:
+    if "With this many latches" not in text:
         assert any(real == pytest.approx(law, rel=0.05) for law, _, real in at_rest)
     rms, most = numbers(text, "reset; the next circle is tracked to")
     assert 0.0 < rms < most < 50.0

@@ -142,6 +142,7 @@ def test_cartesian_impedance_is_a_spring_at_the_tip(plant: MultibodyPlant) -> No
     np.testing.assert_allclose(felt, K * np.concatenate([e, p_r - p]), atol=1e-4)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("axis", range(6))
 def test_admittance_is_a_mass_with_damper_and_spring(plant: MultibodyPlant, axis: int) -> None:
     """The step response against M x'' + D x' + K x = F, solved by the eigenvalues."""
@@ -210,6 +211,7 @@ def test_offsets_calibrate_sensors_and_drives(plant: MultibodyPlant) -> None:
     np.testing.assert_allclose(bench.step(), model(plant, HOME)[0] + 0.5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_posture_stays_while_the_tip_goes_round_and_round() -> None:
     """Inverse kinematics alone does not close a redundant arm's circle (Klein, Huang, "Review of Pseudoinverse Control
     for Use with Kinematically Redundant Manipulators", 1983)."""

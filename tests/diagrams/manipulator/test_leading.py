@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -54,12 +56,15 @@ class Led:
         self.simulator.AdvanceTo(self.context.get_time() + seconds)
 
 
-TESTBEDS = {law: ManipulatorScenario(law=law, led_by_hand=True).build() for law in LAWS}
+@cache
+def built(law: str) -> VirtualTestbed:
+    return ManipulatorScenario(law=law, led_by_hand=True).build()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_tip_goes_where_the_hand_leads_it_and_home_again(law: str) -> None:
-    run = Led(TESTBEDS[law])
+    run = Led(built(law))
     start = run.tip
     goal = RigidTransform(RollPitchYaw(0.2, 0.1, 0.3).ToRotationMatrix() @ start.rotation(), [0.55, 0.12, 0.72])
     run.lead(hand(goal))
@@ -75,7 +80,7 @@ def test_tip_goes_where_the_hand_leads_it_and_home_again(law: str) -> None:
 
 
 def test_reference_is_smooth_and_stops_when_the_hand_lets_go() -> None:
-    run = Led(TESTBEDS["joint_impedance"])
+    run = Led(built("joint_impedance"))
     run.advance(0.01)
     goal = RigidTransform(run.tip.rotation(), [0.4, 0.3, 0.4])
     dt, positions = 0.004, []
@@ -95,9 +100,17 @@ def test_reference_is_smooth_and_stops_when_the_hand_lets_go() -> None:
     assert np.linalg.norm(run.tip.translation() - positions[-1]) < 1e-3
 
 
-@pytest.mark.parametrize("goal", [[1.6, 0.0, 1.6], [-0.4, 0.0, 0.2], [0.0, 0.0, 0.3]])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "goal",
+    [
+        [1.6, 0.0, 1.6],
+        pytest.param([-0.4, 0.0, 0.2], marks=pytest.mark.slow),
+        pytest.param([0.0, 0.0, 0.3], marks=pytest.mark.slow),
+    ],
+)
 def test_arm_stays_within_its_ranges_where_the_hand_is_out_of_reach(goal: list[float]) -> None:
-    run = Led(TESTBEDS["cartesian_impedance"])
+    run = Led(built("cartesian_impedance"))
     run.lead(hand(RigidTransform(RollPitchYaw(0.0, 2.5, 1.0), goal)))
     for _ in range(60):
         run.advance(0.05)
@@ -111,7 +124,7 @@ def test_arm_stays_within_its_ranges_where_the_hand_is_out_of_reach(goal: list[f
 
 @pytest.mark.parametrize("value", [(0.4, *REST[1:]), (1.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.5)])
 def test_what_is_no_pose_leads_nowhere(value: tuple[float, ...]) -> None:
-    run = Led(TESTBEDS["cartesian_impedance"])
+    run = Led(built("cartesian_impedance"))
     before = run.reference.translation()
     run.lead(value)
     run.advance(0.2)
@@ -119,7 +132,7 @@ def test_what_is_no_pose_leads_nowhere(value: tuple[float, ...]) -> None:
 
 
 def test_hand_does_not_lead_other_motions() -> None:
-    run = Led(TESTBEDS["cartesian_impedance"])
+    run = Led(built("cartesian_impedance"))
     run.testbed.write(run.context, {"u.motion": float(Motion.HOME)})
     run.lead(hand(RigidTransform(run.tip.rotation(), [0.4, 0.3, 0.4])))
     run.advance(0.2)
@@ -132,5 +145,5 @@ def test_scenario_declares_what_the_hand_commands() -> None:
     assert declared is not None and ManipulatorScenario().hand_command() is None
     declared.check_interface(scenario.interface())
     assert [map.channel for map in protocol_of(scenario).commands] == ["ARM_MOTION", "ARM_HAND"]
-    tip = Led(TESTBEDS["cartesian_impedance"]).tip.translation()
+    tip = Led(built("cartesian_impedance")).tip.translation()
     assert np.all((tip > declared.lower) & (tip < declared.upper))

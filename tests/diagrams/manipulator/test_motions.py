@@ -46,6 +46,7 @@ def steps(seconds: float) -> int:
     return round(seconds / T)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("position", "speed", "acceleration"), [("q_r", "v_r", "a_r"), ("dp", "dv", "da")])
 @pytest.mark.parametrize("motion", [Motion.SWING, Motion.PRESS, Motion.CIRCLE])
 def test_derivatives_are_those_of_the_motion(motion: int, position: str, speed: str, acceleration: str) -> None:

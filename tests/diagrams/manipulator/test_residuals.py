@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -47,6 +46,7 @@ def monitors(together: Together, **options: Any) -> dict[str, ResidualMonitor]:
     return {mode: ResidualMonitor(loop, mode, worker=False, **options) for mode, loop in loops.items()}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -70,22 +70,36 @@ def test_perfect_model_leaves_nothing_whatever_the_latencies(scenario: Manipulat
         np.testing.assert_allclose([window.residual for window in monitor.history], 0.0, atol=1e-9)
 
 
-@pytest.fixture(scope="module", params=[pytest.param(0, marks=pytest.mark.one_python), 2], ids="latency {}".format)
-def nominal_and_heavy(request: pytest.FixtureRequest) -> Iterator[dict[str, Mapping[str, ResidualMonitor]]]:
-    scenario = noisy(request.param)
-    found = {}
-    for name, mass in (("nominal", MASS), ("heavy", 1.05 * MASS)):
-        together = together_with(scenario, **{TOOL: mass})
-        found[name] = monitors(together, config=replace(scenario.deployment().residuals, tolerance=DEVIATION))
-        together.run(600)
-    yield found
+def monitored(latency: int, mass: float, cycles: int) -> dict[str, ResidualMonitor]:
+    scenario = noisy(latency)
+    together = together_with(scenario, **{TOOL: mass})
+    both = monitors(together, config=replace(scenario.deployment().residuals, tolerance=DEVIATION))
+    together.run(cycles)
+    return both
 
 
+with_and_without_latency = pytest.mark.parametrize(
+    "latency",
+    [2, pytest.param(0, marks=[pytest.mark.one_python, pytest.mark.slow])],
+    ids="latency {}".format,
+    scope="module",
+)
+
+
+@pytest.fixture(scope="module")
+def nominal(latency: int) -> dict[str, ResidualMonitor]:
+    return monitored(latency, MASS, 600)
+
+
+@pytest.fixture(scope="module")
+def heavy(latency: int) -> dict[str, ResidualMonitor]:
+    return monitored(latency, 1.05 * MASS, 250)
+
+
+@with_and_without_latency
 @pytest.mark.parametrize("mode", ["twin", "shadow"])
-def test_heavier_payload_is_found_quickly(
-    nominal_and_heavy: dict[str, Mapping[str, ResidualMonitor]], mode: str
-) -> None:
-    monitor = nominal_and_heavy["heavy"][mode]
+def test_heavier_payload_is_found_quickly(heavy: dict[str, ResidualMonitor], mode: str) -> None:
+    monitor = heavy[mode]
     alarm = monitor.alarms[0]
     # The wrist's sensor carries 20 g more, all of it along its x at home.
     assert (alarm.signal, alarm.entry) == ("sense.wrench", 3)
@@ -94,14 +108,17 @@ def test_heavier_payload_is_found_quickly(
     assert settled < alarm.began < settled + 0.1
 
 
+@pytest.mark.slow
+@with_and_without_latency
 @pytest.mark.parametrize("mode", ["twin", "shadow"])
-def test_nominal_arm_raises_no_alarm(nominal_and_heavy: dict[str, Mapping[str, ResidualMonitor]], mode: str) -> None:
-    monitor = nominal_and_heavy["nominal"][mode]
+def test_nominal_arm_raises_no_alarm(nominal: dict[str, ResidualMonitor], mode: str) -> None:
+    monitor = nominal[mode]
     assert not monitor.alarms
     assert len(monitor.history) == 59 - monitor.config.settle
     assert np.abs([window.residual for window in monitor.history]).max() > 0.01
 
 
+@pytest.mark.slow
 def test_sensor_that_drifts_is_named() -> None:
     scenario = noisy()
     together = together_with(scenario)
@@ -109,7 +126,7 @@ def test_sensor_that_drifts_is_named() -> None:
     machine = together.line.machine
     for k in range(500):
         bias = np.array([0.0, 0.0, 0.0, 0.0, 0.5e-3 * k, 0.0])  # half a newton per second
-        machine.world.write(machine._context, {"sim.sense.wrench.bias": bias})
+        machine.write({"sim.sense.wrench.bias": bias})
         together.run(1)
     for monitor in both.values():
         assert {(alarm.signal, alarm.entry) for alarm in monitor.alarms} == {("sense.wrench", 4)}

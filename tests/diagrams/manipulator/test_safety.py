@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
 from vtbdrake.control.fallback import NO_COMMAND, NoCommand, Sample
-from vtbdrake.control.guards import Guards, Verdict
+from vtbdrake.control.guards import SOUND, GuardDecision, Guards, LoopCondition
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.testbed import Interface, Signal, WorldAlone
 from vtbdrake_diagrams.manipulator.arm import Arm
@@ -22,12 +23,16 @@ REST = np.zeros(7)
 T = 0.001
 
 SCENARIO = ManipulatorScenario()
-WORLD = WorldAlone(SCENARIO)
+
+
+@cache
+def world() -> WorldAlone:
+    return WorldAlone(SCENARIO)
 
 
 def gravity(q: np.ndarray) -> np.ndarray:
     """By Drake."""
-    plant = WORLD.plant
+    plant = world().plant
     assert plant is not None
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
@@ -124,8 +129,8 @@ class GuardedArm:
         deployment = SCENARIO.deployment()
         self.guards = Guards(interface, T, **deployment.guards)
         self.guards.measured_by = {"joint_torque": "joint_torque_measured"}
-        self.context = WORLD.default_context()
-        self.simulator = WORLD.simulator(self.context)
+        self.context = world().default_context()
+        self.simulator = world().simulator(self.context)
         self.simulator.Initialize()
         self.received = {signal.name: ReceivedSignal() for signal in interface.sense}
         self.heard: Callable[[dict[str, Any]], dict[str, Any]] = lambda measured: measured
@@ -135,26 +140,26 @@ class GuardedArm:
         self.run(5)
 
     def measured(self, name: str) -> np.ndarray:
-        return np.array(WORLD.read(self.context, f"sense.{name}"))
+        return np.array(world().read(self.context, f"sense.{name}"))
 
     @property
     def pose(self) -> np.ndarray:
-        assert WORLD.plant is not None
-        return np.array(WORLD.plant.GetPositions(WORLD.plant.GetMyContextFromRoot(self.context)))
+        assert world().plant is not None
+        return np.array(world().plant.GetPositions(world().plant.GetMyContextFromRoot(self.context)))
 
-    def cycle(self, **options: Any) -> Verdict:
+    def cycle(self, condition: LoopCondition = SOUND) -> GuardDecision:
         now = self.cycles * T
         for name, value in self.heard({name: self.measured(name) for name in self.received}).items():
             self.received[name].accept(np.array(value), now, now)
-        verdict = self.guards.judge(now, self.received, {"joint_torque": gravity(self.pose)}, **options)
+        verdict = self.guards.judge(now, self.received, {"joint_torque": gravity(self.pose)}, condition=condition)
         self.guards.note_unsent(())
         if "joint_torque" in verdict.actuation:
-            WORLD.actuate(self.context, "joint_torque", verdict.actuation["joint_torque"])
+            world().actuate(self.context, "joint_torque", verdict.actuation["joint_torque"])
         self.cycles += 1
         self.simulator.AdvanceTo(self.cycles * T)
         return verdict
 
-    def run(self, cycles: int) -> list[Verdict]:
+    def run(self, cycles: int) -> list[GuardDecision]:
         return [self.cycle() for _ in range(cycles)]
 
     def reset(self) -> tuple[str, ...]:
@@ -173,6 +178,7 @@ def test_silent_sensors_leave_arm_to_brakes() -> None:
     assert arm.cycle().actuation == {}
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("signal", ["joint_position", "joint_velocity", "joint_torque_measured", "wrench"])
 def test_arm_is_carried_whichever_of_its_sensors_falls_silent(signal: str) -> None:
     arm = GuardedArm()
@@ -192,11 +198,12 @@ SPOOFS: dict[str, Callable[[int, np.ndarray], np.ndarray]] = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("spoof", SPOOFS)
 def test_false_positions_within_range_do_not_move_the_arm_that_floats(spoof: str) -> None:
     arm = GuardedArm()
     before = arm.pose
-    arm.cycle(error=RuntimeError("a fault of the DPS"))
+    arm.cycle(LoopCondition(error=RuntimeError("a fault of the DPS")))
     arm.heard = lambda measured: {
         **measured,
         "joint_position": SPOOFS[spoof](arm.cycles, measured["joint_position"]),
@@ -207,11 +214,12 @@ def test_false_positions_within_range_do_not_move_the_arm_that_floats(spoof: str
     assert any(fault.kind == "jump" for fault in arm.guards.log)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("offset", [0.2, 5.0])
 def test_false_velocities_within_range_do_not_move_the_arm_that_floats(offset: float) -> None:
     arm = GuardedArm()
     before = arm.pose
-    arm.cycle(error=RuntimeError("a fault of the DPS"))
+    arm.cycle(LoopCondition(error=RuntimeError("a fault of the DPS")))
     arm.heard = lambda measured: {**measured, "joint_velocity": measured["joint_velocity"] + offset}
     arm.run(500)
     assert np.abs(arm.pose - before).max() < 2.0 * SLIP

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,20 @@ from pydrake.systems.framework import Context
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake.testing import Subject
-from vtbdrake.testing.checks.boundary import check_dps_alone_commands_the_same, check_dps_cannot_tell_the_switch
-from vtbdrake.testing.checks.scenario import check_yaml_round_trip
-from vtbdrake.testing.checks.signals import check_parameters_have_bounds, check_variables_do_not_overlap
+from vtbdrake.testing.checks.boundary_checks import check_dps_alone_commands_the_same, check_dps_cannot_tell_the_switch
+from vtbdrake.testing.checks.scenario_checks import check_yaml_round_trip
+from vtbdrake.testing.checks.signal_checks import check_parameters_have_bounds, check_variables_do_not_overlap
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.laws import LAWS
 from vtbdrake_diagrams.manipulator.motions import Motion
 
 T = 0.001
 SIGNALS = ("joint_position", "joint_velocity", "joint_torque_measured", "wrench")
+
+
+# Set after the construction, which refuses it.
+IMPOSSIBLE = ErrorModel()
+IMPOSSIBLE.dropout = 2.0
 
 
 def rough(law: str = "admittance", **fields: object) -> ManipulatorScenario:
@@ -52,7 +58,7 @@ def start(testbed: VirtualTestbed, motion: int) -> Context:
         ({"period": 0.0}, "period must be a finite number above 0 s"),
         ({"wall_stiffness": -1.0}, "wall_stiffness must be a finite number above 0 N/m"),
         ({"plant_config": MultibodyPlantConfig(time_step=0.0)}, "time_step must be a number above 0 s"),
-        ({"position_errors": ErrorModel(dropout=2.0)}, "ManipulatorScenario.position_errors.dropout must be"),
+        ({"position_errors": IMPOSSIBLE}, "ManipulatorScenario.position_errors.dropout must be"),
     ],
 )
 def test_bad_fields_are_refused(fields: dict, message: str) -> None:
@@ -68,6 +74,7 @@ def test_signals_fit_the_robots_messages() -> None:
     np.testing.assert_array_equal(torque.upper, [320, 320, 176, 176, 110, 40, 40])
 
 
+@pytest.mark.slow
 def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
     testbed = rough().build()
     context = start(testbed, Motion.PRESS)
@@ -75,16 +82,22 @@ def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
     simulator.AdvanceTo(1.2)
     assert testbed.read(context, "dps.env.contact_wrench")[3] < -2.0  # in contact
     snapshot = testbed.snapshot(context)
-    simulator.AdvanceTo(1.5)
+    simulator.AdvanceTo(1.3)
 
     other = rough().build()
     copied = other.default_context()
     other.restore(copied, snapshot)
-    other.simulator(copied, restored=True).AdvanceTo(1.5)
+    other.simulator(copied, restored=True).AdvanceTo(1.3)
     assert other.read(copied, "dps.joint_torque").tobytes() == testbed.read(context, "dps.joint_torque").tobytes()
     assert other.snapshot(copied).compare(testbed.snapshot(context)) == {}
 
 
+@cache
+def subject(law: str) -> Subject:
+    return Subject(rough(law), values={"u.motion": float(Motion.SWING), "sim.act.drives.delay": 2.0}, horizon=0.2)
+
+
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "check",
@@ -98,13 +111,13 @@ def test_snapshot_continues_with_the_same_bytes(tmp_path: Path) -> None:
     ids=lambda check: check.__name__,
 )
 def test_every_law_passes_with_every_error(law: str, check: Callable[[Subject], None]) -> None:
-    check(Subject(rough(law), values={"u.motion": float(Motion.SWING), "sim.act.drives.delay": 2.0}, horizon=0.2))
+    check(subject(law))
 
 
 def test_simulated_arm_starts_from_what_the_dps_perceives() -> None:
     testbed = ManipulatorScenario().build()
     context = start(testbed, Motion.SWING)
-    testbed.simulator(context).AdvanceTo(1.0)
+    testbed.simulator(context).AdvanceTo(0.5)
     q = testbed.read(context, "dps.env.joint_position")
     testbed.write(context, {f"sim.sys.arm.joint_{k}.position": 0.0 for k in range(1, 8)})
     testbed.start_from_belief(context)
@@ -138,6 +151,7 @@ def test_simulation_starts_in_equilibrium() -> None:
         np.testing.assert_allclose(velocities, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("law", LAWS)
 def test_compiled_dps_gives_the_same_torques(law: str) -> None:
     torques = []

@@ -28,6 +28,7 @@ def circle() -> Track:
     return track
 
 
+@pytest.mark.slow
 def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
     during = circle.motion == Motion.CIRCLE
     x = circle.clock[during] / DURATIONS["dps.impl.circle_duration"]
@@ -39,6 +40,7 @@ def test_reference_of_the_circle_is_the_circle(circle: Track) -> None:
     assert during.sum() > 400
 
 
+@pytest.mark.slow
 def test_errors_are_the_distances_from_it(circle: Track) -> None:
     errors = circle.errors((Motion.CIRCLE,))
     assert 1e-5 < errors.max() < 0.002

@@ -36,13 +36,14 @@ def test_odometry_and_its_drift_are_those_that_made_the_drive() -> None:
     assert estimate.scale == pytest.approx(1.03, abs=0.01)
     assert estimate.offset == pytest.approx(0.02, abs=0.01)
     assert estimate.antenna[0] == pytest.approx(0.5, abs=0.3)
-    # Of random slip along the path, the errors are as large as its model says.
+    # With random slip along the path, the errors are as large as its model says.
     windows = Windows.of(drive, truth, 10.0)
     model = DriftModel(along=0.03, across=1e-4, heading=0.0, turn=0.0)
     along = windows.errors[:, 0] ** 2 / windows.covariances(model, start=0.0)[:, 0, 0]
     assert along.mean() == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / len(along)))
 
 
+@pytest.mark.slow
 def test_calibrated_with_one_half_it_is_better_in_the_other() -> None:
     drive = Mowing.read(recordings("plaza/Plaza1_.mat")[0])
     turns, ways = drive.likeness

@@ -46,7 +46,7 @@ def test_simulated_car_finds_itself_and_says_how_well():
         claim = testbed.read(context, "sim.act.display.discrete_state_0")
         np.testing.assert_allclose(claim[:2], position, atol=0.3)
         assert claim[3] < 0.2
-    # 2 are expected of a clock like that of the real car; here, all scans are dated exactly.
+    # 2 are expected with a clock like the real car's; here, all scans are dated exactly.
     assert np.mean(squares) < 3.0
 
 
@@ -89,6 +89,7 @@ def test_points_are_laid_onto_others_by_a_rigid_motion():
     np.testing.assert_allclose(laid_onto(points, transform(X, points)), X)
 
 
+@pytest.mark.slow
 def test_part_of_the_real_drive_is_localized_and_replayed(tmp_path):
     """The end of the drive is where it began. The whole: python -m vtbdrake_diagrams.park.reality."""
     drive = victoria_park(recordings("victoria_park/inputs.dat")[0].parent)

@@ -21,6 +21,7 @@ def diameters(rocks: WorldModel) -> np.ndarray:
     return np.array([(one.number("length", unit="m") * one.number("width", unit="m")) ** 0.5 for one in rocks])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("abundance", [0.03, 0.06])
 def test_covered_area_follows_the_law(abundance: float) -> None:
     """F(D) = k exp(-q D); rocks above 1.5 m are too few to test."""
@@ -73,6 +74,7 @@ def test_surface_of_the_rocks_has_their_sizes() -> None:
     np.testing.assert_allclose(middles[:, 2], ground.height(middles[:, 0], middles[:, 1]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_carrier_drives_on_mars() -> None:
     testbed = PlainScenario(length=60.0, width=60.0).build()
     context = testbed.default_context()

@@ -49,6 +49,7 @@ def test_pendulum_is_what_was_weighed_and_not_what_was_published() -> None:
     assert np.max(errors["as weighed"]) < np.min(errors["calibrated"])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("read", "published"),
     [
@@ -67,6 +68,7 @@ def test_other_movements_are_explained_better_than_by_the_published_model(read, 
     assert shares["ours, of real bodies"] < shares[published]
 
 
+@pytest.mark.slow
 def test_tx40_is_explained_better_only_if_both_have_seen_the_movement() -> None:
     shares = relative(compared(subjects.tx40(folder("figaroh"))))
     assert shares["ours, fitted to all"] < shares["FIGAROH"] < shares["ours, of real bodies"]

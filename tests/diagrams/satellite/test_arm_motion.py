@@ -9,7 +9,7 @@ import pytest
 
 from vtbdrake.compiled import UnsupportedTestbedError
 from vtbdrake.rollout import RolloutTask, SerialExecutor
-from vtbdrake.rollout.compiled import CompiledExecutor
+from vtbdrake.rollout.compiled_executor import CompiledExecutor
 from vtbdrake.testbed import ScenarioError
 from vtbdrake_diagrams.satellite.plant import plant_config
 from vtbdrake_diagrams.satellite.studies.arm_motion import BASE, DEVIATION, PLAN, ArmMotionScenario, deviation, limits
@@ -31,8 +31,9 @@ def bent(scenario: ArmMotionScenario) -> np.ndarray:
     return knots
 
 
+@pytest.mark.slow
 def test_full_testbed_tends_to_the_momentum_model():
-    """The difference is that of the plant's time step: half of it with half of the step."""
+    """The difference comes from the plant's time step: half of it with half of the step."""
     errors = []
     for step in (0.01, 0.005):
         config = plant_config()
@@ -58,6 +59,7 @@ def test_mental_testbed_has_no_forces_and_the_same_addresses():
     np.testing.assert_allclose(joints, scenario.goal, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_mental_testbed_is_compiled_to_the_same_outcomes():
     scenario = ArmMotionScenario(thinking_time=0.2).mental()
     task = RolloutTask(scenario, scenario.horizon, DEVIATION, measures=tuple(limits(scenario, PLAN)))
@@ -76,6 +78,7 @@ def test_fingers_that_can_touch_are_not_compiled():
         ArmMotionScenario(thinking_time=0.2).build().compiled(horizon=1.0, compile=False)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_the_decision_on_board_turns_the_base_ten_times_less():
     comparison = compare(ArmMotionScenario(onboard=True))
@@ -95,6 +98,7 @@ def test_a_plan_beyond_a_limit_violates_a_constraint():
     assert excess([scenario.plan(knots)], time=0.0) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_search_in_the_full_testbed_starts_from_the_straight_path():
     scenario = ArmMotionScenario(thinking_time=0.2)
     problem = search_problem(scenario)

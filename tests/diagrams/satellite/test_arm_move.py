@@ -65,7 +65,7 @@ def test_slopes_are_those_of_finite_differences(move):
 
 
 def test_bounds_agree_with_the_limits(move):
-    """What is within the bounds of the solvers keeps the limits, and what exceeds a limit is not."""
+    """Plans within the bounds of the solvers keep the limits, and plans that exceed a limit are outside."""
     least, most = move.bounds
     for scale in (0.05, 0.4, 1.0, 2.0):
         knots = bent(move, scale, seed=4)
@@ -93,7 +93,9 @@ def test_a_plan_has_a_free_knot():
         MoveSpace(knots=4)
 
 
-@pytest.mark.parametrize("solve", [pytest.param(plan_by_casadi, marks=pytest.mark.one_python), plan_by_drake])
+@pytest.mark.parametrize(
+    "solve", [pytest.param(plan_by_casadi, marks=[pytest.mark.one_python, pytest.mark.slow]), plan_by_drake]
+)
 def test_solvers_find_a_plan_that_turns_the_base_back(move, solve):
     plan = solve(move, attempts=1)
     assert move.excess(plan.knots) == {}
@@ -109,9 +111,10 @@ def test_unknown_solvers_are_refused(move):
         plan_by_drake(move, "NLOPT")
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_the_descent_proposes_its_plan_and_ends_with_it():
-    scenario = replace(ArmMotionScenario(), thinking_time=0.5)
+    scenario = replace(ArmMotionScenario(), thinking_time=10.0)
     options = {"origin": scenario.start, "goal": scenario.goal, "duration": 20.0, "knots": 9}
     solver = make_solver(MomentumDescent, free_knots(scenario, PLAN), budget=4, **options)
     (point,) = solver.ask()

@@ -76,6 +76,7 @@ def testbed() -> VirtualTestbed:
     return SatelliteScenario(perception="pose_sensor", wheels=True).build()
 
 
+@pytest.mark.slow
 def test_wheels_keep_the_stack_after_the_grip(testbed: VirtualTestbed) -> None:
     context = testbed.default_context()
     simulator = testbed.simulator(context)

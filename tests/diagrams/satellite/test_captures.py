@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
 
 import vtbdrake_diagrams.satellite.studies
+from vtbdrake.campaigns.campaign import Campaign
+from vtbdrake.campaigns.results import CampaignResult
 from vtbdrake.state.systems import pose_to_array
-from vtbdrake.testing.campaign import Campaign
-from vtbdrake.testing.campaign_results import CampaignResult
 from vtbdrake_diagrams.satellite import SatelliteScenario
 from vtbdrake_diagrams.satellite.bodies import ARM_JOINTS, Target
 from vtbdrake_diagrams.satellite.studies.captures import (
@@ -50,6 +52,7 @@ def result(campaign: Campaign) -> CampaignResult:
     return campaign.run(executor="serial", progress=False)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_campaign_judges_the_true_motion(campaign: Campaign, result: CampaignResult) -> None:
     """Criteria equal what the plant's own kinematics and two samples in a row say."""
@@ -82,15 +85,18 @@ def test_starts_differ_within_the_limits() -> None:
     assert np.linalg.norm(directions.mean(axis=0)) < 0.4
 
 
+@cache
+def plant() -> MultibodyPlant:
+    return SatelliteScenario(perception="pose_sensor").build().plant
+
+
 def gripped(offset: list[float]) -> list[np.ndarray]:
     """Return the arguments of the criteria if the bar is at an offset in the gripper."""
-    scenario = SatelliteScenario(perception="pose_sensor")
-    plant = scenario.build().plant
-    context = plant.CreateDefaultContext()
+    context = plant().CreateDefaultContext()
     for k, position in enumerate(POSTURE, 1):
-        plant.GetJointByName(f"joint_{k}").set_angle(context, position)
-    plant.SetFreeBodyPose(context, plant.GetBodyByName("base"), BASE)
-    X_WG = plant.GetFrameByName("gripper").CalcPoseInWorld(context)
+        plant().GetJointByName(f"joint_{k}").set_angle(context, position)
+    plant().SetFreeBodyPose(context, plant().GetBodyByName("base"), BASE)
+    X_WG = plant().GetFrameByName("gripper").CalcPoseInWorld(context)
     X_WT = X_WG @ RigidTransform(offset) @ Target().X_TH.inverse()
     return [pose_to_array(BASE), pose_to_array(X_WT), *map(np.float64, POSTURE)]
 

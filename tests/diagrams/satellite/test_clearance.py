@@ -1,4 +1,4 @@
-"""The distances that plans of the arm keep, beside those of Drake's SceneGraph."""
+"""The distances that plans of the arm keep, beside the distances of Drake's SceneGraph."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ def poses(count: int, seed: int = 0) -> np.ndarray:
 def test_spheres_are_never_farther_than_the_shapes(arm, drake):
     """Beyond 6 cm, there are pairs of links that no spheres stand for, as they cannot come closer."""
     q = poses(4000)
+    q = q[arm.least(q) > 0.0]  # Nothing is claimed about the others.
     ours, theirs = arm.least(q), np.array([drake.nearest(pose)[0] for pose in q])
     near = (ours > 0.0) & (ours < 0.06)
     assert near.sum() > 200
@@ -58,6 +59,7 @@ def test_no_distance_changes_faster_than_its_bound(arm):
     assert np.all(change <= (np.abs(steps) @ arm.reaches) * (1.0 + 1e-3) + 1e-12)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(3))
 def test_clearance_of_a_plan_is_that_between_the_instants_too(seed, arm):
     space = move_space(20.0, 9)
@@ -68,6 +70,7 @@ def test_clearance_of_a_plan_is_that_between_the_instants_too(seed, arm):
     assert dense - 1e-3 <= space.clearance(knots) <= dense + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 @pytest.mark.parametrize(
     ("solve", "ends"),

@@ -19,7 +19,7 @@ TIMEOUT = 60.0  # s; for a computer that is busy with other things
 READ = [f"dps.env.target.{name}" for name in ("pose", "fused", "left_out")]
 
 
-@pytest.mark.parametrize("perception", ["camera", "pose_sensor"])
+@pytest.mark.parametrize("perception", [pytest.param("camera", marks=pytest.mark.slow), "pose_sensor"])
 def test_poses_from_a_satellite_are_dated_by_the_clock_of_the_dps(perception: str) -> None:
     pytest.importorskip("cv2")
     scenario = SatelliteScenario(seed=1, tumble_deg=2.0, perception=perception, image_width=240, image_height=180)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
@@ -15,6 +16,23 @@ def momentum(plant: MultibodyPlant, context: Context) -> np.ndarray:
     return plant.CalcSpatialMomentumInWorldAboutPoint(context, np.zeros(3)).get_coeffs()
 
 
+def test_motion_of_the_arm_conserves_momentum() -> None:
+    testbed = SatelliteScenario(seed=1, tumble_deg=3.0, perception="pose_sensor").build()
+    context = testbed.default_context()
+    simulator = testbed.simulator(context)
+    simulator.AdvanceTo(0.05)
+    own = testbed.plant.GetMyContextFromRoot(context)
+    before, base = momentum(testbed.plant, own), testbed.plant.GetBodyByName("base")
+    simulator.AdvanceTo(3.0)
+    assert testbed.read(context, "dps.impl.supervisor.mode") == Mode.APPROACH
+    # The arm turns the base on which it stands.
+    assert base.EvalPoseInWorld(own).rotation().ToAngleAxis().angle() > 1e-4
+    for part in (slice(0, 3), slice(3, 6)):
+        error = momentum(testbed.plant, own)[part] - before[part]
+        assert np.linalg.norm(error) < 0.02 * np.linalg.norm(before[part])
+
+
+@pytest.mark.slow
 def test_capture_conserves_momentum_and_wheels_hold_the_attitude() -> None:
     turns = []
     for wheels in (False, True):

@@ -72,6 +72,7 @@ def test_bar_error_is_seen_from_the_base() -> None:
     assert bar_error(record) == pytest.approx(0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_choice_holds_the_bar_in_the_grazing_sun(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lighting, "LIGHTS", {"grazing, 86 deg": LIGHTS["grazing, 86 deg"]})

@@ -1,8 +1,9 @@
-"""What the servicer believes, and the mental copy of its testbed."""
+"""The servicer's belief, and the mental copy of its testbed."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from vtbdrake.reasoning import Belief
 from vtbdrake.rollout import RolloutRunner, RolloutTask
@@ -20,6 +21,7 @@ WORLD = {
 }
 
 
+@pytest.mark.slow
 def test_mental_capture_begins_with_the_estimates() -> None:
     scenario = SatelliteScenario(seed=1, tumble_deg=3.0, perception="pose_sensor")
     testbed = scenario.build()

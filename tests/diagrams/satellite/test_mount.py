@@ -75,6 +75,7 @@ def test_the_supervisor_is_not_varied_along_a_recorded_motion():
         mount_problem([vtb.Parameter("dps.impl.supervisor.standoff", 0.2, 0.3)], seeds=(0,))
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_along_the_recorded_capture_the_count_is_the_same(problem):
     try:
@@ -128,7 +129,7 @@ def test_answer_holds_where_nothing_by_hand_or_on_the_grid_sees_more():
 def test_nothing_is_claimed_where_a_rollout_failed(caplog):
     answer = MountAnswer(placement(5.0), (placement(2.0),), (), counted([1.0, 3.0]))
     assert answer.holds
-    # Otherwise the best of the grid, or of what was placed by hand, would be that of the rest.
+    # Otherwise the best of the grid, or of what was placed by hand, would be the best of the rest.
     for failed in (
         replace(answer, landscape=counted([1.0, 3.0], failing=[3.0])),
         replace(answer, by_hand=(placement(2.0), placement(2.0, 1.0, failing=[1.0]))),

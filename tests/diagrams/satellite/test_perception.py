@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from vtbdrake.common.scan import Scan
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
 from vtbdrake.components.perception.registration import RegistrationConfig
 from vtbdrake.components.perception.target_tracker import STATE_SIZE, body_state
-from vtbdrake.scan import Scan
 from vtbdrake_diagrams.satellite.bodies import Servicer, Target
 from vtbdrake_diagrams.satellite.estimation import HISTORY, POSE, pose_at
 from vtbdrake_diagrams.satellite.perception import ScanPose, in_inertial_frame, target_board, target_faces
@@ -139,9 +139,10 @@ def start(*, deskew: bool, scans: int) -> PoseEstimate:
     return shown
 
 
+@pytest.mark.slow
 def test_start_needs_only_the_rough_attitude() -> None:
     assert not start(deskew=True, scans=1).valid
-    # Of the first scan, the motion is not known; of the second it is.
+    # The motion is not known for the first scan, but for the second.
     raw, corrected = (
         np.linalg.norm(estimate.error_to(target_at(2.0))[3:])
         for estimate in (start(deskew=False, scans=1), start(deskew=True, scans=2))

@@ -10,6 +10,7 @@ from vtbdrake_diagrams.satellite.reality import outcome, photographs
 pytestmark = pytest.mark.one_python
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("upscaling", "least"), [(1, (12, 15, 9)), (2, (12, 20, 10))])
 def test_tags_of_real_photographs_are_found(upscaling, least):
     folder = recordings("apriltag/*_c.jpg")[0].parent

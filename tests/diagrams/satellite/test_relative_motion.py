@@ -1,4 +1,4 @@
-"""What the capture is controlled by, against a plant in the same state."""
+"""The relative motion that controls the capture equals a plant's in the same state."""
 
 from __future__ import annotations
 

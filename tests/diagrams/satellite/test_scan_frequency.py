@@ -26,7 +26,8 @@ pytestmark = pytest.mark.one_python
 FREQUENCY = 2.0
 
 
-@pytest.mark.parametrize("deskew", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("deskew", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_target_seems_half_a_scan_behind_without_deskewing(deskew: bool) -> None:
     testbed = ApproachScenario(tumble_deg=1.0, deskew=deskew).build()
     context = testbed.default_context()
@@ -53,7 +54,7 @@ def test_error_is_that_of_the_end_of_the_bar() -> None:
 
 
 def errors(rows: list[list[float]], frequencies: tuple[float, ...] = (0.5, 1.0, 4.0)) -> Errors:
-    """Return the errors at one tumble rate: of each frequency those of some approaches."""
+    """Return the errors at one tumble rate: for each frequency, the errors of some approaches."""
     return Errors(np.array(frequencies), np.array([rows]))
 
 
@@ -62,7 +63,7 @@ GOOD, BAD = 0.5 * TOLERANCE, 2.0 * TOLERANCE
 
 @pytest.mark.parametrize("starts", [10, 30, 60])
 def test_interval_holds_the_quantile_as_often_as_it_says(starts: int) -> None:
-    # Of errors that are exponentially distributed: 4,000 experiments.
+    # Errors that are exponentially distributed: 4,000 experiments.
     random = np.random.default_rng(0)
     found = Errors(np.ones(4000), random.exponential(size=(1, 4000, starts)))
     lower, estimate, upper = (bound[0] for bound in found.quantiles())

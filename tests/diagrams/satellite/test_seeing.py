@@ -25,6 +25,7 @@ def built(perception: str) -> VirtualTestbed:
     return seeing(perception).build()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("perception", ["camera", "camera+scanner"])
 def test_target_is_tracked_by_what_is_seen(perception: str) -> None:
     testbed = built(perception)

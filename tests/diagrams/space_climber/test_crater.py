@@ -80,7 +80,7 @@ def gradient(crater: Crater, x: np.ndarray, y: np.ndarray, h: float = 1e-5) -> n
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_mesh_has_the_slopes_of_the_surface(seed: int) -> None:
-    """The gradient of a triangle lies among those of the surface at its corners, up to the way that they vary."""
+    """The gradient of a triangle lies among the surface's gradients at its corners, up to the way that they vary."""
     crater = Crater(seed, gullies=False)
     vertices, triangles = crater.mesh
     np.testing.assert_allclose(vertices[:, 2], crater.height(vertices[:, 0], vertices[:, 1]), atol=1e-12)
@@ -114,6 +114,7 @@ def mental() -> VirtualTestbed:
     return CraterScenario(seed=1).mental().build()
 
 
+@pytest.mark.slow
 def test_feet_stand_on_the_wall_of_the_mesh(mental: VirtualTestbed) -> None:
     """Drake finds the surface of the prisms where the mesh has it."""
     vertices, triangles = Crater(1).mesh

@@ -53,7 +53,7 @@ def test_worlds_differ_within_what_the_robot_expects() -> None:
         model(2).with_fields(fields)
 
 
-@pytest.mark.parametrize("seed", [2, 5, 12, 27])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (5, 12, 27))])
 def test_the_robot_starts_on_the_ground_and_not_in_it(seed: int) -> None:
     """Waves lift the ground under a foot by up to 9 cm in these worlds; Drake's own contact query is the judge."""
     world = differing(seed, seed).scenario
@@ -65,6 +65,7 @@ def test_the_robot_starts_on_the_ground_and_not_in_it(seed: int) -> None:
     assert any(pair.distance < 2e-4 for pair in lifted)
 
 
+@pytest.mark.slow
 def test_the_robot_decides_while_it_stands_in_a_world_that_differs() -> None:
     world = World(CraterScenario(seed=1, boulders=False, waviness=0.03, friction=0.55), mass=1.05)
     expedition = Expedition(world)
@@ -79,6 +80,7 @@ def test_the_robot_decides_while_it_stands_in_a_world_that_differs() -> None:
     assert decision.quality == pytest.approx(0.2, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_mental_robot_walks_in_the_direction_of_its_heading() -> None:
     problem = heading_problem(replace(model(1), boulders=False))
     task = replace(problem.task, horizon=14.0, record=(POSE,))
@@ -90,6 +92,7 @@ def test_a_mental_robot_walks_in_the_direction_of_its_heading() -> None:
         assert np.hypot(*way) == pytest.approx(0.19 * 6.0, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_the_landscape_is_drawn_beside_a_continuous_search(tmp_path, monkeypatch) -> None:
     # A few short rollouts: worker processes would take longest to start.

@@ -132,7 +132,7 @@ def test_odometry_counts_the_motion_over_standing_feet() -> None:
         moved[[1, 2, 5]] += 0.02 * k  # feet in the air do not count
         dps.GetInputPort("joint_encoders").FixValue(context, kinematics.inverse(moved).ravel())
         simulator.AdvanceTo(k * PERIOD + 0.5 * PERIOD)
-    # Two samples later (sense and env), the estimate is that of sample 18; standing is known from sample 0 on.
+    # Two samples later (sense and env), the estimate belongs to sample 18; standing is known from sample 0 on.
     estimate = element(dps, simulator.get_context(), "env", "position")
     np.testing.assert_allclose(estimate, [0.005 * 18, -0.002 * 18, 0.20 + 0.001 * 18], atol=1e-9)
 

@@ -1,11 +1,13 @@
 """The testbed and its question: how heavy may the attachment be?"""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from scipy.optimize import linprog
 
-from vtbdrake.testbed import ScenarioError, load_scenario
+from vtbdrake.testbed import ScenarioError, VirtualTestbed, load_scenario
 from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
 from vtbdrake_diagrams.space_climber.studies.payload import (
@@ -16,6 +18,11 @@ from vtbdrake_diagrams.space_climber.studies.payload import (
     statics,
     tipped_over,
 )
+
+
+@cache
+def built() -> VirtualTestbed:
+    return SpaceClimberScenario().build()
 
 
 def test_f_is_that_of_the_paper() -> None:
@@ -29,7 +36,7 @@ def test_f_is_that_of_the_paper() -> None:
 )
 @pytest.mark.parametrize("ahead", [-0.1, 0.0, 0.1])
 def test_static_limit_lies_on_support_edge(legs, ahead) -> None:
-    testbed = SpaceClimberScenario().build()
+    testbed = built()
     context = testbed.default_context()
     limit = static_limit(testbed, legs=legs, ahead=ahead)
     testbed.write(context, {MASS: limit})
@@ -42,7 +49,7 @@ def test_static_limit_lies_on_support_edge(legs, ahead) -> None:
 
 
 def test_statics_names_every_way_to_stand() -> None:
-    limits = statics(SpaceClimberScenario().build())
+    limits = statics(built())
     begin, middle, end, rest = limits.values()
     assert end < middle < begin < rest
 
@@ -54,6 +61,7 @@ def test_a_slower_robot_walks_as_many_strides() -> None:
     assert problem.scenario.gravity == 9.81
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_with_locked_legs_it_tips_where_statics_says() -> None:
     problem = locked_problem()
@@ -64,9 +72,9 @@ def test_with_locked_legs_it_tips_where_statics_says() -> None:
 
 
 def test_a_heavy_attachment_tips_the_robot_a_light_does_not() -> None:
-    sweep = payload_problem(phases=[0.0]).sweep(values=[0.0, 20.0, 55.0], executor="serial", progress=False)
-    assert sweep.exceeded.tolist() == [False, False, True]
-    assert sweep.t_star[2] < 6.0
+    sweep = payload_problem(phases=[0.0]).sweep(values=[20.0, 55.0], executor="serial", progress=False)
+    assert sweep.exceeded.tolist() == [False, True]
+    assert sweep.t_star[1] < 6.0
 
 
 def test_a_robot_that_falls_keeps_its_energy_until_it_lands() -> None:
@@ -83,13 +91,13 @@ def test_a_robot_that_falls_keeps_its_energy_until_it_lands() -> None:
     after = plant.CalcPotentialEnergy(own) + plant.CalcKineticEnergy(own)
     fall = 1.62 * 1.5**2 / 2
     assert testbed.read(context, "sim.sys.climber.base.height") == pytest.approx(3.0 - fall, abs=1.62 * 1.5 * step / 2)
-    # Of the energy that has moved, joints that give way have taken next to nothing.
+    # Joints that give way have taken next to nothing of the energy that has moved.
     moved = plant.CalcTotalMass(own) * 1.62 * fall
     assert abs(after - before) < 0.01 * moved
 
 
 def test_the_simulated_world_starts_from_what_the_robot_believes() -> None:
-    testbed = SpaceClimberScenario().build()
+    testbed = built()
     context = testbed.default_context()
     testbed.write(context, {"u.heading": 0.3})
     testbed.simulator(context).AdvanceTo(3.51)

@@ -56,8 +56,12 @@ def test_contact_forces_carry_the_weight() -> None:
     np.testing.assert_array_equal(testbed.read(root, "sim.sense.foot_contact.foot_contact"), np.ones(6))
 
 
-@pytest.mark.parametrize("gravity", [LUNAR_GRAVITY, 9.81])
-@pytest.mark.parametrize("gait", GAITS)
+WALKS = [(gait, gravity) for gait in GAITS for gravity in (LUNAR_GRAVITY, 9.81)]
+
+
+@pytest.mark.parametrize(
+    ("gait", "gravity"), [WALKS[0], *(pytest.param(*walk, marks=pytest.mark.slow) for walk in WALKS[1:])]
+)
 def test_walks_straight_and_level_at_one_stroke_per_stance(gait: str, gravity: float) -> None:
     track = simulate(gait=gait, gravity=gravity)
     start, end = np.searchsorted(track.time, [1.99, 7.99])  # three periods, after the smooth start
@@ -78,6 +82,7 @@ def test_perceived_pose_follows_the_true_one() -> None:
     np.testing.assert_allclose([x, y, height], track.position[-1], atol=0.08)
 
 
+@pytest.mark.slow
 def test_turns_to_the_commanded_heading() -> None:
     heading = np.radians(30.0)
     track = simulate(duration=16.0, heading=heading)

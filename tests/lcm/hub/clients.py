@@ -39,11 +39,11 @@ class Client:
     def __init__(self, url: str, *patterns: str) -> None:
         self.bus = lcm.LCM(url)
         self.received: list[tuple[str, bytes]] = []
-        self.subscriptions = {pattern: self.bus.subscribe(pattern, self._receive) for pattern in patterns}
+        self.subscriptions = {pattern: self.bus.subscribe(pattern, self.receive) for pattern in patterns}
         self._turns = 0
         self.sync()
 
-    def _receive(self, channel: str, data: bytes) -> None:
+    def receive(self, channel: str, data: bytes) -> None:
         self.received.append((channel, data))
 
     def publish(self, channel: str, data: bytes = b"") -> None:

@@ -10,7 +10,8 @@ import pytest
 from pydrake.lcm import DrakeLcm
 
 from tests.lcm.hub.clients import Client, ClientProcess, wait_until
-from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, HubStatistics, client_name, server
+from vtbdrake.lcm.hub import Hub, HubConfig, HubServer, HubStatistics, client_name
+from vtbdrake.lcm.hub import hub_server as server
 from vtbdrake.lcm.hub.clients import ClientConnection
 from vtbdrake.lcm.hub.routing import ProtectedChannel
 
@@ -62,7 +63,7 @@ def test_patterns_match_as_in_lcm(hub, pattern: str, expected: list[str]) -> Non
 
 def test_unsubscribing_ends_one_subscription(hub) -> None:
     client = Client(hub.url, "A", "B")
-    again = client.bus.subscribe("A", client._receive)
+    again = client.bus.subscribe("A", client.receive)
     client.bus.unsubscribe(client.subscriptions["B"])
     client.bus.unsubscribe(again)
     client.publish("B")

@@ -102,6 +102,7 @@ def test_messages_arrive_in_pieces_of_any_size(hub, piece: int) -> None:
     assert client.received == [(channel.decode(), data) for channel, data in sent]
 
 
+@pytest.mark.slow
 def test_random_bytes_disturb_no_other_client(hub) -> None:
     rng = random.Random(20)
     client = Client(hub.url, "A", "SENTINEL")

@@ -24,7 +24,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.lcm.connections import TcpqConnection
 from vtbdrake.lcm.hub import Hub, client_name
 from vtbdrake.monitoring.live.client import LiveClient, LiveError, LiveTimeoutError, LiveWatch, watch
-from vtbdrake.monitoring.live.server import MAX_WAITING
+from vtbdrake.monitoring.live.live_server import MAX_WAITING
 from vtbdrake.monitoring.live.service import loop_status
 from vtbdrake.testbed import DpsAlone
 
@@ -132,6 +132,7 @@ def test_owner_of_protected_channel_is_named(hub: Hub) -> None:
         assert any(told in reason(timeout) for timeout in LONGER_AND_LONGER)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("noise", [b"", b"[1]", b"no", b"\xff", b"[" * 5000, b'{"id": 3}'])
 def test_noise_is_not_taken_for_an_answer(hub: Hub, noise: bytes) -> None:
     bus = lcm.LCM(hub.url)
@@ -386,6 +387,7 @@ def test_values_beyond_the_budget_take_turns(hub: Hub) -> None:
     assert all(m["values"]["dps.ticks"] == round(m["since"] / PERIOD) for m in seen)
 
 
+@pytest.mark.slow
 def test_watches_beyond_the_budget_take_turns(hub: Hub) -> None:
     with served(hub.url, budget=1e-9) as (rig, service):
         with LiveWatch(hub.url, ["dps.ticks", "dps.gain"], timeout=PATIENCE) as first:

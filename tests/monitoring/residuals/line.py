@@ -7,12 +7,12 @@ from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import Any
 
-from vtbdrake.control.bridge import Bridge, reported_signals
+from vtbdrake.control.bridge import Bridge, Reports
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.guards import Guards
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.runtime import Runtime
-from vtbdrake.lcm.bridge import ChannelReader, ChannelWriter, SentSignal
+from vtbdrake.lcm.lcm_bridge import ChannelReader, ChannelWriter, SentSignal
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.machine.machine import Machine
 from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
@@ -25,13 +25,13 @@ class Ear(Bridge):
 
     def __init__(self, scenario: Scenario) -> None:
         protocol, self.interface = protocol_of(scenario), scenario.interface()
-        carriers = reported_signals(self.interface, protocol.reported)
+        reports = Reports(self.interface, protocol.reported, protocol.robot_mode)
         self.sensed = {signal.name: ReceivedSignal() for signal in self.interface.sense}
-        self.reported = {name: ReceivedSignal() for name in carriers}
+        self.reported = reports.acting
         self.commands = {}
         self.heard: deque[tuple[str, bytes]] = deque()
-        signals = {signal.name: signal for signal in [*self.interface.sense, *carriers.values()]}
-        received = self.sensed | {signal.name: self.reported[name] for name, signal in carriers.items()}
+        signals = {signal.name: signal for signal in [*self.interface.sense, *reports.signals]}
+        received = self.sensed | reports.received
         self._readers = {
             map.channel: ChannelReader(map, [signals[name] for name in map.signals], received, 0.1)
             for map in protocol.sense

@@ -14,7 +14,7 @@ from pydrake.systems.primitives import Demultiplexer, ZeroOrderHold
 
 from tests.testbeds import PENDULUM
 from vtbdrake.deployment import Deployment
-from vtbdrake.lcm.arm_messages import iiwa_command, iiwa_status
+from vtbdrake.lcm.iiwa_messages import iiwa_command, iiwa_status
 from vtbdrake.lcm.protocol import Protocol
 from vtbdrake.machine.config import MachineConfig
 from vtbdrake.machine.machine import Machine
@@ -105,5 +105,5 @@ class DrivenPendulum(Scenario):
 
 
 def machine(scenario: Scenario, **options: Any) -> Machine:
-    """Return a machine that is simulated by ``scenario``; ``options`` are those of `MachineConfig`."""
+    """Return a machine that is simulated by ``scenario``; ``options`` are fields of `MachineConfig`."""
     return Machine(scenario, MachineConfig(period=PERIOD, timeout=100.0, **options))

@@ -25,7 +25,7 @@ from vtbdrake.monitoring.residuals.alarms import (
     run_length,
     threshold_for,
 )
-from vtbdrake.monitoring.residuals.comparison import Window
+from vtbdrake.monitoring.residuals.comparison import ResidualWindow
 
 pytestmark = pytest.mark.one_python
 
@@ -51,9 +51,10 @@ def start(
 
 @cache
 def nominal() -> NominalResiduals:
-    together, monitors = start()
+    together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: MASS}, noise=NOISE, seed=1))
+    monitor = ResidualMonitor(together.driver, "twin", config=CONFIG, learn=True, worker=False)
     together.run(4000)
-    return monitors["twin"].calibrate()
+    return monitor.calibrate()
 
 
 def telling(field: str, change: Callable[[float], float]) -> Callable[[str, bytes], bytes]:
@@ -67,6 +68,7 @@ def telling(field: str, change: Callable[[float], float]) -> Callable[[str, byte
     return falsify
 
 
+@pytest.mark.slow
 def test_heavier_payload_raises_alarms() -> None:
     together, monitors = start(mass=1.05 * MASS, seed=2, calibration=nominal())
     together.run(500)
@@ -79,13 +81,14 @@ def test_heavier_payload_raises_alarms() -> None:
 
 
 def test_shadow_and_twin_agree() -> None:
-    together, monitors = start(mass=1.05 * MASS, seed=2, calibration=nominal())
+    together, monitors = start(mass=1.05 * MASS, seed=2)
     together.run(300)
     twin, shadow = monitors["twin"].history, monitors["shadow"].history
     np.testing.assert_allclose([w.residual for w in shadow], [w.residual for w in twin], atol=1e-12)
     assert len(twin) == 29
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("field", "bias", "signal"),
     [("joint_position_measured", 0.1, "position"), ("joint_velocity_estimated", 0.5, "velocity")],
@@ -114,6 +117,7 @@ def test_wrong_reported_actuation_raises_alarm(mode: str) -> None:
     assert alarm.residual == pytest.approx(0.01, abs=0.002)
 
 
+@pytest.mark.slow
 def test_missing_nominal_bias_raises_alarm() -> None:
     biased = replace(nominal(), mean=nominal().mean | {"act.torque": [0.01]})
     together, monitors = start(calibration=biased)
@@ -125,6 +129,7 @@ def test_missing_nominal_bias_raises_alarm() -> None:
     assert monitors["twin"].alarms[0].signal == "act.torque"
 
 
+@pytest.mark.slow
 def test_alarm_ends_after_the_fault() -> None:
     together, monitors = start(calibration=nominal())
     monitor = monitors["twin"]
@@ -142,6 +147,7 @@ def test_alarm_ends_after_the_fault() -> None:
     assert f"until {alarm.ended:.3f} s" in str(alarm)
 
 
+@pytest.mark.slow
 def test_nominal_hour_raises_no_alarm() -> None:
     robot = machine(SCENARIO, noise=NOISE, seed=3)
     together = Together(SCENARIO, robot)
@@ -204,7 +210,7 @@ def noise(windows: int) -> np.ndarray:
 def test_calibration_finds_mean_and_deviation() -> None:
     found = of(noise(20_000))
     np.testing.assert_allclose([*found.mean["sense.a"], *found.mean["act.b"]], [1.0, 0.0, -2.0], atol=0.06)
-    # The largest of 200 batches' deviations, each of which scatters by 7 %.
+    # The largest of 200 batches' deviations, which scatter by 7 % each.
     ratios = np.array([*found.deviation["sense.a"], *found.deviation["act.b"]]) / [0.1, 1.0, 3.0]
     assert ((ratios > 1.05) & (ratios < 1.4)).all()
     assert (found.windows, found.horizon, found.period) == (20_000, 10, 1e-3)
@@ -234,12 +240,13 @@ def correlated(rho: float, windows: int) -> np.ndarray:
     return table
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("rho", "windows"), [(0.8, 250), (0.9, 1000)])
 def test_correlated_residuals_raise_no_alarm(rho: float, windows: int) -> None:
     table = correlated(rho, windows + 20_000)
     config = ResidualConfig(false_alarm_interval=3.6e6)
     detector = AlarmDetector(PLACES, config, of(table[:windows]))
-    assert not [alarm for row in table[windows:] for alarm in detector.update(Window(0.0, row))]
+    assert not [alarm for row in table[windows:] for alarm in detector.update(ResidualWindow(0.0, row))]
 
 
 def test_deviation_counts_correlated_residuals_as_fewer() -> None:

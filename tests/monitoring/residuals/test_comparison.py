@@ -14,7 +14,7 @@ from tests.monitoring.residuals.line import Together
 from tests.monitoring.residuals.pendulum import MASS, PAYLOAD, PERIOD, DrivenPendulum, machine
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.monitoring.residuals import ResidualConfig, ResidualMonitor
-from vtbdrake.monitoring.residuals.comparison import Comparison, RowLayout
+from vtbdrake.monitoring.residuals.comparison import ResidualGenerator, RowLayout
 from vtbdrake.monitoring.residuals.monitor import Sampler
 from vtbdrake.testbed.prediction import Predictor
 
@@ -56,6 +56,7 @@ def test_perfect_twin_has_no_residuals(scenario: DrivenPendulum) -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("scenario", EXACT, ids=str)
 def test_perfect_shadow_has_no_residuals(scenario: DrivenPendulum) -> None:
     together = Together(scenario, machine(scenario), shadowing=scenario)
@@ -139,7 +140,7 @@ def test_prediction_begins_anew_after_gap() -> None:
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
-def rows_of(cycles: int) -> tuple[Comparison, RowLayout, np.ndarray]:
+def rows_of(cycles: int) -> tuple[ResidualGenerator, RowLayout, np.ndarray]:
     """Return a comparison of a twin, and layout and rows of a heavier machine."""
     scenario = DrivenPendulum()
     runtime = Together(scenario, machine(scenario, values={PAYLOAD: 2.0 * MASS})).driver
@@ -149,7 +150,7 @@ def rows_of(cycles: int) -> tuple[Comparison, RowLayout, np.ndarray]:
     rows = layout.empty(cycles)
     for row in rows:
         assert sampler.fill(row[None], runtime.cycle()) == 1
-    return Comparison(predictor, layout, CONFIG, mode="twin"), layout, rows
+    return ResidualGenerator(predictor, layout, CONFIG, mode="twin"), layout, rows
 
 
 def test_rows_arrive_in_any_portions() -> None:

@@ -49,6 +49,7 @@ def test_worker_process_gives_equal_results() -> None:
     np.testing.assert_array_equal([w.residual for w in other.history], [w.residual for w in own.history])
 
 
+@pytest.mark.slow
 def test_newest_residuals_are_available_while_running() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
@@ -60,7 +61,7 @@ def test_newest_residuals_are_available_while_running() -> None:
 
 def test_arrays_show_the_alarm_statistic() -> None:
     together = Together(SCENARIO, machine(SCENARIO, values={PAYLOAD: 1.05 * MASS}))
-    with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
+    with ResidualMonitor(together.driver, "twin", config=CONFIG, worker=False) as monitor:
         assert {name: value.shape for name, value in monitor.arrays().items()} == {
             "time": (0,),
             **dict.fromkeys(TOLERANCE, (0, 1)),
@@ -89,6 +90,7 @@ def test_killed_worker_process_is_harmless(caplog: pytest.LogCaptureFixture) -> 
         assert "is lost" in caplog.text
 
 
+@pytest.mark.slow
 def test_stopped_worker_process_skips_windows() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
@@ -107,6 +109,7 @@ def test_stopped_worker_process_skips_windows() -> None:
         assert not monitor.alarms
 
 
+@pytest.mark.slow
 def test_skipped_windows_are_reported_while_running() -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     with ResidualMonitor(together.driver, "twin", config=CONFIG) as monitor:
@@ -161,6 +164,7 @@ class OwnClock(Line):
         return super().poll() + (super().poll() if polls % 7 == 6 else 0)
 
 
+@pytest.mark.slow
 def test_machine_with_its_own_clock_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     driver = loop(DpsAlone(SCENARIO), OwnClock(SCENARIO, machine(SCENARIO)), PERIOD)
     monitor = ResidualMonitor(driver, "twin", config=CONFIG, worker=False)
@@ -293,7 +297,7 @@ def test_world_with_other_signals_is_rejected(worker: bool) -> None:
         ResidualMonitor(together.driver, "twin", config=replace(CONFIG, scenario=ServoScenario()), worker=worker)
 
 
-@pytest.mark.parametrize("worker", [True, False])
+@pytest.mark.parametrize("worker", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_scenario_without_belief_is_rejected(worker: bool) -> None:
     scenario = DrivenPendulum(believes=False)
     together = Together(scenario, machine(scenario))
@@ -301,11 +305,12 @@ def test_scenario_without_belief_is_rejected(worker: bool) -> None:
         ResidualMonitor(together.driver, "twin", config=CONFIG, worker=worker)
 
 
-def test_unknown_variable_is_rejected() -> None:
+@pytest.mark.parametrize("worker", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_unknown_variable_is_rejected(worker: bool) -> None:
     together = Together(SCENARIO, machine(SCENARIO))
     config = replace(CONFIG, values={"sim.sys.Pendulum.arm_com.mas": 1.0})
     with pytest.raises(ValueError, match="arm_com.mass"):
-        ResidualMonitor(together.driver, "twin", config=config)
+        ResidualMonitor(together.driver, "twin", config=config, worker=worker)
 
 
 def test_shadow_needs_reported_actuation() -> None:

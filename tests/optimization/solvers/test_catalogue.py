@@ -88,7 +88,12 @@ def test_what_a_solver_cannot_do_is_refused_by_name(name, arguments, message):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in known_solvers() if not {name} & {*ALGORITHMS, "COBYQA", "SNOPT", "IPOPT", "GP"}]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in ("auto", "bayesian") else [])
+        for name in known_solvers()
+        if not {name} & {*ALGORITHMS, "COBYQA", "SNOPT", "IPOPT", "GP"}
+    ],
 )
 def test_batches_are_as_wide_as_asked_for(name):
     sizes = []
@@ -102,7 +107,7 @@ def test_batches_are_as_wide_as_asked_for(name):
     assert sum(sizes) == 100
 
 
-@pytest.mark.parametrize("size", [1, 2, 25])
+@pytest.mark.parametrize("size", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2)), 25])
 def test_every_stage_of_auto_is_as_wide_as_asked_for(size):
     solver, widths = make_solver("auto", box(size, -1.0, 2.0), budget=3000, parallel=40), {}
     while points := solver.ask():
@@ -224,10 +229,11 @@ def test_auto_chooses_by_the_problem(space, arguments, method):
     assert solver.method == method
 
 
-# Searches in other basins, of which there are none.
+# Searches in other basins, but there are none.
 _OTHERS = ["LN_BOBYQA in another basin"] * 3
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("size", "budget", "methods"),
     [
@@ -244,6 +250,7 @@ def test_auto_has_a_plan_for_every_budget(size, budget, methods, short_model):
     assert [method for _, method in solver.changes][: len(methods)] == methods
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("space", "budget", "changes"),
     [
@@ -265,6 +272,7 @@ def test_auto_ends_a_small_budget_with_a_local_search(space, budget, changes, sh
         assert after > before
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 @pytest.mark.parametrize("seed", [21, 22])
 def test_auto_finds_a_minimum_exactly_in_a_hundred_evaluations(seed):
@@ -279,9 +287,10 @@ def test_auto_finds_a_minimum_exactly_in_a_hundred_evaluations(seed):
     assert -max(e.values[0] for e in drive(solver, cost)) < 1e-3
 
 
+@pytest.mark.slow_cases
 @pytest.mark.one_python
 @pytest.mark.parametrize("function", [SPHERE, ROSENBROCK, ACKLEY])
-@pytest.mark.parametrize("budget", [90, 180])
+@pytest.mark.parametrize("budget", [90, pytest.param(180, marks=pytest.mark.slow)])
 def test_auto_spends_its_whole_budget(function, budget, short_model):
     solver = make_solver("auto", function.space, budget=budget)
     assert len(drive(solver, function.cost)) == budget
@@ -294,6 +303,7 @@ def test_the_start_takes_from_the_budget_of_auto_once():
     assert [method for _, method in solver.changes] == ["start", "bayesian"]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(("continuous", "method"), [(2, "LN_BOBYQA around the best"), (1, "COBYQA around the best")])
 def test_auto_searches_locally_with_the_integers_held(continuous, method, short_model):
     solver = make_solver("auto", (COUNT, *box(continuous, -3.0, 4.0)), budget=150)
@@ -304,6 +314,7 @@ def test_auto_searches_locally_with_the_integers_held(continuous, method, short_
     assert -best.values[0] < 1e-10
 
 
+@pytest.mark.slow
 def test_local_searches_of_auto_stay_within_their_boxes(short_model):
     # Wide steps would pay: the valley goes on beyond each box.
     solver = make_solver("auto", ROSENBROCK.space, budget=400)
@@ -322,6 +333,7 @@ def test_local_searches_of_auto_stay_within_their_boxes(short_model):
         assert (u.max(axis=0) > u[0]).all() and (u.min(axis=0) < u[0]).all()
 
 
+@pytest.mark.slow
 def test_auto_searches_locally_in_a_range_of_two_numbers(short_model):
     space = (Parameter("x", 1.0, np.nextafter(1.0, 2.0)), Parameter("y", 0.0, 1.0))
     solver = make_solver("auto", space, budget=100)
@@ -343,6 +355,7 @@ def test_what_racing_saves_goes_to_the_later_phases_of_auto(short_model):
     assert [method for _, method in solver.changes][:2] == ["bayesian", "LN_BOBYQA around the best"]
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_what_racing_dropped_is_no_start_of_a_local_search():
     solver = make_solver("auto", SPHERE.space, budget=300)
@@ -356,6 +369,7 @@ def test_what_racing_dropped_is_no_start_of_a_local_search():
     assert SPHERE.cost(points[0]) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_auto_starts_anew_with_larger_populations_and_another_method(short_model):
     solver = make_solver("auto", ACKLEY.space, budget=2500)
@@ -395,6 +409,7 @@ def test_auto_evaluates_the_given_start_first():
     solver.close()
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 @pytest.mark.parametrize("seed", [0, 3])
 def test_auto_leaves_a_well_that_is_not_the_deepest(seed):

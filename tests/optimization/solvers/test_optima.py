@@ -24,9 +24,12 @@ from vtbdrake.optimization.solvers.drake_solvers import ALGORITHMS
 
 pytestmark = pytest.mark.usefixtures("short_model")
 
+# It fits a Gaussian process, and takes a second or two.
+AUTO = pytest.param("auto", marks=pytest.mark.slow)
 LOCAL = ["SNOPT", "IPOPT", "LD_SLSQP", "LN_BOBYQA", "LN_NELDERMEAD"]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", ["CMA-ES", "differential-evolution", "auto", *LOCAL])
 @pytest.mark.parametrize("function", [SPHERE, ROSENBROCK], ids=["sphere", "rosenbrock"])
 def test_it_converges_to_the_minimum_of_a_valley(name, function):
@@ -43,13 +46,14 @@ def test_every_algorithm_of_nlopt_comes_near_the_minimum(name):
     np.testing.assert_allclose(best.point, SPHERE.best, atol=0.05)
 
 
-@pytest.mark.parametrize("name", ["auto", "differential-evolution"])
+@pytest.mark.parametrize("name", [AUTO, "differential-evolution"])
 def test_global_solvers_find_the_deepest_of_many_minima(name):
     solver, best = solve(name, ACKLEY, seed=3)
     assert solver.success is True
     np.testing.assert_allclose(best.point, ACKLEY.best, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["auto", "CMA-ES", "GN_DIRECT_L", "TPE"])
 def test_global_solvers_find_the_value_of_branin(name):
     _, best = solve(name, BRANIN, budget=240)
@@ -59,6 +63,7 @@ def test_global_solvers_find_the_value_of_branin(name):
 CONSTRAINED_NLOPT = sorted(name for name, takes_constraints in ALGORITHMS.items() if takes_constraints)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "name", ["SNOPT", "IPOPT", "CMA-ES", "auto", "differential-evolution", "COBYQA", *CONSTRAINED_NLOPT]
 )
@@ -79,7 +84,7 @@ def test_an_optimum_at_the_bounds_is_found(name):
     assert solver.success is True
 
 
-@pytest.mark.parametrize("name", ["CMA-ES", "auto", "TPE"])
+@pytest.mark.parametrize("name", ["CMA-ES", AUTO, "TPE"])
 def test_a_mixed_problem_agrees_with_brute_force(name):
     space = (Parameter("n", -7, 12, integer=True), Parameter("x", -2.0, 2.0), Parameter("k", 1, 40, integer=True))
 
@@ -99,6 +104,7 @@ def test_a_mixed_problem_agrees_with_brute_force(name):
         assert best.point[1] == pytest.approx(0.1 * brute[0], abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 def test_a_categorical_parameter_is_chosen_rightly():
     space = (Choice("kind", ["up", "down", "left"]), Parameter("x", 0.0, 1.0), Choice("flag", [True, 0, 2.5]))
@@ -114,12 +120,14 @@ def test_a_categorical_parameter_is_chosen_rightly():
     assert best.point[1] == pytest.approx(0.25, abs=0.1)
 
 
+@pytest.mark.slow
 def test_few_evaluations_are_enough_for_a_model():
     # The best of 40 random points is about 1 above it.
     _, best = solve("bayesian", BRANIN, budget=40, batch=1)
     assert -best.values[0] == pytest.approx(BRANIN.lowest, abs=1e-2)
 
 
+@pytest.mark.slow
 def test_a_model_finds_the_optimum_under_a_constraint_with_few_evaluations():
     _, best = solve("bayesian", CONSTRAINED, violations=half_plane, budget=40)
     assert -best.values[0] == pytest.approx(CONSTRAINED.lowest, abs=2e-2)
@@ -138,6 +146,7 @@ def test_a_model_expects_what_it_was_told():
     assert (expected[~usable] < np.median(true[usable], axis=0)).all()
 
 
+@pytest.mark.slow
 def test_a_model_remembers_only_so_many_points():
     solver, best = solve("bayesian", SPHERE, budget=80, memory=15)
     np.testing.assert_allclose(best.point, SPHERE.best, atol=1e-2)
@@ -160,6 +169,7 @@ def test_a_space_in_which_all_fails_is_exhausted_too(seed):
     assert solver.message == "every point of the space is known"
 
 
+@pytest.mark.slow
 def test_one_parameter_is_enough_for_every_method_of_auto():
     function = Function(lambda p: abs(p[0] - 0.3), (Parameter("x", -1.0, 2.0),), (0.3,))
     solver, best = solve("auto", function)
@@ -186,7 +196,7 @@ def _two_costs(p):
 
 
 def _hypervolume(log):
-    """Of two costs, under the reference (1, 1), by a sweep along the first."""
+    """The hypervolume of two costs, under the reference (1, 1), by a sweep along the first."""
     volume, ceiling = 0.0, 1.0
     for first, second in sorted((-e.values[0], -e.values[1]) for e in log):
         if second < ceiling:
@@ -195,7 +205,7 @@ def _hypervolume(log):
     return volume
 
 
-@pytest.mark.parametrize("name", ["NSGA-II", "auto"])
+@pytest.mark.parametrize("name", ["NSGA-II", AUTO])
 def test_a_pareto_front_is_covered_better_than_by_chance(name):
     space = SPHERE.space
     t = np.linspace(-1.0, 1.0, 2001) / np.sqrt(2.0)
@@ -210,6 +220,7 @@ def test_a_pareto_front_is_covered_better_than_by_chance(name):
     assert ideal - volumes[name] < 0.6 * (ideal - volumes["random"])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_a_front_much_smaller_than_the_costs_is_approached():
     # Costs of up to 1000 above a front that is 0.001 wide: expected improvements below the smallest double.
@@ -231,12 +242,14 @@ def _beyond_the_disk(p):
     return (p[0] ** 2 + p[1] ** 2 - 1.0,)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("start", [(0.2, 0.2), (-0.5, 0.5), (0.0, -0.9)])
 def test_cobyqa_follows_a_curved_constraint(start):
     solver = make_solver("COBYQA", box(2, -1.5, 1.5), constraints=1, start=start, budget=120)
     assert _best_on_the_disk(drive(solver, ROSENBROCK.cost, violations=_beyond_the_disk)) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.one_python
 @pytest.mark.parametrize("seed", [0, 1])
 def test_auto_follows_a_curved_constraint(seed):

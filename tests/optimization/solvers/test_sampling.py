@@ -49,6 +49,7 @@ def test_predictive_sampling_stays_at_the_best_point_so_far():
         solver.tell([evaluation(point, cost) for point in points])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("elites", [0.1, 0.3])
 def test_cem_takes_mean_and_deviation_of_the_elites_of_a_slope(elites):
     # The best share of a normal distribution is a truncated one: mean sigma phi(z) / share.
@@ -79,6 +80,7 @@ def test_cem_never_shrinks_below_its_least_deviation():
     assert points.std() == pytest.approx(2.9, rel=0.03)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("temperature", [0.2, 1.0])
 def test_mppi_weighs_a_parabola_as_the_product_of_two_normal_distributions(temperature):
     # Weights exp(-(x - a)^2 / lambda) times N(0, s^2) are normal, too, with mean a s^2 / (s^2 + lambda / 2).

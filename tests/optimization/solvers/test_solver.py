@@ -17,6 +17,9 @@ from vtbdrake.optimization.solvers.blocking import BlockingSolver
 from vtbdrake.optimization.solvers.solver import Search
 
 INSTALLED = [name for name in known_solvers() if name != "GP" or importlib.util.find_spec("torch")]
+# What "bayesian" does is the first that "auto" does.
+ALL = [pytest.param(name, marks=[pytest.mark.slow] if name == "bayesian" else []) for name in INSTALLED]
+AUTO = pytest.param("auto", marks=pytest.mark.slow)
 BLOCKING = [name for name in INSTALLED if isinstance(make_solver(name, SPHERE.space), BlockingSolver)]
 SEEDED = [
     "sobol",
@@ -42,7 +45,8 @@ def no_thread_is_left():
     assert set(threading.enumerate()) <= before
 
 
-@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ALL)
 def test_it_asks_for_points_of_the_space_within_its_budget(name):
     solver = make_solver(name, ROSENBROCK.space, budget=90)
     log = drive(solver, ROSENBROCK.cost)
@@ -69,6 +73,7 @@ EDGES = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("edge", EDGES)
 @pytest.mark.parametrize("name", INSTALLED)
 def test_edge_cases_work_or_are_refused(name, edge):
@@ -92,7 +97,8 @@ def test_edge_cases_work_or_are_refused(name, edge):
         assert solver.success is not None and solver.message
 
 
-@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ALL)
 def test_the_same_seed_asks_for_the_same_points(name):
     count = 20 if name == "bayesian" else 80
     first, second = (drive(make_solver(name, ROSENBROCK.space, seed=5), ROSENBROCK.cost, limit=count) for _ in range(2))
@@ -105,7 +111,8 @@ def test_another_seed_asks_for_other_points(name):
     assert not {told.point for told in first} & {told.point for told in second}
 
 
-@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ALL)
 def test_told_again_it_goes_on_where_another_stopped(name):
     count = 25 if name == "bayesian" else 100
     whole = drive(make_solver(name, ROSENBROCK.space, seed=9), ROSENBROCK.cost, limit=count)
@@ -121,7 +128,8 @@ def test_told_again_it_goes_on_where_another_stopped(name):
     assert log == whole[: len(log)]
 
 
-@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", ALL)
 def test_failed_simulations_are_survived(name):
     count = 40 if name == "bayesian" else 120
     solver = make_solver(name, SPHERE.space, seed=2, budget=count)
@@ -130,7 +138,7 @@ def test_failed_simulations_are_survived(name):
     assert max(told.values[0] for told in log if not told.failed) > -6.0
 
 
-@pytest.mark.parametrize("name", ["CMA-ES", "auto", "differential-evolution", "LN_NELDERMEAD", "SNOPT", "GN_DIRECT_L"])
+@pytest.mark.parametrize("name", [AUTO, "CMA-ES", "differential-evolution", "LN_NELDERMEAD", "SNOPT", "GN_DIRECT_L"])
 def test_it_finds_the_optimum_beside_a_region_where_simulations_fail(name):
     solver = make_solver(name, SPHERE.space, budget=1200)
     log = drive(solver, SPHERE.cost, fails=lambda p: p[1] > 1.2 or p[0] < -1.0)
@@ -164,7 +172,7 @@ def test_points_given_by_hand_change_nothing_that_was_asked(name):
     solver.close()
 
 
-@pytest.mark.parametrize("name", ["TPE", "bayesian", "auto"])
+@pytest.mark.parametrize("name", ["TPE", pytest.param("bayesian", marks=pytest.mark.slow), "auto"])
 def test_it_learns_from_points_given_by_hand(name):
     space = SPHERE.space
     spread = [told.point for told in drive(make_solver("sobol", space, points=60), SPHERE.cost)]
@@ -286,6 +294,7 @@ def test_close_releases_a_waiting_caller(stuck):
     assert (stuck.success, stuck.message) == (False, "it was closed")
 
 
+@pytest.mark.slow
 def test_a_program_ends_although_a_method_never_returns():
     program = (
         "import threading\n"

@@ -1,5 +1,5 @@
-"""Simulated actuators, which turn an actuator command into the torque on a joint."""
+"""Simulated actuators: drives, which turn a command into the torque on a joint, and the control of a gripper."""
 
-from vtbdrake.components.actuators.joint_drives import JointDrives
+from vtbdrake.common.lazy_names import attach_names
 
-__all__ = ["JointDrives"]
+__getattr__, __dir__, __all__ = attach_names(__name__, __file__)

@@ -108,6 +108,7 @@ class JointDrives(AddressedSystem):
         _check(period, {**entries, "time_constant": np.array(time_constant), "delay": np.array(delay)})
         self.period: float = float(period)  # sample period T in seconds
         self._n = n
+        self.entry_names = tuple(joint.name() for joint in joints)
         self._command = self.DeclareVectorInputPort("command", n)
         self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
         before = np.array(np.broadcast_to(np.asarray(initial, dtype=float), (n,)))
@@ -129,7 +130,12 @@ class JointDrives(AddressedSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(self.period, 0.0, self._update)
 
     def resume(self, context: Context, command: ArrayLike) -> None:
-        """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time."""
+        """Go on where drives stand that were given ``command`` (N m, shape (n,)) for some time.
+
+        Args:
+            context: The drives' own context, which is changed.
+            command: The command that has acted, shape (n,), in N m or N.
+        """
         torque = np.asarray(command, dtype=float)
         context.SetDiscreteState(self._torque.index, torque)
         context.SetDiscreteState(self._memory.index, np.tile(torque, 2 + self.max_delay))
@@ -153,7 +159,7 @@ class JointDrives(AddressedSystem):
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
     """Return [torque; m_k; r_k] as a kernel of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
 
-    ``velocities`` are those of the joints in [q; v], of ``states`` entries.
+    ``velocities`` are the places of the joints' velocities in [q; v], which has ``states`` entries.
     """
     n = len(velocities)
     values, memory = casadi.SX.sym("values", 5 * n + 2), casadi.SX.sym("memory", 2 * n)

@@ -11,10 +11,12 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import casadi
@@ -25,6 +27,8 @@ _log = logging.getLogger(__name__)
 
 # Products and sums are rounded one by one, as the interpreted function does it.
 _FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
+LONGEST_COMPILATION = 600.0
+"""s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
 _ONE_AT_A_TIME = threading.Lock()
 _DIGEST_SIZE = hashlib.sha256().digest_size
 
@@ -41,7 +45,7 @@ def compiled(function: casadi.Function) -> casadi.Function:
 
     Raises:
         ValueError: The function has no C code, such as a `casadi.Callback`.
-        CompilerError: The compiler is missing or fails; the environment variable CC names another one than ``cc``.
+        CompilerError: The compiler (`compiler_command`) is missing or fails.
     """
     generator = casadi.CodeGenerator(f"{function.name()}.c", {})
     generator.add(function)
@@ -52,7 +56,7 @@ def compiled(function: casadi.Function) -> casadi.Function:
         raise ValueError(
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
-    command = _command()
+    command = (*compiler_command(), *_FLAGS)
     recipe = "\n".join((source, *command, platform.system(), platform.machine(), "with its digest"))
     library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
     with _ONE_AT_A_TIME:
@@ -108,21 +112,36 @@ def _digest(contents: bytes) -> bytes:
     return hashlib.sha256(contents).digest()
 
 
-def _command() -> tuple[str, ...]:
-    return (*shlex.split(os.environ.get("CC") or "cc"), *_FLAGS)
+def compiler_command() -> tuple[str, ...]:
+    """Return the command of the C compiler, which need not be there.
+
+    It is what the environment variable CC names; else ``cc``; else, where there is no ``cc``, the compiler of the wheel
+    `ziglang` (the extra ``compiler``), which brings its own C library's headers: it compiles for any processor of this
+    kind and for glibc, as ``cc`` does, not for the one processor that it runs on.
+    """
+    if named := shlex.split(os.environ.get("CC") or ""):
+        return tuple(named)
+    if shutil.which("cc") is None and find_spec("ziglang") is not None:
+        target = f"{platform.machine()}-linux-gnu"
+        return (sys.executable, "-m", "ziglang", "cc", "-target", target, "-mcpu=baseline")
+    return ("cc",)
 
 
 def compile_library(source: str, library: Path) -> None:
     """Compile C code to a shared library, which is written whole or not at all, and ends with its digest.
 
+    Args:
+        source: The C code, a whole translation unit.
+        library: The file of the library; its folder is made if there is none, for this user alone.
+
     Raises:
-        CompilerError: The compiler is missing or fails.
+        CompilerError: The compiler is missing or fails, or does not end.
     """
-    command = _command()
+    command = (*compiler_command(), *_FLAGS)
     if shutil.which(command[0]) is None:
         raise CompilerError(
-            f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc), name "
-            "yours in the environment variable CC, or leave out compile=True."
+            f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc, or the extra "
+            "'compiler' of vtbdrake), name yours in the environment variable CC, or leave out compile=True."
         )
     # No other user may write there: the files in the folder are executed.
     library.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -150,9 +169,14 @@ def _run(command: Sequence[str], folder: str) -> tuple[int, str]:
         process_group=0,
     ) as process:
         try:
-            complaint = process.communicate()[1]
-        except BaseException:
+            complaint = process.communicate(timeout=LONGEST_COMPILATION)[1]
+        except BaseException as error:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise CompilerError(
+                    f"{command[0]} did not end within {LONGEST_COMPILATION:g} s: compile a smaller part or a shorter "
+                    "rollout, or leave out compile=True"
+                ) from None
             raise
     return process.returncode, complaint

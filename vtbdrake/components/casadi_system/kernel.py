@@ -37,7 +37,13 @@ _SET_ASIDE: list[object] = []
 
 
 def clamp(value: Expression, lower: Expression, upper: Expression) -> Expression:
-    """Return a value within two limits; NaN, which fmin and fmax would drop, stays NaN."""
+    """Return a value within two limits; NaN, which fmin and fmax would drop, stays NaN.
+
+    Args:
+        value: The value, shape (n, m).
+        lower: The least value, of the same shape or a scalar.
+        upper: The largest value, of the same shape or a scalar.
+    """
     return casadi.if_else(value > upper, upper, casadi.if_else(value < lower, lower, value))
 
 
@@ -47,6 +53,12 @@ class Kernel:
     CasADi gives up the interpreter lock while it evaluates, and a system is evaluated in several threads at once: so
     every thread has its own arrays.
 
+    Args:
+        name: The name of the function in messages and files.
+        arguments: Symbols of the shapes (n_i, 1), which z holds one after the other.
+        y: An expression in the symbols, shape (m, 1).
+        compile: Whether to make machine code; None: if there is a C compiler.
+
     Attributes:
         value: Returns y for the concatenated blocks of z. The thread's next call overwrites the result.
     """
@@ -54,7 +66,7 @@ class Kernel:
     def __init__(self, name: str, arguments: Sequence[Expression], y: Expression, *, compile: bool | None):
         """Wrap ``y`` (m, 1), an expression in the symbols ``arguments`` (n_i, 1), which z holds one after the other.
 
-        ``compile`` is that of a `CasadiSystem`; a Jacobian above `LONGEST_JACOBIAN` is interpreted.
+        See `CasadiSystem` for ``compile``; a Jacobian above `LONGEST_JACOBIAN` is interpreted.
         """
         _SET_ASIDE.clear()
         self._name = casadi.Function.fix_name(name)
@@ -104,6 +116,10 @@ class Kernel:
 
 class Buffers(threading.local):
     """The arrays on which one thread evaluates a function.
+
+    Args:
+        function: The function.
+        may_fail: Whether an evaluation can fail, so that it has to be checked.
 
     Attributes:
         parts: The array z of the arguments, the function, and the array y of the result; looking them up costs time.

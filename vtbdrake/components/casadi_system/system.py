@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
@@ -24,12 +25,24 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from vtbdrake.components.casadi_system.function_ports import (
+    INPUT,
+    PARAMETER,
+    STATE,
+    TIME,
+    ArgumentBlock,
+    FunctionResult,
+    Model,
+)
 from vtbdrake.components.casadi_system.handler import handler
-from vtbdrake.components.casadi_system.model import INPUT, PARAMETER, STATE, TIME, Block, Model, Result
 from vtbdrake.state.declarations import NO_DICT, weakly
+from vtbdrake.state.systems import class_for_float
 
 
-@TemplateSystem.define("CasadiSystem_", T_list=[float, AutoDiffXd])  # type: ignore[untyped-decorator]
+# The scope is named, because Drake would look for it in the stack of all callers, which takes time.
+@TemplateSystem.define(  # type: ignore[untyped-decorator]
+    "CasadiSystem_", T_list=[float, AutoDiffXd], scope=sys.modules[__name__]
+)
 def CasadiSystem_(T: type) -> type:
     """`CasadiSystem` by scalar type."""
 
@@ -112,78 +125,95 @@ def CasadiSystem_(T: type) -> type:
             Impl._declare(self, model, converter)
 
         def _construct_copy(self, other: Any, converter: SystemScalarConverter | None = None) -> None:
-            Impl._declare(self, other._model, converter)
+            Impl._declare(self, other.model, converter)
 
         def _declare(self, model: Model, converter: SystemScalarConverter | None) -> None:
             LeafSystem_[T].__init__(self, converter)
-            self._model = model
             self.variables = model.variables
-            self._ports = {name: self.DeclareVectorInputPort(name, model.size(name)) for name in model.inputs}
-            for value in model.state.values():
-                self.DeclareDiscreteState(BasicVector_[T](value))
-            if model.parameters:
-                self.DeclareNumericParameter(BasicVector_[T](np.concatenate(list(model.parameters.values()))))
-            for name, result in model.outputs.items():
-                if result.shows is not None:
-                    self.DeclareStateOutputPort(name, DiscreteStateIndex(model.state_index(result.shows)))
-                else:
-                    tickets = {self._ticket(block) for block in result.blocks} or {self.nothing_ticket()}
-                    self.DeclareVectorOutputPort(name, result.size, self._calc(result), prerequisites_of_calc=tickets)
-            if model.update is not None:
-                self.DeclarePeriodicDiscreteUpdateEvent(model.period, 0.0, self._update(model.update))
+            self._declaration = _Declaration(self, model, T)
 
         @property
         def model(self) -> Model:
             """Return the functions of the system."""
-            model: Model = self._model
-            return model
-
-        def _calc(self, result: Result) -> Callable[[Context, Any], None]:
-            return Impl._handler(self, result, deliver=BasicVector_[T].set_value, updates=False)
-
-        def _update(self, result: Result) -> Callable[[Context, Any], None]:
-            if T is float:
-                return Impl._handler(self, result, deliver=None, updates=True)
-            ends = np.cumsum([value.size for value in self._model.state.values()]).tolist()
-            groups = [(i, slice(start, end)) for i, (start, end) in enumerate(pairwise([0, *ends]))]
-
-            def deliver(state: Any, following: NDArray[Any]) -> None:
-                for i, entries in groups:
-                    state.set_value(i, following[entries])
-
-            return Impl._handler(self, result, deliver=deliver, updates=True)
-
-        def _handler(
-            self, result: Result, *, deliver: Callable[[Any, NDArray[Any]], None] | None, updates: bool
-        ) -> Callable[[Context, Any], None]:
-            """Return the compiled event handler (see `handler`), which needs few calls of Python functions per step."""
-            sources = {block.source for block in result.blocks}
-            return handler(
-                states=tuple(self._model.state_index(b.names[0]) for b in result.blocks if b.source == STATE),
-                updates=updates,
-                clock=TIME in sources,
-                parameters=Context_[T].get_numeric_parameter if PARAMETER in sources else None,
-                inputs=tuple(
-                    weakly(self._ports[b.names[0]], InputPort_[T].Eval) for b in result.blocks if b.source == INPUT
-                ),
-                # Views are cheaper, but there are none of AutoDiffXd.
-                state_value=DiscreteValues_[T].value if deliver else DiscreteValues_[T].get_mutable_value,
-                vector_value=BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector,
-                compute=result.kernel.value if T is float else result.kernel.autodiff,
-                deliver=deliver,
-            )
-
-        def _ticket(self, block: Block) -> DependencyTicket:
-            name = block.names[0]
-            if block.source == INPUT:
-                return self._ports[name].ticket()
-            if block.source == STATE:
-                return self.discrete_state_ticket(DiscreteStateIndex(self._model.state_index(name)))
-            if block.source == PARAMETER:
-                return self.numeric_parameter_ticket(NumericParameterIndex(0))
-            return self.time_ticket()
+            return self._declaration.model
 
     return Impl
 
 
-CasadiSystem = CasadiSystem_[None]
+class _Declaration:
+    """Declares what a `CasadiSystem` has: its ports, its state, its parameters, and what computes them.
+
+    Args:
+        system: The system, which has nothing yet.
+        model: Its functions.
+        T: Its scalar type.
+
+    Attributes:
+        model: As given.
+    """
+
+    def __init__(self, system: Any, model: Model, T: type) -> None:
+        self.model = model
+        self._T = T
+        self._ports = {name: system.DeclareVectorInputPort(name, model.size(name)) for name in model.inputs}
+        for value in model.state.values():
+            system.DeclareDiscreteState(BasicVector_[T](value))
+        if model.parameters:
+            system.DeclareNumericParameter(BasicVector_[T](np.concatenate(list(model.parameters.values()))))
+        for name, result in model.outputs.items():
+            if result.shows is not None:
+                system.DeclareStateOutputPort(name, DiscreteStateIndex(model.state_index(result.shows)))
+            else:
+                tickets = {self._ticket(system, block) for block in result.blocks} or {system.nothing_ticket()}
+                system.DeclareVectorOutputPort(name, result.size, self._calc(result), prerequisites_of_calc=tickets)
+        if model.update is not None:
+            system.DeclarePeriodicDiscreteUpdateEvent(model.period, 0.0, self._update(model.update))
+
+    def _calc(self, result: FunctionResult) -> Callable[[Context, Any], None]:
+        return self._handler(result, deliver=BasicVector_[self._T].set_value, updates=False)
+
+    def _update(self, result: FunctionResult) -> Callable[[Context, Any], None]:
+        if self._T is float:
+            return self._handler(result, deliver=None, updates=True)
+        ends = np.cumsum([value.size for value in self.model.state.values()]).tolist()
+        groups = [(i, slice(start, end)) for i, (start, end) in enumerate(pairwise([0, *ends]))]
+
+        def deliver(state: Any, following: NDArray[Any]) -> None:
+            for i, entries in groups:
+                state.set_value(i, following[entries])
+
+        return self._handler(result, deliver=deliver, updates=True)
+
+    def _handler(
+        self, result: FunctionResult, *, deliver: Callable[[Any, NDArray[Any]], None] | None, updates: bool
+    ) -> Callable[[Context, Any], None]:
+        """Return the compiled event handler (see `handler`), which needs few calls of Python functions per step."""
+        T = self._T
+        sources = {block.source for block in result.blocks}
+        return handler(
+            states=tuple(self.model.state_index(b.names[0]) for b in result.blocks if b.source == STATE),
+            updates=updates,
+            clock=TIME in sources,
+            parameters=Context_[T].get_numeric_parameter if PARAMETER in sources else None,
+            inputs=tuple(
+                weakly(self._ports[b.names[0]], InputPort_[T].Eval) for b in result.blocks if b.source == INPUT
+            ),
+            # Views are cheaper, but there are none of AutoDiffXd.
+            state_value=DiscreteValues_[T].value if deliver else DiscreteValues_[T].get_mutable_value,
+            vector_value=BasicVector_[T].value if T is float else BasicVector_[T].CopyToVector,
+            compute=result.kernel.value if T is float else result.kernel.autodiff,
+            deliver=deliver,
+        )
+
+    def _ticket(self, system: Any, block: ArgumentBlock) -> DependencyTicket:
+        name = block.names[0]
+        if block.source == INPUT:
+            return self._ports[name].ticket()
+        if block.source == STATE:
+            return system.discrete_state_ticket(DiscreteStateIndex(self.model.state_index(name)))
+        if block.source == PARAMETER:
+            return system.numeric_parameter_ticket(NumericParameterIndex(0))
+        return system.time_ticket()
+
+
+CasadiSystem = class_for_float(CasadiSystem_)

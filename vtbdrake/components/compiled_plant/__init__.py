@@ -16,7 +16,7 @@ from vtbdrake.components.compiled_plant.momentum import (
     momentum_world,
     rotation_angle,
 )
-from vtbdrake.components.compiled_plant.rollouts import PlantRollouts, RolloutBatch
+from vtbdrake.components.compiled_plant.plant_rollouts import PlantRollouts, RolloutBatch
 
 __all__ = [
     "AppliedForce",

@@ -1,9 +1,9 @@
 r"""The equations of motion of a MultibodyPlant, written in CasADi.
 
-The recursions are those of Featherstone, "Rigid Body Dynamics Algorithms", 2008 (RBDA), in the frames of the links. A
-spatial vector is [angular; linear], as in Drake. Of a link with the frame M: V is its velocity; S v the velocity of
-its joint; X takes motions from the frame of the parent to M, and X' takes forces back; V x and V x* are crm(V) and
-crf(V). The world accelerates with -g, so that weight needs no force.
+The recursions are from Featherstone, "Rigid Body Dynamics Algorithms", 2008 (RBDA), in the frames of the links. A
+spatial vector is [angular; linear], as in Drake. The symbols of a link with the frame M: V is its velocity; S v the
+velocity of its joint; X takes motions from the frame of the parent to M, and X' takes forces back; V x and V x* are
+crm(V) and crf(V). The world accelerates with -g, so that weight needs no force.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from vtbdrake.components.compiled_plant.links import (
 def plant_dynamics(plant: MultibodyPlant, context: Context, *, inputs: Sequence[str] = ()) -> casadi.Function:
     """Return the function (x, u, inputs) -> xdot of a plant: what `System.EvalTimeDerivatives` computes.
 
-    x is the plant's [q; v], u its actuation. Masses, inertias, frames, damping and reflected inertia are those of the
-    Context. Those that are ``inputs`` are arguments, so that nothing is compiled when they change; they follow x and u,
-    and are named after their addresses, with ``_`` for each dot.
+    x is the plant's [q; v], u its actuation. Masses, inertias, frames, damping and reflected inertia are read from the
+    Context. All ``inputs`` are arguments, so that nothing is compiled when they change; they follow x and u, and are
+    named after their addresses, with ``_`` for each dot.
 
     Args:
         plant: The plant, finalized; discrete or continuous.
@@ -65,7 +65,12 @@ def plant_step(plant: MultibodyPlant, context: Context, *, inputs: Sequence[str]
     The step is semi-implicit Euler's, with implicit damping. ``overrun`` (rad or m, the largest of all joints) is
     positive as soon as the plant would feel one of its joint stops, which the step lacks; -inf without stops.
 
-    Args and errors are those of `plant_dynamics`.
+    It refuses what `plant_dynamics` refuses, too.
+
+    Args:
+        plant: The plant, finalized and discrete.
+        context: The plant's own Context.
+        inputs: Addresses within the plant, such as ``payload.mass``; see `read_links`.
 
     Raises:
         UnsupportedPlantError: The plant is continuous, or uses the solver TAMSI.
@@ -114,6 +119,10 @@ class AppliedForce:
 class PlantDynamics:
     """A plant as CasADi expressions. All quantities are the plant's own: q, v and tau in its order and units.
 
+    Args:
+        plant: The finalized plant.
+        context: Its own Context, with the values that are compiled in.
+
     Attributes:
         nq: Number of positions.
         nv: Number of velocities.
@@ -123,7 +132,7 @@ class PlantDynamics:
     """
 
     def __init__(self, plant: MultibodyPlant, context: Context, *, inputs: Sequence[str] = ()) -> None:
-        """Read the plant through its own Context; the arguments and errors are those of `plant_dynamics`."""
+        """Read the plant through its own Context; see `plant_dynamics` for arguments and errors."""
         tree = read_links(plant, context, inputs)
         self._links = tree.links
         self._symbols = tree.symbols
@@ -144,7 +153,13 @@ class PlantDynamics:
         return casadi.SX.sym("q", self.nq), casadi.SX.sym("v", self.nv), casadi.SX.sym("u", self.nu)
 
     def function(self, name: str, arguments: Sequence[Expression], results: dict[str, Expression]) -> casadi.Function:
-        """Return the function of x and u, and of the inputs, with common subexpressions eliminated."""
+        """Return the function of x and u, and of the inputs, with common subexpressions eliminated.
+
+        Args:
+            name: Name of the function.
+            arguments: Its arguments before the inputs, such as x and u.
+            results: Its results by name.
+        """
         names = ["x", "u", *(input_name(address) for address in self.inputs)]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
@@ -153,7 +168,12 @@ class PlantDynamics:
         return casadi.Function(name, [*arguments, *self._symbols.values()], values, names, list(results), {"cse": True})
 
     def substituted(self, results: Sequence[Expression], values: Mapping[str, Expression]) -> list[Expression]:
-        """Return results of the methods below with expressions, by address, in place of the inputs."""
+        """Return results of the methods below with expressions, by address, in place of the inputs.
+
+        Args:
+            results: Expressions that depend on the inputs.
+            values: The expression for each replaced input, by address.
+        """
         symbols = list(self._symbols.values())
         return list(casadi.substitute(list(results), symbols, [casadi.densify(values[name]) for name in self.inputs]))
 
@@ -164,6 +184,12 @@ class PlantDynamics:
 
         D is the damping; M contains the reflected inertias, and period * D: with the period of a step, the damping acts
         at the end of the step, on v + period * vdot.
+
+        Args:
+            q: Positions, shape (nq, 1), in rad or m.
+            v: Velocities, shape (nv, 1), in rad/s or m/s.
+            tau: Generalized forces, shape (nv, 1), in N m or N.
+            period: Time step in s for implicit damping; 0 for the continuous plant.
         """
         moves = self._moves(q, v)
         inertias = [link.inertia for link in self._links]
@@ -231,7 +257,13 @@ class PlantDynamics:
         return torque
 
     def energy(self, q: Expression, v: Expression, *, rotors: bool = True) -> tuple[Expression, Expression]:
-        """Return the kinetic and the potential energy, in J; ``rotors`` as in `inverse_dynamics`."""
+        """Return the kinetic and the potential energy, in J; ``rotors`` as in `inverse_dynamics`.
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+            rotors: Whether the reflected inertias count.
+        """
         kinetic, potential = casadi.SX(0), casadi.SX(0)
         for link, move, (R, p) in zip(self._links, self._moves(q, v), self._poses(q), strict=True):
             kinetic += casadi.dot(move.V, link.inertia @ move.V) / 2
@@ -246,6 +278,11 @@ class PlantDynamics:
         """Return the momentum p = M(q) v, and dL/dq of the Lagrangian L = v' M v / 2 - U; ``rotors`` as above.
 
         Lagrange's equation is then dp/dt = dL/dq + tau (but not for a floating joint, whose v is not qdot).
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+            rotors: Whether the reflected inertias count.
         """
         position, velocity, _ = self.symbols()
         kinetic, potential = self.energy(position, velocity, rotors=rotors)
@@ -254,14 +291,26 @@ class PlantDynamics:
         return casadi.densify(p), casadi.densify(slope)
 
     def step(self, q: Expression, v: Expression, tau: Expression, period: float) -> tuple[Expression, Expression]:
-        """Return q and v after one step of Drake's discrete plant: semi-implicit Euler with implicit damping."""
+        """Return q and v after one step of Drake's discrete plant: semi-implicit Euler with implicit damping.
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+            tau: Generalized forces, shape (nv, 1), in N m or N.
+            period: Time step in s.
+        """
         v_next = v + period * self.acceleration(q, v, tau, period=period)
         return q + period * self.qdot(q, v_next), v_next
 
     def overrun(self, q: Expression, v_next: Expression, period: float) -> Expression:
-        """Return how far q + 2 period qdot is beyond the joints' stops, the largest of all joints (rad or m).
+        """Return the largest distance of q + 2 period qdot beyond the joints' stops, of all joints (rad or m).
 
         SAP's stops push back as soon as it is positive (their dissipation time is the period).
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v_next: Velocities after the step, shape (nv, 1).
+            period: Time step in s.
         """
         ahead = q + 2 * period * self.qdot(q, v_next)
         beyond = [
@@ -281,7 +330,12 @@ class PlantDynamics:
     # -- kinematics
 
     def qdot(self, q: Expression, v: Expression) -> Expression:
-        """Return qdot = N(q) v."""
+        """Return qdot = N(q) v.
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+        """
         rates = casadi.SX(self.nq, 1)
         for link in self._links:
             if link.kind == FLOATING:
@@ -291,7 +345,12 @@ class PlantDynamics:
         return rates
 
     def frame(self, frame: Frame, q: Expression) -> FrameMotion:
-        """Return pose and Jacobian of a frame of the plant."""
+        """Return pose and Jacobian of a frame of the plant.
+
+        Args:
+            frame: A frame of the plant.
+            q: Positions, shape (nq, 1).
+        """
         return self._motion_on_link(*self._on_link(frame), q)
 
     def _motion_on_link(self, k: int, X_MF: Pose, q: Expression) -> FrameMotion:
@@ -308,7 +367,13 @@ class PlantDynamics:
         return FrameMotion(R, p, casadi.densify(J))
 
     def frame_bias(self, frame: Frame, q: Expression, v: Expression) -> Expression:
-        """Return Jdot v, the [angular; linear] acceleration of a frame in the world at constant v, shape (6, 1)."""
+        """Return Jdot v, the [angular; linear] acceleration of a frame in the world at constant v, shape (6, 1).
+
+        Args:
+            frame: A frame of the plant.
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+        """
         moves = self._moves(q, v)
         accelerations: list[Expression] = []
         for link, move in zip(self._links, moves, strict=True):
@@ -318,19 +383,29 @@ class PlantDynamics:
             return casadi.SX(6, 1)
         (R, _), omega = self._poses(q)[k], skew(moves[k].V[:3])
         alpha = accelerations[k][:3]
-        # A spatial acceleration is that of a point fixed in space; F's origin moves through it with the link.
+        # A spatial acceleration belongs to a point fixed in space; F's origin moves through it with the link.
         linear = accelerations[k][3:] + omega @ moves[k].V[3:] + skew(alpha) @ p_MF + omega @ (omega @ p_MF)
         return casadi.vertcat(R @ alpha, R @ linear)
 
     # -- forces
 
     def pose(self, body: RigidBody, q: Expression) -> Pose:
-        """Return the pose of a body in the world, (R_WB, p_WB)."""
+        """Return the pose of a body in the world, (R_WB, p_WB).
+
+        Args:
+            body: A body of the plant.
+            q: Positions, shape (nq, 1).
+        """
         k, X_MB = self._mounts[int(body.index())]
         return X_MB if k < 0 else times(self._poses(q)[k], X_MB)
 
     def generalized(self, q: Expression, forces: Sequence[AppliedForce]) -> Expression:
-        """Return tau of forces in the world that act on bodies."""
+        """Return tau of forces in the world that act on bodies.
+
+        Args:
+            q: Positions, shape (nq, 1).
+            forces: Forces and torques in the world, with their bodies.
+        """
         tau = casadi.SX(self.nv, 1)
         for force in forces:
             motion = self._motion_on_link(*self._mounts[force.body], q)
@@ -376,7 +451,7 @@ class PlantDynamics:
             return F
 
         def carried(bodies: set[int]) -> Expression:
-            """Return what bodies of one link need, with all links that hang on them, in the frame of the link."""
+            """Return the force on the bodies of one link and all links that hang on them, in the frame of the link."""
             F = casadi.SX(6, 1)
             for body in sorted(bodies):
                 F += needed(body)
@@ -386,14 +461,21 @@ class PlantDynamics:
             return F
 
         def reaction(joint: Joint) -> Expression:
-            child = int(joint.child_body().index())
+            parent, child = int(joint.parent_body().index()), int(joint.child_body().index())
             k, (R, p) = self._on_link(joint.frame_on_child())
-            moved = [i for i, link in enumerate(self._links) if link.joint == int(joint.index())]
-            F = carried(self._on(moved[0]) if moved else self._behind(child))
-            if k < 0:
+            moved = next((i for i, link in enumerate(self._links) if link.joint == int(joint.index())), None)
+            if moved is None and k < 0:
                 raise UnsupportedPlantError(
                     f"the reaction force of {joint.name()}, which does not move, is not compiled"
                 )
+            if moved is None:
+                hangs = parent if self._welds.get(parent) == child else child
+                F = carried(self._behind(hangs))
+            else:
+                hangs = parent if self._links[moved].carrier == child else child
+                F = carried(self._on(moved))
+            if hangs == parent:  # The joint exerts the opposite on its child, which carries the parent.
+                F = -F if moved is None else -(moves[moved].X.T @ F)
             return casadi.vertcat(R.T @ (F[:3] - casadi.cross(p, F[3:])), R.T @ F[3:])
 
         return reaction

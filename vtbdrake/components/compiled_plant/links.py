@@ -28,7 +28,10 @@ from vtbdrake.state.multibody import bodies, element_address
 Expression = Any  # casadi.SX
 Pose = tuple[Expression, Expression]  # R, shape (3, 3), and p, shape (3, 1)
 
-REVOLUTE, PRISMATIC, WELD, FLOATING = "revolute", "prismatic", "weld", "quaternion_floating"
+REVOLUTE = "revolute"
+PRISMATIC = "prismatic"
+WELD = "weld"
+FLOATING = "quaternion_floating"
 
 
 class UnsupportedPlantError(ValueError):
@@ -47,8 +50,8 @@ class Link:
         carrier: Index of the body that carries the joint.
         kind: Type name of the joint.
         axis: Axis of the joint, in F and in M, shape (3, 1).
-        q: Places of its positions among those of the plant.
-        v: Places of its velocities among those of the plant.
+        q: Places of its positions among the plant's positions.
+        v: Places of its velocities among the plant's velocities.
         X_PF: Pose of F in the frame of the parent.
         inertia: M_LMo_M of the link L, [angular; linear], shape (6, 6).
         damping: Damping of the joint, shape (nv, 1).
@@ -106,10 +109,10 @@ def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = 
     reasons = list(_unsupported(plant, context))
     if reasons:
         raise UnsupportedPlantError(f"the plant cannot be compiled: {'; '.join(reasons)}.")
-    return _Reader(plant, context, inputs).tree()
+    return _LinkReader(plant, context, inputs).tree()
 
 
-class _Reader:
+class _LinkReader:
     """Reads the links of one plant."""
 
     def __init__(self, plant: MultibodyPlant, context: Context, inputs: Sequence[str]) -> None:
@@ -285,8 +288,8 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
         drives.setdefault(actuator.joint().index(), []).append(actuator.name())
     for joint_index, names in drives.items():
         if len(names) > 1:
-            # Drake sums their torques in a continuous plant, but takes those of the last in a discrete one; of their
-            # reflected inertias it takes the last in both.
+            # Drake sums their torques in a continuous plant, but takes the last one's torque in a discrete one; in both
+            # it takes the last reflected inertia.
             joint_name = plant.get_joint(joint_index).name()
             yield f"the joint {joint_name} has {len(names)} actuators ({', '.join(names)}): give it one"
     yield from _other_inputs(plant, context)
@@ -313,7 +316,12 @@ def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
 
 
 def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
-    """Yield the pairs of bodies that may touch each other."""
+    """Yield the pairs of bodies that may touch each other.
+
+    Args:
+        plant: The plant, finalized.
+        context: The plant's own Context; unless its geometry query is connected, there is no contact.
+    """
     port = plant.get_geometry_query_input_port()
     if not plant.num_collision_geometries() or not port.HasValue(context):
         return
@@ -364,7 +372,12 @@ def roll_pitch_yaw(angles: Expression) -> Expression:
 
 
 def rotation(axis: Expression, angle: Expression) -> Expression:
-    """Return R of a turn about a unit vector, by Rodrigues' formula."""
+    """Return R of a turn about a unit vector, by Rodrigues' formula.
+
+    Args:
+        axis: The unit vector, (3, 1).
+        angle: The angle in rad, a scalar.
+    """
     along = axis @ axis.T
     across = casadi.sparsify(casadi.SX.eye(3) - along)
     return casadi.sparsify(along + casadi.cos(angle) * across + casadi.sin(angle) * skew(axis))
@@ -376,7 +389,12 @@ def input_name(address: str) -> str:
 
 
 def times(X_AB: Pose, X_BC: Pose) -> Pose:
-    """Return X_AC."""
+    """Return X_AC.
+
+    Args:
+        X_AB: The pose of frame B in frame A, as rotation and translation (m).
+        X_BC: The pose of frame C in frame B.
+    """
     return X_AB[0] @ X_BC[0], X_AB[1] + X_AB[0] @ X_BC[1]
 
 

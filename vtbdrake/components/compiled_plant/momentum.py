@@ -25,12 +25,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, Joint
 from pydrake.systems.framework import Context
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.spline import Spline
 from vtbdrake.components.casadi_system import CasadiSystem
 from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
 from vtbdrake.components.compiled_plant.links import FLOATING, Expression, UnsupportedPlantError, skew
-from vtbdrake.spline import Spline
 
 
 class MomentumModel(PlantDynamics):
@@ -73,7 +73,7 @@ class MomentumModel(PlantDynamics):
         self._base = base.v
         everything = (plant.get_joint(index) for index in plant.GetJointIndices())
         (self.base,) = (joint.child_body().name() for joint in everything if joint.type_name() == FLOATING)
-        # The base frame is that of its joint, and its axes are those of B0.
+        # The base frame is its joint's frame, with the axes of B0.
         self._default_positions[base.q] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
     def _check_tree(self, plant: MultibodyPlant) -> None:
@@ -106,7 +106,7 @@ class MomentumModel(PlantDynamics):
         return self._free(at, momentum)
 
     def reaction(self, q: Expression, qdot: Expression) -> tuple[Expression, Expression]:
-        """Return what turns the base, and what resists: (h_B, J_B), about the centre of mass of all, in the axes of B.
+        """Return (h_B, J_B), the momentum that turns the base and its inertia, about the centre of mass, in B's axes.
 
         h_B, shape (3, 1) in N m s, is the angular momentum of the joints' motion while the base keeps its attitude;
         J_B, shape (3, 3) in kg m^2, is the inertia with the joints locked. So the base turns by -J_B^-1 h_B if nothing
@@ -150,8 +150,8 @@ class MomentumModel(PlantDynamics):
         """Return the function (knots) -> rotation, position, torque of the joints' curve over its duration.
 
         Pose by the Runge-Kutta method of fourth order. ``knots`` has the shape (m, n); ``rotation`` holds quaternions
-        [w, x, y, z] of R_B0B, shape (4, N + 1); ``position`` p_B0B_B0, shape (3, N + 1), in m; ``torque`` those of the
-        drives, shape (m, N + 1).
+        [w, x, y, z] of R_B0B, shape (4, N + 1); ``position`` p_B0B_B0, shape (3, N + 1), in m; ``torque`` the drives'
+        torques, shape (m, N + 1).
 
         Args:
             spline: The curve of each joint; smooth, ``cubic`` or ``bspline``.
@@ -275,7 +275,7 @@ def base_poses(steps: int, duration: float) -> casadi.Function:
     """Return the function (V) -> rotation, position, by the Runge-Kutta method of fourth order.
 
     V are velocities V_B0B_B at the 2 N + 1 ends and middles of the N steps, shape (6, 2 N + 1); ``rotation`` and
-    ``position`` are those of `MomentumModel.motion`.
+    ``position`` are as in `MomentumModel.motion`.
 
     Args:
         steps: Number N of steps.
@@ -299,9 +299,9 @@ def momentum_world(model: MomentumModel, positions: ArrayLike, *, period: float)
         - state
 
     At t = 0, T, 2 T, ... the joints move to ``position`` (rad or m, shape (m,)), at a constant rate since the last
-    sample; the velocity of the base is that halfway. ``state`` is [quaternion of R_WB, p_WoBo_W; q], shape (7 + m,).
-    Its variables, ``<base>.position`` and ``<joint>.position``, are named as those of the plant, where that is added to
-    a testbed as ``sim.sys.<model instance>``: beliefs and qualities fit both.
+    sample; the velocity of the base is taken halfway. ``state`` is [quaternion of R_WB, p_WoBo_W; q], shape (7 + m,).
+    Its variables, ``<base>.position`` and ``<joint>.position``, are named like the plant's variables, where the plant
+    is added to a testbed as ``sim.sys.<model instance>``: beliefs and qualities fit both.
 
     Args:
         model: The model.

@@ -11,6 +11,10 @@ class Conditions(AddressedSystem):
     """Shows a vector of parameters at its only output port.
 
     They are variables: a rollout changes the conditions by writing them.
+
+    Args:
+        port: The name of the output port.
+        quantities: The parameters, by name.
     """
 
     def __init__(self, port: str, **quantities: Quantity) -> None:

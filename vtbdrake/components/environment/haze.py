@@ -20,12 +20,22 @@ _CONTRAST_THRESHOLD = 0.02
 
 
 def transmission(extinction: float, distance: ArrayLike) -> NDArray[np.float64]:
-    """Return the share of light that is left after a way of ``distance`` (m) in haze of ``extinction`` (1/m)."""
+    """Return the share of light that is left after a way of ``distance`` (m) in haze of ``extinction`` (1/m).
+
+    Args:
+        extinction: The extinction coefficient, in 1/m; 0 without haze.
+        distance: The length of the way in m, any shape.
+    """
     return np.exp(-extinction * np.asarray(distance, dtype=float)) if extinction else np.ones(np.shape(distance))
 
 
 def two_way_transmission(extinction: float, distance: ArrayLike) -> NDArray[np.float64]:
-    """Return the share of a laser's light that is left after the way to a target at ``distance`` (m) and back."""
+    """Return the share of a laser's light that is left after the way to a target at ``distance`` (m) and back.
+
+    Args:
+        extinction: The extinction coefficient, in 1/m; 0 without haze.
+        distance: The distance of the target in m, one way, any shape.
+    """
     return transmission(2.0 * extinction, distance)
 
 
@@ -45,7 +55,7 @@ def extinction_of_visibility(visibility: float) -> float:
 def hazed(
     image: NDArray[np.floating], *, distance: NDArray[np.float64], extinction: float, airlight: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return what a camera sees of a scene through homogeneous haze.
+    """Return the image of a scene through homogeneous haze.
 
     Koschmieder (1924), "Theorie der horizontalen Sichtweite": I = I0 exp(-b d) + A (1 - exp(-b d)), where the first
     term is the light that is left of the scene's and the second is the light that the haze scatters into the camera.

@@ -1,8 +1,8 @@
 """Light: sunlight, and sunlight that the Earth reflects.
 
-Brightness is relative: 1 is that of sunlight near the Earth, 1361 W/m^2 (Kopp and Lean, "A new, lower value of total
-solar irradiance", 2011), on a white surface that faces it. A camera with exposure 1 and gain 1 shows such a surface at
-full scale.
+Brightness is relative: 1 is the brightness of sunlight near the Earth, 1361 W/m^2 (Kopp and Lean, "A new, lower value
+of total solar irradiance", 2011), on a white surface that faces it. A camera with exposure 1 and gain 1 shows such a
+surface at full scale.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.environment.conditions import Conditions
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import NamedVector, Quantity
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ is the inverse of the observed information: matches that are in doubt count less
 difference between the local position of a landmark and that on the map:
 
 * There are at least `fewest` local landmarks.
-* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 10⁶. The first logarithm is that of the number of distinguishable poses on a
+* Λ > ln(A / (2π s²) · 2π · 10 m / s) + ln 10⁶. The first logarithm counts the distinguishable poses on a
   map of area A, at least 1 ha: a small map asks for no less. At a place that the map does not show, an attempt exceeds
   the bound with a probability of at most 10⁻⁶ if the trees stand at random, because the expectation of exp Λ is then 1
   for each pose; real stands are not quite random.
@@ -42,12 +42,12 @@ from math import inf, log, pi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array, Indices, immutable
+from vtbdrake.common.arrays import Array, Indices, immutable
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.pair_votes import LocalPairs, PairTable
 from vtbdrake.components.localization.planar import compose, rotation, rotations, transform, wrap
 
-# Standard deviation in m that is added to those of diameters: assumed, for bark.
+# Standard deviation in m that is added to the diameters' deviations: assumed, for bark.
 _DIAMETER_FLOOR = 0.01
 
 # The share of diameters that are measured badly, ε: assumed.
@@ -56,8 +56,12 @@ _BAD_DIAMETERS = 0.1
 # Landmarks are counted within this radius, in m, for the density around each.
 _SURROUNDINGS = 8.0
 
-# The numbers of poses: those with most votes, those that are fitted, those that are judged.
-_VOTED, _FITTED, _JUDGED = 300, 60, 10
+# Number of poses with the most votes that are looked at.
+_VOTED = 300
+# Number of poses that are fitted.
+_FITTED = 60
+# Number of poses that are judged.
+_JUDGED = 10
 
 # The number of steps of expectation maximization.
 _STEPS = 8
@@ -68,10 +72,17 @@ _NEIGHBOURS = 3
 # The number of samples from which the likelihood of a right pose is computed.
 _SAMPLES = 300
 
-# The test of uniqueness, see the module. The factor is the number of attempts off the map, among random trees, of which
-# one may be sure; a carrier tries every 2 m. A smaller map than the least area, in m², asks for as much evidence.
-_FACTOR, _LEAST_AREA = 1e6, 1e4
-_LEAST_MARGIN, _LARGEST_SHARE, _LEAST_FIT = 5.0, 0.5, 0.6
+# The test of uniqueness, see the module.
+# Number of attempts off the map, among random trees, for one that is wrongly sure; a carrier tries every 2 m.
+_FACTOR = 1e6
+# A map of a smaller area asks for as much evidence as one of this area, in m².
+_LEAST_AREA = 1e4
+# Least difference of Λ to the best other pose.
+_LEAST_MARGIN = 5.0
+# Largest Λ of another pose, as a share of the Λ of the best one.
+_LARGEST_SHARE = 0.5
+# Least fit, relative to the expected one.
+_LEAST_FIT = 0.6
 
 
 @immutable
@@ -83,7 +94,7 @@ class Fix:
         covariance: The covariance of the pose, if it is the right one, shape (3, 3).
         is_sure: Whether the pose passes the test of uniqueness. If not, pose and covariance must not be used.
         log_likelihood: Logarithm Λ of the likelihood ratio against a place that the map does not show.
-        margin: Difference between Λ and that of the best other pose, or of a place off the map (0) if that is larger.
+        margin: Difference between Λ and the Λ of the best other pose, or of a place off the map (0) if that is larger.
         fit: Ratio of Λ to its expectation for the right pose.
         pairs: Matches: indices of the local landmark and of the one on the map, shape (m, 2).
     """
@@ -106,7 +117,7 @@ class _Local:
         covariances: Covariances of the positions in m², (n, 2, 2).
         diameters: Diameters in m, (n,).
         diameter_variances: Variances of the diameters in m², (n,).
-        common: Densities of these diameters among those of the map in 1/m, (n,).
+        common: Densities of these diameters among the map's diameters in 1/m, (n,).
         shared: The functions that make up the displacement of the map at the landmarks, (n, f).
         independent: The share of the map's variance that these functions do not contain, (n,).
     """
@@ -131,7 +142,7 @@ class _Matches:
 
     Attributes:
         near: Indices on the map, (n, k).
-        deltas: Their positions less that of the local landmark in m, (n, k, 2).
+        deltas: Their positions less the local landmark's position in m, (n, k, 2).
         weights: Inverse covariances of these, (n, k, 2, 2).
         ratios: Logarithms of w N D / λ, (n, k).
     """
@@ -147,7 +158,7 @@ class _Matches:
         return terms
 
     def probabilities(self, share: float) -> Array:
-        """Return how probable each match is, (n, k)."""
+        """Return the probabilities of the matches, (n, k)."""
         return np.exp(self.ratios - self.likelihoods(share)[:, np.newaxis])
 
 
@@ -169,8 +180,8 @@ class ConstellationMap:
         correlation: Length L in m over which errors of the map are shared by neighbours; 0 if they are independent.
         share: The share w of the local landmarks that are on the map, assumed.
         fewest: The least number of local landmarks with which a pose can be sure.
-        least_deviation: Standard deviation in m that is added to those of local landmarks, per axis: assumed, for bark,
-            lean and roots. It also keeps the likelihoods of exact landmarks finite.
+        least_deviation: Standard deviation in m that is added to the local landmarks' deviations, per axis: assumed,
+            for bark, lean and roots. It also keeps the likelihoods of exact landmarks finite.
 
     Raises:
         ValueError: The map has fewer than 3 landmarks, or a parameter is outside of its range.
@@ -282,7 +293,7 @@ class ConstellationMap:
         return _Local(places, local.covariances, local.diameters, diameter_variances, common, shared, independent)
 
     def _common(self, diameters: Array, variances: Array) -> Array:
-        """Return the density of diameters among those of the map, (n,), if they are measured with these variances."""
+        """Return the density of diameters among the map's, (n,), if they are measured with these variances."""
         delta = diameters[:, np.newaxis] - self.landmarks.diameters[self._typical]
         return _normal(delta, variances[:, np.newaxis] + self._diameter_variances[self._typical]).mean(axis=1)
 
@@ -323,7 +334,7 @@ class ConstellationMap:
         return len(here.places) * expected
 
     def _candidates(self, here: _Local, deviation: float) -> Array:
-        """Return the poses X_MC to be judged, (k, 3); ``deviation`` (m) is that of local from mapped positions."""
+        """Return the poses X_MC to be judged, (k, 3); ``deviation`` (m) is local from mapped positions' deviation."""
         local = LocalPairs.of(
             here.places,
             here.variances + self.least_deviation**2,

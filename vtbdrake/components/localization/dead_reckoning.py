@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.scan import Scan
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.planar import rotation
-from vtbdrake.scan import Scan
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, NamedVector, Quantity
 from vtbdrake.state.declarations import NamedView
 
@@ -37,7 +37,7 @@ MOTION = NamedVector(
 
 
 class CarrierPose(NamedTuple):
-    """The pose of the carrier at one time, an entry of the port ``history``: x, y and heading are those of H in O.
+    """The pose of the carrier at one time, an entry of the port ``history``: x, y and heading describe H in O.
 
     Attributes:
         time: The time in s.
@@ -114,7 +114,12 @@ class DriftModel:
         return covariance
 
     def extent(self, motion: ArrayLike, duration: float) -> float:
-        """Return what the error of the heading grows with: the duration of a motion, as its rate is measured."""
+        """Return the duration of a motion: the error of the heading grows with it, as its rate is measured.
+
+        Args:
+            motion: The motion X_AB = [x, y, heading], (3,) in m and rad; not used.
+            duration: The duration of the motion in s.
+        """
         return duration
 
 
@@ -123,8 +128,8 @@ class SteeringDriftModel(DriftModel):
     """The drift of dead reckoning by speed and steering angle, which measures a curvature in place of a turn rate.
 
     An error of the angle turns the carrier while it drives, and not while it stands: the heading's error grows with the
-    distance. The lasting error g of a `Tracker` is then one of the curvature, ``rate_deviation`` and ``rate_walk`` are
-    in rad/m and rad/m^1.5. The defaults are those of a car on grass: rounded from the first half of the drive in
+    distance. The lasting error g of a `Tracker` is then an error of the curvature, ``rate_deviation`` and ``rate_walk``
+    are in rad/m and rad/m^1.5. The defaults fit a car on grass: rounded from the first half of the drive in
     Victoria Park, see `vtbdrake_diagrams.park`.
     """
 
@@ -134,7 +139,12 @@ class SteeringDriftModel(DriftModel):
     turn: float = setting(0.02, "Standard deviation of the heading in turns.", unit="rad/sqrt(rad)", ge=0)
 
     def extent(self, motion: ArrayLike, duration: float) -> float:
-        """Return what the error of the heading grows with: the distance of a motion, negative backwards."""
+        """Return the distance of a motion, negative backwards: the error of the heading grows with it.
+
+        Args:
+            motion: The motion X_AB = [x, y, heading], (3,) in m and rad.
+            duration: The duration of the motion in s; not used.
+        """
         x, y, _ = np.asarray(motion, dtype=float).tolist()
         return copysign(hypot(x, y), x)
 
@@ -157,7 +167,7 @@ class DeadReckoning(AddressedSystem):
     sideways, the middle of an axle that is not steered, at x = ``axle`` in B. The estimates therefore hold for that
     time, the first entry of ``motion``, which is laid out as `MOTION` says. ``history`` has the poses of the last
     `HISTORY_LENGTH`, newest first, each a `CarrierPose`; before the start, the carrier stood still. x, y and
-    heading are those of H in O; the heading is continuous, not wrapped.
+    heading describe H in O; the heading is continuous, not wrapped.
 
     *Levelling.* The reaction g to gravity, expressed in B, points up. It is rotated by the gyros, and corrected towards
     the specific force f less the acceleration of Bo, whose velocity in B is V = [v, -axle w_z, 0]:
@@ -399,7 +409,7 @@ def deskewed(scan: Scan, history: ArrayLike, X_BL: RigidTransform, *, time: floa
     """Return the points of a scan in the level frame H at one time, (n, 3) in m.
 
     Each point is transformed from the pose of the carrier when its ray was fired to the pose at ``time``. Poses between
-    those of the history are interpolated linearly. The vertical motion of the carrier is neglected.
+    the history's are interpolated linearly. The vertical motion of the carrier is neglected.
 
     Args:
         scan: The scan.

@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
 from scipy.sparse import kron
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
-# The distance of the nodes of the surface, and the edge length of the cells whose lowest points count, in m.
-_SPACING, _CELL = 4.0, 1.5
+# Distance of the nodes of the surface, in m.
+_SPACING = 4.0
+# Edge length of the cells whose lowest points count, in m.
+_CELL = 1.5
 # From stiff to soft: the weight of the squared second differences of neighbouring nodes (1/m^2), and how far (m) the
 # lowest point of a cell may lie above the surface and still be taken for ground.
 _STAGES = ((1e3, 2.0), (1e2, 1.0), (1e1, 0.5), (2.0, 0.3), (1.0, 0.2))
@@ -35,7 +37,7 @@ class GroundSurface:
     heights: Array
 
     def at(self, places: ArrayLike) -> Array:
-        """Return the heights (m), (n,), of the surface at places (n, 2); beyond its border, those of the border."""
+        """Return the heights (m), (n,), of the surface at places (n, 2); beyond its border, the border's heights."""
         heights, total = self.heights.ravel(), np.zeros(len(np.asarray(places)))
         for nodes, weights in self.support(np.asarray(places)):
             total += weights * heights[nodes]

@@ -4,10 +4,10 @@
 last fused scan showed. The track is lost after ``patience`` failures in succession, or when position or heading are too
 uncertain.
 
-*Evidence.* The d² of a right first match is chi-square distributed, that of a match by chance is uniform within the
-gate γ of first matches. So the log-likelihood ratio of a match with d², of which the share ε = 0.2 is by chance
-although the pose is right, is ln(ε + (1 - ε) γ / 2 exp(-d² / 2)). Its sum is kept up to at most ``credit``; below 0,
-the track is lost (the cumulative sum of Page, Biometrika 41, 1954).
+*Evidence.* The d² of a right first match is chi-square distributed, the d² of a match by chance is uniform within the
+gate γ of first matches. So the log-likelihood ratio of a match with d² is (a share ε = 0.2 of matches is by chance
+although the pose is right) ln(ε + (1 - ε) γ / 2 exp(-d² / 2)). Its sum is kept up to at most ``credit``; below 0, the
+track is lost (the cumulative sum of Page, Biometrika 41, 1954).
 
 *Drift.* Dead reckoning may be worse than the model of its noise says, by wheels that slip or a steering angle that is
 measured badly. The change d of the pose by a scan has the covariance D, the pose's before the scan less that after it.
@@ -28,13 +28,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.track_state import TrackState
 
-# A scan fails if it matches a smaller share of its detections, or of the landmarks that should be seen again.
-_LEAST_SHARE, _LEAST_AGAIN = 0.15, 0.25
+# A scan fails if it matches a smaller share of its detections.
+_LEAST_SHARE = 0.15
+# A scan fails if it matches a smaller share of the landmarks that should be seen again.
+_LEAST_AGAIN = 0.25
 
 # The least number of detections, or of landmarks that should be seen again, for this test.
 _JUDGED_FROM = 6
@@ -42,9 +44,14 @@ _JUDGED_FROM = 6
 # With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
 _LARGEST_TURN = 0.2
 
-# The factor of the variance of dead reckoning: by which share it follows the ratio of a scan, the largest ratio that
-# counts, the factor of a scan that fails, and the largest value.
-_FOLLOWS, _LARGEST_RATIO, _FAILED, _LARGEST_DRIFT = 0.1, 25.0, 4.0, 1e3
+# Share by which the factor of the variance of dead reckoning follows the ratio of a scan.
+_FOLLOWS = 0.1
+# Largest ratio of a scan that counts.
+_LARGEST_RATIO = 25.0
+# A scan that fails multiplies the factor of the variance of dead reckoning by this number.
+_FAILED = 4.0
+# Largest factor of the variance of dead reckoning.
+_LARGEST_DRIFT = 1e3
 
 # Units in which errors of x, y (m) and heading (rad) are of the same size, as a landmark at 10 m shows them.
 _SCALES = np.array([1.0, 1.0, 0.1])
@@ -60,7 +67,13 @@ _CHANCE = 0.2
 
 
 def fails(state: TrackState, detections: Landmarks, pairs: Indices) -> bool:
-    """Return whether a scan with these pairs of detection and landmark, (k, 2), fails."""
+    """Return whether a scan with these pairs of detection and landmark, (k, 2), fails.
+
+    Args:
+        state: The state before the scan.
+        detections: The detections of the scan, in H.
+        pairs: Indices of the detection and of the landmark on the map.
+    """
     matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
     recent = state.landmark_positions[state.is_recent]
     # Near the largest distance of detections, landmarks are not seen reliably.
@@ -71,7 +84,12 @@ def fails(state: TrackState, detections: Landmarks, pairs: Indices) -> bool:
 
 
 def evidence(squares: Array, first_gate: float) -> float:
-    """Return the log-likelihood ratio of first matches, right against by chance, from their d² (k,)."""
+    """Return the log-likelihood ratio of first matches, right against by chance, from their d² (k,).
+
+    Args:
+        squares: The d² of the first matches.
+        first_gate: The share of right first matches that their gate lets pass, in (0, 1).
+    """
     ratio = 0.5 * chi_square_quantile(first_gate, 2) * np.exp(-0.5 * squares)
     return float(np.log(_CHANCE + (1.0 - _CHANCE) * ratio).sum())
 
@@ -82,10 +100,15 @@ def drift_after_failure(state: TrackState) -> float:
 
 
 def drift_after(before: TrackState, after: TrackState) -> float:
-    """Return the factor of the variance of dead reckoning after a scan that was fused."""
+    """Return the factor of the variance of dead reckoning after a scan that was fused.
+
+    Args:
+        before: The state before the scan was fused, at the same time.
+        after: The state with the scan.
+    """
     change = after.pose - before.pose
     D = before.pose_covariance - after.pose_covariance
-    # Directions of which the scan says nothing have no variance, and no change.
+    # Directions about which the scan says nothing have no variance, and no change.
     values, directions = np.linalg.eigh(D / np.outer(_SCALES, _SCALES))
     along = directions.T @ (change / _SCALES)
     says = values > 1e-3 * values.max()
@@ -118,7 +141,14 @@ def distortion(places: Array, corrections: Array, M: Array) -> float:
 
 
 def is_lost(state: TrackState, *, patience: int, largest_deviation: float, distortion_gate: float) -> bool:
-    """Return whether the track is lost, with the settings of a `Tracker`."""
+    """Return whether the track is lost, with the settings of a `Tracker`.
+
+    Args:
+        state: The state after the last scan.
+        patience: The number of failures in succession after which the track is lost.
+        largest_deviation: The largest standard deviation of x and y, in m.
+        distortion_gate: The share of right maps that are not doubtful in one test of the distortion, in (0, 1).
+    """
     limits = np.array([largest_deviation, largest_deviation, _LARGEST_TURN])
     is_vague = bool((np.sqrt(np.diagonal(state.pose_covariance)) > limits).any())
     is_tangled = state.distortion > _TANGLED * chi_square_quantile(distortion_gate, _DISTORTIONS)
@@ -126,7 +156,12 @@ def is_lost(state: TrackState, *, patience: int, largest_deviation: float, disto
 
 
 def is_doubtful(state: TrackState, *, distortion_gate: float) -> bool:
-    """Return whether the last scan failed or the map seems distorted."""
+    """Return whether the last scan failed or the map seems distorted.
+
+    Args:
+        state: The state after the last scan.
+        distortion_gate: The share of right maps that are not doubtful in one test of the distortion, in (0, 1).
+    """
     return state.failures > 0 or state.distortion > chi_square_quantile(distortion_gate, _DISTORTIONS)
 
 

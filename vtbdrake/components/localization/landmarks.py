@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.components.localization.planar import rotation, transform
 from vtbdrake.components.world_model import WorldModel
 
@@ -48,7 +48,7 @@ class Landmarks:
             if array.shape != shape:
                 raise ValueError(f"{name} of {n} landmarks have the shape {shape}, not {array.shape}")
             if np.isnan(array).any() or (name != "diameter_deviations" and np.isinf(array).any()):
-                raise ValueError(f"{name} of landmarks are finite numbers: leave out those of which nothing is known")
+                raise ValueError(f"{name} of landmarks are finite numbers: leave out unknown landmarks")
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)
         if (self.diameter_deviations < 0.0).any() or (variances < 0.0).any():
             raise ValueError("standard deviations and variances of landmarks are at least 0")
@@ -73,7 +73,7 @@ class Landmarks:
         return Landmarks(*(getattr(self, field.name)[indices] for field in fields(self)))
 
     def widened(self, deviation: float) -> Landmarks:
-        """Return the landmarks with a deviation (m) added to those of positions, per axis, and of diameters."""
+        """Return the landmarks with a deviation (m) added to the positions', per axis, and the diameters'."""
         covariances = self.covariances + deviation**2 * np.eye(2)
         return replace(self, covariances=covariances, diameter_deviations=np.hypot(self.diameter_deviations, deviation))
 

@@ -1,7 +1,7 @@
 """Votes of pairs of landmarks for poses on a map: candidates for global localization.
 
 Two local landmarks at a distance ℓ can be any pair of the map with that distance and with diameters like theirs. Each
-such pair is a vote for a pose. Each local pair of which both landmarks are on the map votes for the right pose; for a
+such pair is a vote for a pose. Each local pair with both landmarks on the map votes for the right pose; for a
 wrong pose, few vote by chance.
 """
 
@@ -14,16 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 Singles = NDArray[np.float32]
 
-# The least and the largest distance of a pair in m: close pairs say little about the heading, far ones are too many.
-_NEAREST, _FARTHEST = 3.0, 15.0
+# Least distance of a pair, in m: close pairs say little about the heading.
+_NEAREST = 3.0
+# Largest distance of a pair, in m: there are too many farther ones.
+_FARTHEST = 15.0
 
-# Local pairs vote until there are enough votes, and until the right cell has so many standard deviations (_CONTRAST)
-# more votes than other cells, if this share (_RIGHT, assumed) of the pairs votes for it. The limit is set by memory.
-_ENOUGH, _LIMIT, _CONTRAST, _RIGHT = 800_000, 20_000_000, 10.0, 0.08
+# Local pairs vote until there are at least this number of votes.
+_ENOUGH = 800_000
+# Largest number of votes, by memory.
+_LIMIT = 20_000_000
+# They vote until the right cell has this number of standard deviations more votes than other cells, too.
+_CONTRAST = 10.0
+# Share of the pairs that vote for the right cell, assumed.
+_RIGHT = 0.08
 _FEWEST_PAIRS = 25
 
 # Pairs agree within this many standard deviations of their distance and of each diameter.

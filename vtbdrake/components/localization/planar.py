@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 Numbers = TypeVar("Numbers", float, Array)
 
@@ -31,12 +31,22 @@ def wrap(angle: Numbers) -> Numbers:
 
 
 def chord(length: float, turn: float) -> Array:
-    """Return the motion X_AB, (3,), along a chord (m) that points halfway through a turn (rad)."""
+    """Return the motion X_AB, (3,), along a chord (m) that points halfway through a turn (rad).
+
+    Args:
+        length: Length of the chord in m, negative backwards.
+        turn: The change of the heading on the way, in rad.
+    """
     return np.array([length * cos(0.5 * turn), length * sin(0.5 * turn), turn])
 
 
 def compose(X_AB: ArrayLike, X_BC: ArrayLike) -> Array:
-    """Return the pose X_AC of a frame C whose pose in B is X_BC."""
+    """Return the pose X_AC of a frame C whose pose in B is X_BC.
+
+    Args:
+        X_AB: The pose of B in A, [x, y, heading], (3,) in m and rad.
+        X_BC: The pose of C in B, alike.
+    """
     ab, bc = np.asarray(X_AB, dtype=float), np.asarray(X_BC, dtype=float)
     return np.array([*(ab[:2] + rotation(ab[2]) @ bc[:2]), wrap(ab[2] + bc[2])])
 
@@ -48,7 +58,12 @@ def inverse(X_AB: ArrayLike) -> Array:
 
 
 def transform(X_AB: ArrayLike, points_B: ArrayLike) -> Array:
-    """Return points in A, shape (n, 2) in m, that are given in B."""
+    """Return points in A, shape (n, 2) in m, that are given in B.
+
+    Args:
+        X_AB: The pose of B in A, [x, y, heading], (3,) in m and rad.
+        points_B: The points in B, shape (n, 2) in m.
+    """
     ab = np.asarray(X_AB, dtype=float)
     points: Array = np.asarray(points_B, dtype=float) @ rotation(ab[2]).T + ab[:2]
     return points

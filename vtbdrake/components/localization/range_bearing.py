@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.landmarks import Landmarks
-from vtbdrake.settings import check_settings, setting
 
 
 @dataclass
@@ -16,8 +16,9 @@ class RangeBearingConfig:
     """The pose of the sensor in the level frame H, and the accuracy of its detector.
 
     The standard deviation of a range r is ``hypot(range_noise, range_share r)``, across the ray it is
-    ``hypot(range_noise / 2, bearing_noise r)``, and that of a diameter d ``hypot(diameter_noise, diameter_share d)``.
-    The defaults are rounded from the first half of the drive in Victoria Park, see `vtbdrake_diagrams.park`.
+    ``hypot(range_noise / 2, bearing_noise r)``, and the deviation of a diameter d is ``hypot(diameter_noise,
+    diameter_share d)``. The defaults are rounded from the first half of the drive in Victoria Park, see
+    `vtbdrake_diagrams.park`.
     """
 
     x: float = setting(0.0, "Position of the sensor in H, ahead of its origin.", unit="m")

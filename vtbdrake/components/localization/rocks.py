@@ -17,16 +17,16 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations
-from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
-from vtbdrake.settings import setting
+from vtbdrake.components.localization.scan_scene import Cells, Clusters, ScanDetectorConfig, ScanPoints
 
 
 @dataclass(frozen=True)
 class RockDetectorConfig(ScanDetectorConfig):
-    """Settings of the detector of rocks, beside those of `ScanDetectorConfig`.
+    """Settings of the detector of rocks, in addition to `ScanDetectorConfig`.
 
     Raises:
         ValueError: A setting is outside of its range.
@@ -34,13 +34,16 @@ class RockDetectorConfig(ScanDetectorConfig):
 
     least_height: float = setting(
         0.06,
-        "The least height over the ground of a point of a rock; more than that of waves of the ground that "
+        "The least height over the ground of a point of a rock; more than the height of waves of the ground that "
         "are too short for `fit_ground` to follow.",
         unit="m",
         gt=0.0,
     )
     least_roundness: float = setting(
-        0.4, "The least bulge of the visible outline, as a share of that of a circle of the same width.", ge=0.0, lt=1.0
+        0.4,
+        "The least bulge of the visible outline, as a share of the bulge of a circle of the same width.",
+        ge=0.0,
+        lt=1.0,
     )
     least_width: float = setting(0.2, "The least width of a rock.", unit="m", gt=0.0, below="largest_width")
     largest_width: float = setting(3.0, "The largest width of a rock.", unit="m", gt=0.0)
@@ -70,7 +73,7 @@ def detect_rocks(points_H: ArrayLike, detector: RockDetectorConfig, *, p_HoLo_H:
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    scene = Scene.of(points_H, p_HoLo_H, detector)
+    scene = ScanPoints.of(points_H, p_HoLo_H, detector)
     standing = scene.select(np.flatnonzero(scene.heights > detector.least_height))
     cells = Cells.of(standing.points, size=detector.cell, reach=detector.reach)
     rows, owners = cells.connected(np.arange(len(standing)))
@@ -96,7 +99,7 @@ def _outlines(clusters: Clusters, detector: RockDetectorConfig, origin: Array) -
     hidden = clusters.hidden_edges(detector, gap=detector.cell + 4.0 * detector.range_noise)
     good = (clusters.counts >= detector.least_points) & ~hidden.any(axis=1)
     good &= (width >= detector.least_width) & (width <= detector.largest_width)
-    # The distance of the sides beyond the middle, as a share of that of a circle.
+    # The distance of the sides beyond the middle, as a share of a circle's distance.
     middle, half = 0.5 * (left + right), 0.5 * (left - right + step)
     turned = (clusters.azimuths - middle[clusters.owners]) / half[clusters.owners]
     bulge = np.sqrt(np.maximum(1.0 - turned**2, 0.0)) * radius[clusters.owners]

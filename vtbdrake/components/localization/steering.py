@@ -1,6 +1,6 @@
 """Dead reckoning of a car-like carrier from speed and steering angle, without gyros.
 
-The frames are those of `vtbdrake.components.localization.dead_reckoning`; Bo is the middle of the axle that is not
+See `vtbdrake.components.localization.dead_reckoning` for the frames; Bo is the middle of the axle that is not
 steered, and B stays level.
 """
 
@@ -12,13 +12,15 @@ from math import inf
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues
 
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.dead_reckoning import MOTION, POSE, history_at_start
 from vtbdrake.components.localization.planar import Numbers, chord, compose
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
 
-# Speeds of at least this size in m/s are faults, as are angles of the steered wheels above the second number, in rad.
-_LARGEST_SPEED, _LARGEST_ANGLE = 1e3, 1.4
+# Speeds of at least this size are faults, in m/s.
+_LARGEST_SPEED = 1e3
+# Larger angles of the steered wheels are faults, in rad.
+_LARGEST_ANGLE = 1.4
 
 
 @dataclass
@@ -30,7 +32,7 @@ class SteeringConfig:
         0.0, "How far left of the middle of the axle the wheel is whose speed is measured.", unit="m"
     )
     speed_scale: float = setting(1.0, "True over measured speed.", gt=0)
-    steering_scale: float = setting(1.0, "Change of the true over that of the measured angle.", gt=0)
+    steering_scale: float = setting(1.0, "Change of the true over the change of the measured angle.", gt=0)
     steering_offset: float = setting(0.0, "The true angle where 0 is measured.", unit="rad")
 
     def __post_init__(self) -> None:
@@ -71,7 +73,7 @@ class SteeringReckoning(AddressedSystem):
         - history
 
     ``odometry`` is [speed (m/s), steering angle (rad)], sampled one period ago, see `SteeringConfig`. The outputs are
-    those of a `DeadReckoning`, with roll and pitch 0: ``motion`` is laid out as `MOTION`, ``history`` as rows of
+    as in a `DeadReckoning`, with roll and pitch 0: ``motion`` is laid out as `MOTION`, ``history`` as rows of
     `CarrierPose`, newest first. Between two samples, the carrier moves on an arc with the mean of their speeds and turn
     rates.
 

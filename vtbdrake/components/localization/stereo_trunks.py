@@ -3,10 +3,11 @@
 All pixels of a trunk have about the same disparity, and lie above each other. So pixels are counted by column and
 disparity, as a level camera at the same place would see them: a cell with enough of them, one above the other, belongs
 to an upright object. Neighbouring cells are one trunk, whose columns give its direction and its width, and whose mean
-disparity gives its distance. In columns and disparities the errors are the same near and far, unlike those of points.
+disparity gives its distance. In columns and disparities the errors are the same near and far, unlike the errors of
+points.
 Ground, which is spread over many disparities, and twigs need no model: their cells have too few pixels.
 
-The errors of the disparities of one trunk are correlated: that of its distance does not vanish with the number of
+The errors of the disparities of one trunk are correlated: the error of its distance does not vanish with the number of
 pixels. The standard deviations in `StereoTrunkDetectorConfig` are calibrated.
 """
 
@@ -20,10 +21,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.ndimage import convolve1d, find_objects, label
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.perception.stereo import StereoCamera
-from vtbdrake.settings import check_settings, setting
 
 # Cells per pixel of disparity. A trunk of one disparity is spread over three: a cell, and one on either side.
 _CELLS = 2

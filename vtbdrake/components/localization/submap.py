@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.components.estimation import (
     chi_square_quantile,
     kalman_update,
@@ -21,7 +21,7 @@ from vtbdrake.components.localization.planar import inverse, rotation
 # The share of right pairs that the gate of the association lets pass.
 _GATE = 0.997
 
-# A place that was in view of at least so many scans is a landmark only if it was detected at least twice.
+# A place that was in view of at least this number of scans is a landmark only if it was detected at least twice.
 _CHANCES = 3
 
 # A place is in view up to this share of the distance of the farthest detection: beyond, detections are unreliable.
@@ -32,8 +32,8 @@ _IN_VIEW = 0.7
 class Submap:
     """Landmarks detected so far, relative to the carrier. Immutable, with read-only arrays.
 
-    The covariances are those of the positions relative to the present carrier: they grow with the covariance of each
-    motion, including that of the heading times the lever arm. Correlations between landmarks are not kept.
+    The covariances belong to positions relative to the present carrier: they grow with the covariance of each
+    motion, including the heading's covariance times the lever arm. Correlations between landmarks are not kept.
 
     Attributes:
         X_OH: The pose of the carrier in the odometry frame, shape (3,) in m and rad.
@@ -91,7 +91,8 @@ class Submap:
 
         Args:
             landmarks: The detections, in H.
-            least_deviation: Standard deviation in m that is added to those of positions, see `ConstellationMap`.
+            least_deviation: Standard deviation in m that is added to the deviations of positions, see
+                `ConstellationMap`.
         """
         if not len(landmarks):
             return self

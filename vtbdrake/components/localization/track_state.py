@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.arrays import Array, Indices, immutable
+from vtbdrake.common.arrays import Array, Indices, immutable
 
-BIAS, ODOMETRY, RATE = 3, 4, 5
-"""The places of b, e and g in x."""
+BIAS = 3
+"""The place of b in x."""
+ODOMETRY = 4
+"""The place of e in x."""
+RATE = 5
+"""The place of g in x."""
 FIXED = 6
 """The place of the first landmark in x."""
 

@@ -14,7 +14,7 @@ localization and mapping: part I", IEEE Robotics & Automation Magazine 13, 2006)
 The heading of a plain extended Kalman filter becomes overconfident. Scans show the positions of landmarks relative to
 the carrier, so that a common rotation of both is not observable; but with derivatives at estimates that change from
 scan to scan, it seems to be (Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF
-SLAM estimators", International Journal of Robotics Research 29, 2010). Therefore the errors here are those of the
+SLAM estimators", International Journal of Robotics Research 29, 2010). Therefore the errors here are defined as in the
 right-invariant filter (Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", arXiv:1510.06263,
 2015): an error θ of the heading displaces the carrier and each landmark, at a point p, by θ J p, where J is the
 rotation by a right angle.
@@ -33,8 +33,8 @@ Errors of a map may be correlated: neighbours are displaced alike. With M_ij = c
 its distribution given the errors of those in the state (simple kriging). So a new landmark is expected to be displaced
 like its neighbours.
 
-Which detection is of which landmark is decided in `vtbdrake.components.localization.association`, whether the estimate
-may be used in `vtbdrake.components.localization.health`.
+`vtbdrake.components.localization.landmark_association` decides which landmark each detection shows,
+`vtbdrake.components.localization.health` whether the estimate may be used.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.estimation import chi_square_quantile
 from vtbdrake.components.localization import health
-from vtbdrake.components.localization.association import Association, ExpectedDetections, MatchedPairs
+from vtbdrake.components.localization.landmark_association import Association, ExpectedDetections, MatchedPairs
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import compose, rotation
 from vtbdrake.components.localization.track_state import BIAS, FIXED, ODOMETRY, RATE, TrackState
-from vtbdrake.settings import check_settings, setting
 
 # The number of leading elements of x on which a detection depends, beside the landmark.
 _OBSERVED = 4
@@ -123,7 +123,7 @@ class Tracker:
     rate_walk: float = setting(2e-5, "Random walk of g; assumed.", unit="rad/s^1.5", ge=0.0)
     least_deviation: float = setting(
         0.005,
-        "Standard deviation that is added to those of detections, per axis; calibrated with simulated scans "
+        "Standard deviation that is added to the deviations of detections, per axis; calibrated with simulated scans "
         "of `vtbdrake_diagrams.forest` and an exact map.",
         unit="m",
         ge=0.0,
@@ -182,7 +182,7 @@ class Tracker:
                 f"no landmark of the map is certain within largest_deviation={self.largest_deviation:g} m: the best "
                 f"one has a standard deviation of {np.sqrt(variances.min()):g} m"
             )
-        # Variances of an expected detection, apart from that of the pose: of the landmark, of the bias and of the scan.
+        # Variances of an expected detection without the pose's: of the landmark, of the bias and of the scan.
         spread = variances[usable].astype(float) + self.bias_deviation**2 + self.scan_deviation**2
         association = Association(self.landmarks, usable, spread, self.field_of_view, self.gate, self.first_gate)
         object.__setattr__(self, "_association", association)
@@ -308,7 +308,7 @@ class Tracker:
             weights = np.linalg.solve(M[:n, :n], M[:n, n:])
             rest = M[n:, n:] - M[n:, :n] @ weights
             if probability is not None:
-                # The variance of the error of each landmark, given those of all others, times the factor.
+                # The variance of the error of each landmark, given the errors of all others, times the factor.
                 rest = rest + np.diag((factor - 1.0) / np.diagonal(np.linalg.inv(M))[n:])
             prior, J = np.kron(rest, np.eye(2)), np.kron(weights.T, np.eye(2))
             added = places[indices] + weights.T @ (state.landmark_positions - places[state.indices])
@@ -425,7 +425,7 @@ def _corrected(mean: Array, P: Array, step: Array) -> tuple[Array, Array]:
 
 
 def _rows_of(indices: Indices, values: Indices) -> Indices:
-    """Return where each of the values stands in indices, which have it once."""
+    """Return the positions of the values in indices, which have each value once."""
     order = np.argsort(indices)
     return order[np.searchsorted(indices, values, sorter=order)]
 

@@ -1,12 +1,12 @@
 """Trunks of trees from the points of one scan: the positions of their axes, and their diameters.
 
 A trunk is an object that returns most of the rows of rays that pass its place within a slice of heights over the
-ground, is as wide as a trunk, opaque, and has a surface as smooth as that of a cylinder. It is fitted as a leaning
+ground, is as wide as a trunk, opaque, and has a surface as smooth as a cylinder's. It is fitted as a leaning
 cylinder: horizontal sections are circles of one radius r, whose centres lie on a straight line, c(z) = c + l (z - z0)
 with z0 at breast height.
 
-Errors are those of the ranges along the rays. A ray at the azimuth a, with the horizontal unit vectors e along it and n
-to the left of it, meets a circle with the centre c at the horizontal distance
+Errors are errors of the ranges along the rays. A ray at the azimuth a, with the horizontal unit vectors e along it and
+n to the left of it, meets a circle with the centre c at the horizontal distance
 
     c·e - r cos i,    cos i = sqrt(1 - (c·n / r)²)
 
@@ -16,7 +16,7 @@ rays graze the trunk; therefore ranges are weighted by cos² i. Beyond some metr
 The azimuths of rays in steps s that hit a trunk are spread evenly over its angular width w, so w² = 12 var + s², and
 each of its edges is known to s / sqrt(12). The directions of both edges are measurements, asin(r / |c|) to either side
 of the axis, if no nearer object hides them. The lean l has a normal prior; beside the ranges, the slope of the azimuths
-over the heights measures it. Covariances are those of the weighted least squares, plus floors.
+over the heights measures it. Covariances come from the weighted least squares, plus floors.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array, Indices
+from vtbdrake.common.arrays import Array, Indices
+from vtbdrake.common.settings import setting
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.planar import rotations, wrap
-from vtbdrake.components.localization.scene import Cells, Clusters, ScanDetectorConfig, Scene
-from vtbdrake.settings import setting
+from vtbdrake.components.localization.scan_scene import Cells, Clusters, ScanDetectorConfig, ScanPoints
 
 # The number of layers of the slice, one bit each.
 _LAYERS = 8
 # Iterations of the fit to all points of a trunk, and then to those that lie on it.
 _ITERATIONS = (3, 4)
-# A point lies on a trunk if the error of its range is at most so many standard deviations.
+# A point lies on a trunk if the error of its range is at most this number of standard deviations.
 _GATE = 4.0
 # The largest sine of the angle of incidence with which ranges are predicted.
 _GRAZING = 0.98
@@ -46,11 +46,16 @@ _DEPTH = 0.1
 # A column of rays shows a face if it has at least this share of the hits of the fullest one: branches are hit in few
 # rows. Where no trunk is found with the first share, as among many branches, the second one is tried.
 _PERSISTENCE = (0.35, 0.65)
-# The hits of a face in one column lie within this depth, and what the noise adds. Columns are at least so wide. In m.
-_FACE, _COLUMN = 0.15, 0.03
-# A trunk is opaque: of the rays towards it, within this share of its radius, that end on it, behind it or less than
-# this distance (m) in front of it, this share ends on it.
-_INNER, _SURROUNDINGS, _OPAQUE = 0.85, 0.5, 0.8
+# The hits of a face in one column lie within this depth, and what the noise adds, in m.
+_FACE = 0.15
+# Least width of a column, in m.
+_COLUMN = 0.03
+# A trunk is opaque: of the rays towards it, at least this share ends on it.
+_OPAQUE = 0.8
+# Rays towards a trunk pass its axis within this share of its radius.
+_INNER = 0.85
+# They end on it, behind it, or less than this distance in front of it, in m.
+_SURROUNDINGS = 0.5
 # The more the error of an edge exceeds this number of standard deviations, the less it counts: it may be a branch.
 _DOUBT = 4.0
 # A negligible information in 1/m^2, which keeps matrices regular where no point is left.
@@ -59,7 +64,7 @@ _NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True)
 class TrunkDetectorConfig(ScanDetectorConfig):
-    """Settings of the detector of trunks, beside those of `ScanDetectorConfig`.
+    """Settings of the detector of trunks, in addition to `ScanDetectorConfig`.
 
     Trunks whose bark is less than two cells apart become one object, which is mostly rejected.
 
@@ -72,7 +77,7 @@ class TrunkDetectorConfig(ScanDetectorConfig):
     )
     outline: float = setting(
         0.0,
-        "Standard deviation of an edge of a trunk from that of the cylinder: lobes, stubs of branches, loose bark, "
+        "Standard deviation of an edge of a trunk from the cylinder's edge: lobes, stubs of branches, loose bark, "
         "what stands in front. It changes covariances only. Simulated trunks have none, real ones 0.05 to 0.2 m.",
         unit="m",
         ge=0.0,
@@ -99,14 +104,14 @@ class TrunkDetectorConfig(ScanDetectorConfig):
     )
     position_floor: float = setting(
         0.015,
-        "Standard deviation, per axis, that is added to that of the fit: the axis is not straight, and the "
+        "Standard deviation, per axis, that is added to the fit's: the axis is not straight, and the "
         "foot of the tree, which a map may give, is not right below. Assumed: leans of 0.01 rad.",
         unit="m",
         ge=0.0,
     )
     diameter_floor: float = setting(
         0.01,
-        "Standard deviation that is added to that of the fitted diameter, for taper and ovality.",
+        "Standard deviation that is added to the fitted diameter's, for taper and ovality.",
         unit="m",
         ge=0.0,
     )
@@ -126,7 +131,7 @@ def detect_trunks(points_H: ArrayLike, detector: TrunkDetectorConfig, *, p_HoLo_
     Raises:
         ValueError: The points have another shape, or are not finite.
     """
-    return _trunks(_upright(Scene.of(points_H, p_HoLo_H, detector), detector), detector, p_HoLo_H)
+    return _trunks(_upright(ScanPoints.of(points_H, p_HoLo_H, detector), detector), detector, p_HoLo_H)
 
 
 def detect_planar_trunks(
@@ -135,14 +140,14 @@ def detect_planar_trunks(
     """Find the trunks in the points of a planar scan: round, opaque objects of their width, apart from others.
 
     One row of rays does not show whether an object is upright, so that the map has to tell trunks from posts, legs and
-    corners: fewer detections are trunks than those of `detect_trunks`. A trunk takes three rays.
+    corners: fewer detections are trunks than with `detect_trunks`. A trunk takes three rays.
 
     Args:
         points_H: The points in the level frame H of the carrier, shape (n, 3) in m, in any order; their z is ignored.
         detector: The settings; the elevation step, the heights and the share of rows mean nothing here.
         p_HoLo_H: The position of the scanner at the time of H, shape (3,) in m.
-        field: The directions in H in rad of the last ray to the right and to the left. Objects are left out of which
-            these may show a part only.
+        field: The directions in H in rad of the last ray to the right and to the left. Objects are left out if these
+            may show a part of them only.
 
     Returns:
         The trunks in H, with the covariances of the fit and the floors. Edges that something nearer hides are not used.
@@ -154,7 +159,7 @@ def detect_planar_trunks(
     if not 0.0 < left - right <= 2.0 * pi:
         raise ValueError(f"field is the direction of the ray to the right, then that to the left, not {field!r}")
     detector = replace(detector, reference_height=float(np.mean(detector.heights)))
-    scene = Scene.planar(points_H, p_HoLo_H, detector, height=detector.reference_height)
+    scene = ScanPoints.planar(points_H, p_HoLo_H, detector, height=detector.reference_height)
     cells = Cells.of(scene.points, size=detector.cell, reach=detector.reach)
     clusters = Clusters(scene, *cells.connected(np.arange(len(scene))))
     if len(clusters.rows) and left - right < 2.0 * pi - detector.azimuth_step:
@@ -170,13 +175,13 @@ def _trunks(clusters: Clusters, detector: TrunkDetectorConfig, p_HoLo_H: ArrayLi
     for persistence in _PERSISTENCE:
         if not len(clusters.rows):
             break
-        fit = _Fit(clusters, detector, persistence)
+        fit = _CylinderFits(clusters, detector, persistence)
         trunks.append(fit.trunks(np.asarray(p_HoLo_H)[:2]))
         clusters = fit.rest
     return Landmarks.joined(trunks)
 
 
-def _upright(scene: Scene, detector: TrunkDetectorConfig) -> Clusters:
+def _upright(scene: ScanPoints, detector: TrunkDetectorConfig) -> Clusters:
     """Return the points that stand above each other in the slice."""
     low, high = detector.heights
     in_slice = np.flatnonzero((scene.heights >= low) & (scene.heights < high))
@@ -201,8 +206,8 @@ def _layers(heights: Array, detector: TrunkDetectorConfig) -> Indices:
     return layers
 
 
-def _passed(scene: Scene, rows: Indices, detector: TrunkDetectorConfig) -> Array:
-    """Return how many layers of the slice rays pass at these points, (n,): no more than the field of view has rows."""
+def _passed(scene: ScanPoints, rows: Indices, detector: TrunkDetectorConfig) -> Array:
+    """Return the number of layers that rays pass at these points, (n,): at most the rows of the field of view."""
     low, high = detector.heights
     heights, distances = scene.heights[rows], scene.distances[rows]
     eye_heights = heights - scene.points[rows, 2]
@@ -212,7 +217,7 @@ def _passed(scene: Scene, rows: Indices, detector: TrunkDetectorConfig) -> Array
     return passed
 
 
-class _Fit:
+class _CylinderFits:
     """The cylinders that are fitted to k clusters of points.
 
     Each has a frame of its own: x points from the scanner to its points, y to the left. A cylinder has the parameters
@@ -350,7 +355,7 @@ class _Fit:
         return filled.sum(axis=1) >= detector.upright_share * clusters.sums(passed) / clusters.counts
 
     def _on(self, cylinders: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Return which points are on the cylinders (n,), and their weighted squared errors (n,).
+        """Return a mask of the points on the cylinders (n,), and their weighted squared errors (n,).
 
         A point on a cylinder agrees with it in range and direction: branches lie beside a trunk at the same distance.
         """
@@ -376,7 +381,7 @@ class _Fit:
         return errors, cosine**2 / self._variance, np.stack([dx, dy, -1.0 / cosine, dx * z, dy * z], axis=1)
 
     def _edges(self, lean: Array, distance: Array, on: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array, Array]:
-        """Return what the azimuths of the points measure of the k trunks.
+        """Return measurements of the k trunks by the azimuths of the points.
 
         Args:
             lean: The leans of the trunks to the left in rad, (k,).

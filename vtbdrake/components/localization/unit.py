@@ -14,7 +14,8 @@ from math import inf, isfinite, nan
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.localization.constellation import ConstellationMap
 from vtbdrake.components.localization.dead_reckoning import DriftModel
 from vtbdrake.components.localization.landmarks import Landmarks
@@ -22,13 +23,18 @@ from vtbdrake.components.localization.planar import compose, inverse
 from vtbdrake.components.localization.submap import Submap
 from vtbdrake.components.localization.track_state import TrackState
 from vtbdrake.components.localization.tracking import Matches, Tracker
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import Codec
 from vtbdrake.state.codecs import codec_of
 
-SEARCHING, TRACKING, LOST, DOUBTFUL = range(4)
-"""The values of `Localization.status`: no pose yet; a pose; the pose was lost, and the unit searches again; the last
-scan does not show the place where the carrier should be, and the tracker waits for the next one."""
+# The values of `Localization.status`.
+SEARCHING = 0
+"""There is no pose yet."""
+TRACKING = 1
+"""There is a pose."""
+LOST = 2
+"""The pose was lost, and the unit searches again."""
+DOUBTFUL = 3
+"""The last scan does not show the place where the carrier should be, and the tracker waits for the next one."""
 
 # A pose by odometry with a number of this size or more, in m or rad, is a fault.
 _LARGEST = 1e9
@@ -67,7 +73,14 @@ class Localization:
     def unknown(
         cls, status: int = SEARCHING, *, time: float = -inf, X_OH: ArrayLike = (0.0, 0.0, 0.0), detected: int = 0
     ) -> Localization:
-        """Return an answer without a pose."""
+        """Return an answer without a pose.
+
+        Args:
+            status: `SEARCHING`, `LOST` or `DOUBTFUL`.
+            time: The time of the scan, in s; -inf before the first one.
+            X_OH: The pose of the odometry at that time, shape (3,) in m and rad.
+            detected: The number of detections.
+        """
         return cls(time, np.asarray(X_OH), np.full(3, nan), np.diag(np.full(3, inf)), status, detected)
 
 
@@ -118,7 +131,7 @@ class LocalizationUnit:
     )
     begins_with_submap: bool = setting(
         False,
-        "Whether tracking begins with all gathered landmarks instead of those of the last scan, for sensors of which "
+        "Whether tracking begins with all gathered landmarks instead of the last scan's, for sensors where "
         "one sample shows too few for a pose. Their errors are then assumed to be independent.",
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
 
 
 @immutable
@@ -39,7 +39,13 @@ class PoseEstimate:
 
     @staticmethod
     def of(X_AB: RigidTransform, covariance: ArrayLike, *, time: float) -> PoseEstimate:
-        """Return a valid estimate of X_AB at ``time`` (s) with the covariance (6, 6) of its error δ."""
+        """Return a valid estimate of X_AB at ``time`` (s) with the covariance (6, 6) of its error δ.
+
+        Args:
+            X_AB: The estimated pose.
+            covariance: The covariance of δ = [θ; d], in rad and m.
+            time: When the pose held, in s.
+        """
         return PoseEstimate(X_AB.GetAsMatrix34(), np.asarray(covariance, dtype=float), float(time))
 
     @staticmethod

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array, immutable, set_read_only
+from vtbdrake.common.arrays import Array, immutable, set_read_only
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.perception.estimate import (
     PoseEstimate,
     cross_matrix,
@@ -26,7 +27,6 @@ from vtbdrake.components.perception.estimate import (
 )
 from vtbdrake.components.perception.opencv import grey_image, opencv
 from vtbdrake.components.textures import textured_mesh
-from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.geometry import Mesh, SceneGraphInspector
@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from pydrake.systems.sensors import ImageRgba8U
 
 FAMILY_SIZE = 587  # The number of markers in 36h11.
-# The black square of a marker has 8 × 8 cells; it stands in a white frame one cell wide.
-_CELLS, _FRAMED = 8, 10
+# Cells along an edge of the black square of a marker.
+_CELLS = 8
+# Cells along an edge of the marker with its white frame, which is one cell wide.
+_FRAMED = 10
 _CELL_PIXELS = 8  # In the texture.
 _PROPERTY = ("markers", "size")
 
@@ -72,7 +74,12 @@ class MarkerBoard:
 
     @staticmethod
     def of(poses: Mapping[int, RigidTransform], *, size: float) -> MarkerBoard:
-        """Return the board of markers of one ``size`` (m) with the poses X_TM by id."""
+        """Return the board of markers of one ``size`` (m) with the poses X_TM by id.
+
+        Args:
+            poses: The pose X_TM of each marker on the body T, by its number in the family 36h11.
+            size: The edge length of the black squares, in m.
+        """
         return MarkerBoard(
             np.array(list(poses)), np.array([X_TM.GetAsMatrix34() for X_TM in poses.values()]), float(size)
         )
@@ -119,6 +126,10 @@ def add_markers(plant: MultibodyPlant, body: RigidBody, board: MarkerBoard, *, n
 
 def check_marker_size(board: MarkerBoard, inspector: SceneGraphInspector) -> None:
     """Check that the markers which `add_markers` put into a model are as large as a detector's board says.
+
+    Args:
+        board: The board of the detector.
+        inspector: The inspector of the scene with the model; other geometry is left out.
 
     Raises:
         ValueError: They are not.
@@ -181,7 +192,7 @@ class MarkerDetectorConfig:
     )
     upscaling: int = setting(
         1,
-        "Above 1, markers are also searched for in an image that is enlarged so many times: 2 finds more that are "
+        "Above 1, markers are also searched for in an image that is enlarged by this factor: 2 finds more that are "
         "narrower than 20 pixels, in two to three times the time.",
         ge=1,
         le=4,
@@ -271,7 +282,7 @@ def _search(grey: NDArray[np.uint8], detector: MarkerDetectorConfig, *, scale: i
 
 
 def _repeated(corners: Array, ids: NDArray[np.int64], first: Array, first_ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which markers (n, 4, 2) are among the first ones (m, 4, 2): the same ids, the middles within them."""
+    """Return a mask of the markers (n, 4, 2) among the first ones (m, 4, 2): the same ids, the middles within them."""
     gaps = np.linalg.norm(corners.mean(axis=1)[:, None] - first.mean(axis=1), axis=2)
     widths = np.linalg.norm(np.diff(first, axis=1), axis=2).max(axis=1, initial=0.0)
     return np.asarray(((ids[:, None] == first_ids) & (gaps < 0.5 * widths)).any(axis=1))
@@ -325,7 +336,7 @@ def fit_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
 
 
 def _intersections(p: Array, u: Array, q: Array, v: Array) -> Array:
-    """Return where the lines p + s u and q + t v meet, (..., 2)."""
+    """Return the points where the lines p + s u and q + t v meet, (..., 2)."""
     across = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     d = q - p
     s = (d[..., 0] * v[..., 1] - d[..., 1] * v[..., 0]) / np.where(np.abs(across) < 1e-9, 1e-9, across)
@@ -342,9 +353,12 @@ _APART = 16.8
 _NEAR = 0.4
 # Markers that are narrower in the image (in pixels) are left out: a cell then has hardly more than one pixel.
 _NARROWEST = 10.0
-# An edge deviates by this, over the marker's width across it, in pixels; its ends by so many times more to either side;
-# and the number of residuals that this counts for, beside those of an image.
-_DEVIATION, _TURN, _PRIOR_WEIGHT = 0.8, 2.0, 4.0
+# Standard deviation of an edge, over the marker's width across the edge, which is in pixels.
+_DEVIATION = 0.8
+# The ends of an edge deviate by this factor more, to either side.
+_TURN = 2.0
+# Number of residuals that this prior counts for, beside an image's residuals.
+_PRIOR_WEIGHT = 4.0
 
 
 def pose_from_markers(
@@ -369,7 +383,7 @@ def pose_from_markers(
 
     All edges may be shifted outwards by the same δ pixels, their corners by δ d_i, because a bright frame that is
     overexposed or smoothed grows into the black square. The covariance is s² (JᵀJ)⁻¹ with the Jacobian J of all terms
-    r, of which the rows and columns of the pose are taken. The smaller a marker is, the less exact are its edges:
+    r, restricted to the rows and columns of the pose. The smaller a marker is, the less exact are its edges:
     σ_k = 0.8 / w_k pixels at the width w_k of the marker across the edge, in pixels, somewhat more than in rendered
     images whose pixels are means (``supersampling``). By how much it is more or less in an image follows from its
     residuals: s² = (4 + r·r) / (4 + 2 n - 6) for n corners, as if 4 more residuals were as supposed. Markers that are
@@ -427,7 +441,7 @@ def pose_from_markers(
     if not fit.rms <= residual_limit:
         return PoseEstimate.missing(time=time)
     estimate = fit.estimate(fit.scale, time=time)
-    # Of a front view, both may be one minimum.
+    # In a front view, both may be one minimum.
     rival = next((pose for pose in (other, back) if pose is not None and _is_rival(pose, fit)), None)
     if rival is None:
         return estimate
@@ -450,7 +464,7 @@ def _widths(corners: Array) -> Array:
 
 
 def _edges(corners: Array) -> Array:
-    """Return the matrices that turn errors of the corners into those of the edges over their deviations, (n, 8, 8)."""
+    """Return the matrices that turn errors of corners into errors of edges over their deviations, (n, 8, 8)."""
     along = np.roll(corners, -1, axis=1) - corners
     normals = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-9)
@@ -473,7 +487,7 @@ def _outward(corners: Array) -> Array:
     return moved
 
 
-def _is_rival(pose: _Fit, best: _Fit) -> bool:
+def _is_rival(pose: _PoseFit, best: _PoseFit) -> bool:
     """Return whether a pose is nearly as likely as the best one, but outside of what its covariance allows."""
     estimate = best.estimate(best.scale, time=0.0)
     apart = estimate.error_to(pose.X_CT)
@@ -524,7 +538,7 @@ def _tilted_back(points: Array, X_CT: RigidTransform) -> RigidTransform:
     """Return the pose from which points in a plane look the same from afar: their depths are exchanged.
 
     With the line of sight d, a unit vector in C, and the plane's normal n in T, R' = (1 - 2 d dᵀ) R (1 - 2 n nᵀ).
-    Points that are in no plane have that of least squares.
+    Points that are in no plane have the normal of least squares.
     """
     middle = points.mean(axis=0)
     n, sight = np.linalg.svd(points - middle)[2][-1], X_CT @ middle
@@ -538,7 +552,7 @@ def _mirror(n: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _PoseFit:
     """A pose and a shift of the edges, and how well the corners fit to them.
 
     Attributes:
@@ -580,8 +594,8 @@ class _Fit:
         return PoseEstimate.of(self.X_CT, 0.5 * (covariance + covariance.T), time=time)
 
 
-def _fit_at(corners: _Corners, X_CT: RigidTransform, shift: float = 0.0) -> _Fit | None:
-    """Return how well the corners fit to a pose; None if it has a corner behind the camera."""
+def _fit_at(corners: _Corners, X_CT: RigidTransform, shift: float = 0.0) -> _PoseFit | None:
+    """Return the fit of the corners to a pose; None if it has a corner behind the camera."""
     fx, fy, cx, cy = corners.intrinsics
     turned = corners.points @ X_CT.rotation().matrix().T
     x, y, z = (turned + X_CT.translation()).T
@@ -594,13 +608,15 @@ def _fit_at(corners: _Corners, X_CT: RigidTransform, shift: float = 0.0) -> _Fit
     J = np.concatenate([-J_p @ cross_matrix(turned), J_p, corners.shift[:, :, None]], axis=2)
     error = (corners.pixels - expected).ravel()
     residual = np.append(corners.whitened(error), -shift)
-    return _Fit(corners, X_CT, shift, error, residual, np.vstack([corners.whitened(J.reshape(-1, 7)), np.eye(7)[6]]))
+    return _PoseFit(
+        corners, X_CT, shift, error, residual, np.vstack([corners.whitened(J.reshape(-1, 7)), np.eye(7)[6]])
+    )
 
 
 _MOST_STEPS = 15
 
 
-def _refine(corners: _Corners, start: RigidTransform) -> _Fit | None:
+def _refine(corners: _Corners, start: RigidTransform) -> _PoseFit | None:
     """Return the fit to the best pose near ``start``, or None if the steps lead to none."""
     X_CT, shift = start, 0.0
     for _ in range(_MOST_STEPS):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.lazy import extra_module
+from vtbdrake.common.extras import extra_module
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import ImageRgba8U

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
-from vtbdrake.settings import check_settings, setting
 
 
 @immutable
@@ -82,9 +82,9 @@ class Faces:
 
         The distances of points from a plane do not determine a motion within the plane; the edges do. The face is cut
         into strips. The first and the last point of a strip lie within the mean distance s of points from the edges, so
-        that their midpoint is that of the face to ± s / 2. The offset is the mean over the strips. If the rows of
-        points are parallel to an edge, the errors of all strips are equal: so the standard deviation is that of one
-        strip, s / √12 for a uniform distribution.
+        that their midpoint is the face's to ± s / 2. The offset is the mean over the strips. If the rows of
+        points are parallel to an edge, the errors of all strips are equal: so the standard deviation equals one
+        strip's, s / √12 for a uniform distribution.
 
         Args:
             points: Points in T, (n, 3) in m.
@@ -205,7 +205,7 @@ def register_points(
         registration: Noise and limits.
         deviation: The standard deviations of the start in rad and m. Motions that the points do not determine keep the
             start, and offsets along a face of more than four deviations are rejected. The covariance of the estimate
-            does not depend on it: it is that of a start with 0.3 rad and 0.3 m.
+            does not depend on it: it belongs to a start with 0.3 rad and 0.3 m.
 
     Returns:
         An estimate of X_AT; a missing one if too few points lie on the body.
@@ -259,7 +259,7 @@ def register_points(
 def misfit(points: ArrayLike, faces: Faces, X_AT: RigidTransform, *, eye: ArrayLike, limit: float) -> float:
     """Return the mean of min(d, limit)² over points with the distances d to the body at X_AT, in m².
 
-    Of several registrations, the one with the least misfit explains the points best.
+    The registration with the least misfit explains the points best.
 
     Args:
         points: Points in A, (n, 3) in m.
@@ -275,7 +275,7 @@ def misfit(points: ArrayLike, faces: Faces, X_AT: RigidTransform, *, eye: ArrayL
 
 
 def _jacobian(arms: Array, directions: Array) -> Array:
-    """Return how far points at ``arms`` from To move along ``directions`` per motion [θ; d] of T, (n, 6)."""
+    """Return the Jacobian of points at ``arms`` from To along ``directions`` by the motion [θ; d] of T, (n, 6)."""
     return np.concatenate([np.cross(arms, directions), directions], axis=1)
 
 

@@ -1,6 +1,6 @@
 """Distances from a pair of images, by the shift of each point between them.
 
-The images are those of two equal cameras with the same orientation, the right one beside the left one: a rectified
+The images come from two equal cameras with the same orientation, the right one beside the left one: a rectified
 pair. A point at the depth z is shifted by the disparity d = f b / z pixels (focal length f, baseline b). So an error of
 the disparity with the deviation sigma_d is one of the depth with sigma_z = z² sigma_d / (f b). OpenCV's semi-global
 matching (Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 30, 2008) compares the
@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.perception.opencv import grey_image, opencv
-from vtbdrake.settings import check_settings, setting
 
 if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo, ImageRgba8U
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class StereoCamera:
     """The geometry of a rectified pair of cameras.
 
-    The frame C is that of the left camera: x to the right, y down, z forward; the right one stands at [baseline, 0, 0]
+    The frame C is the left camera's: x to the right, y down, z forward; the right one stands at [baseline, 0, 0]
     in C. Pixels count as in Drake's `CameraInfo`: the centre of the first one is at (0.5, 0.5).
     """
 
@@ -46,6 +46,10 @@ class StereoCamera:
     @classmethod
     def of(cls, info: CameraInfo, *, baseline: float) -> StereoCamera:
         """Return the pair of two cameras with these intrinsics, ``baseline`` (m) apart.
+
+        Args:
+            info: The intrinsics of either camera, in pixels.
+            baseline: The distance of the cameras, in m.
 
         Raises:
             ValueError: The pixels are not square.
@@ -69,7 +73,12 @@ class StereoCamera:
         return depth
 
     def depth_deviation(self, depth: ArrayLike, *, disparity_deviation: float) -> Array:
-        """Return the standard deviation (m) of a depth (m) that is measured with a deviation in pixels."""
+        """Return the standard deviation (m) of a depth (m) that is measured with a deviation in pixels.
+
+        Args:
+            depth: The depth z_C in m, any shape.
+            disparity_deviation: The standard deviation of a measured disparity, in pixels.
+        """
         deviation: Array = np.square(depth) * disparity_deviation / (self.focal_length * self.baseline)
         return deviation
 
@@ -107,9 +116,7 @@ class StereoMatcher:
         "On upright surfaces all are alike.",
         choices=tuple(_MODES),
     )
-    uniqueness: int = setting(
-        10, "By how many per cent the best cost is better than that of any other disparity.", ge=0
-    )
+    uniqueness: int = setting(10, "By how many per cent the best cost is better than any other disparity's.", ge=0)
     symmetry: int = setting(
         1, "How far the disparities from left to right and from right to left may differ.", unit="pixels", ge=0
     )
@@ -139,7 +146,7 @@ class StereoMatcher:
         Unknown are most pixels that the right camera does not see, pixels without texture, and ambiguous ones. Not all
         wrong matches are found: beside the edges of near bodies three quarters are, and fewer where patterns repeat, in
         mirrors and in glass. In rendered images of textured walls less than 3 % of the disparities are off by more than
-        a pixel; expect more in those of real cameras.
+        a pixel; expect more in images of real cameras.
 
         Args:
             left: The image of the left camera: in colours, or an array (h, w) of greys.

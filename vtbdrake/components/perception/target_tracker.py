@@ -16,7 +16,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import RotationalInertia
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.casadi_system.kernel import Kernel
 from vtbdrake.components.casadi_system.rotations import exponential, quaternion, roll_pitch_yaw_angles
 from vtbdrake.components.estimation import kalman_update
@@ -25,7 +26,6 @@ from vtbdrake.components.perception.estimate import (
     rotation_matrix,
     rotation_vector,
 )
-from vtbdrake.settings import check_settings, setting
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT
 
@@ -86,7 +86,7 @@ class MotionModel:
     does between estimates that are dt apart: (I_max - I_min) / I_mid ω^2 sqrt(dt), 0.0012 rad/s^1.5 for principal
     moments of 1, 0.6 and 0.4 at 3 deg/s, five times a second.
 
-    The inertia is that of the body about its centre of mass, in T, of which only ratios matter.
+    The inertia is the body's about its centre of mass, in T; only its ratios matter.
     """
 
     rate_noise: float = setting(
@@ -100,7 +100,7 @@ class MotionModel:
     inertia: list[float] = setting(doc="[Ixx, Iyy, Izz, Ixy, Ixz, Iyz].", default_factory=lambda: list(SPHERE))
 
     def check(self) -> None:
-        """Raise ValueError if a setting is out of range, or the inertia is not that of a body."""
+        """Raise ValueError if a setting is out of range, or no body has this inertia."""
         check_settings(self)
         if len(self.inertia) != 6 or not RotationalInertia(*self.inertia).CouldBePhysicallyValid():
             raise ValueError(
@@ -116,11 +116,16 @@ class MotionModel:
         return Track(estimate.time, estimate.matrix[:, :3], estimate.matrix[:, 3], np.zeros(3), np.zeros(3), P)
 
     def predict(self, track: Track, time: float) -> Track:
-        """Return the track at a later (or the same) time."""
+        """Return the track at a later (or the same) time.
+
+        Args:
+            track: The track at its own time.
+            time: The later time, in s.
+        """
         return Track.of(_predicted().value(self._flight(track.numbers(), time)).copy())
 
     def present(self, track: Array, time: float) -> Array:
-        """Return where a track leads at another time, as one vector (21,).
+        """Return the pose and velocity of a track at another time, as one vector (21,).
 
         Args:
             track: The `Track.numbers`.
@@ -152,6 +157,10 @@ class MotionModel:
         it measures F(-Δt) x, with the process noise of Δt added to its own. This neglects the correlation of that noise
         with the track; the exact solution is in Bar-Shalom, "Update with out-of-sequence measurements in tracking",
         2002.
+
+        Args:
+            track: The track at its own time.
+            estimate: A valid estimate of the pose X_IT of the body.
         """
         covariance = estimate.covariance
         if estimate.time >= track.time:
@@ -180,12 +189,12 @@ _NOT_TURNED = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
 
 @dataclass(frozen=True)
 class _Flight:
-    """The symbols of a flight, of which kernels are made.
+    """The symbols of a flight, from which kernels are made.
 
     Attributes:
         track: `Track.numbers` at its start, (163, 1).
         flight: [R, ω, A, B] at its present end: with the error of attitude θ(0) at the start, and δL of the angular
-            momentum, which is that of all the flight, θ = A θ(0) + B δL. (30, 1).
+            momentum, which holds for all the flight, θ = A θ(0) + B δL. (30, 1).
         conditions: [the time at its end, the length of a step, the spectral densities of the angular acceleration and
             of the acceleration, the inertia], (10, 1).
     """
@@ -234,7 +243,7 @@ class _Flight:
         return F
 
     def kernel(self, name: str, *values: casadi.SX) -> Kernel:
-        """Return values as a kernel of the flight; those of matrices row after row."""
+        """Return values as a kernel of the flight; matrices are written row after row."""
         y = casadi.densify(casadi.vertcat(*(casadi.vec(value.T) if value.is_square() else value for value in values)))
         return Kernel(name, [self.track, self.flight, self.conditions], y, compile=None)
 
@@ -267,7 +276,7 @@ def _predicted() -> Kernel:
 
 @lru_cache
 def _looked_back() -> Kernel:
-    """Return what a late measurement measures: [the rows H of F for the pose, R, p, variances of the noise since]."""
+    """Return the kernel of a late measurement: [the rows H of F for the pose, R, p, variances of the noise since]."""
     f = _Flight()
     R, _, _, _ = f.end()
     H, since = f.transition()[:6, :], -f.duration()
@@ -277,7 +286,7 @@ def _looked_back() -> Kernel:
 
 @lru_cache
 def _present() -> Kernel:
-    """Return what `MotionModel.present` returns."""
+    """Return the kernel of `MotionModel.present`."""
     f = _Flight()
     (_, _, _, _, v, P), (R, w, _, _), p, dt = f.start(), f.end(), f.position(), f.duration()
     variances, shared = casadi.diag(P), casadi.diag(P[:6, 6:])
@@ -294,7 +303,8 @@ def _matrix(numbers: casadi.SX) -> casadi.SX:
     return casadi.reshape(numbers, n, n).T
 
 
-STATE_SIZE, STATUS_SIZE = 13, 4
+STATE_SIZE = 13
+STATUS_SIZE = 4
 
 
 def body_state(X_IT: RigidTransform, w: ArrayLike, v: ArrayLike) -> Array:

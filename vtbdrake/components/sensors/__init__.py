@@ -2,6 +2,7 @@
 
 from vtbdrake.components.sensors.encoders import JointEncoders, JointTachometers
 from vtbdrake.components.sensors.errors import ErrorModel
+from vtbdrake.components.sensors.floating_base import BasePoseSensor, BaseTwistSensor
 from vtbdrake.components.sensors.foot_contact import ContactSensor
 from vtbdrake.components.sensors.imu import Imu
 from vtbdrake.components.sensors.noise import normal_noise, stream_of, uniform_noise
@@ -9,6 +10,8 @@ from vtbdrake.components.sensors.reaction import ForceTorqueSensor, JointTorqueS
 from vtbdrake.components.sensors.sampled import SampledSensor, connect_to_plant
 
 __all__ = [
+    "BasePoseSensor",
+    "BaseTwistSensor",
     "ContactSensor",
     "ErrorModel",
     "ForceTorqueSensor",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import inf, isfinite
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from vtbdrake.arrays import immutable
+from vtbdrake.common.arrays import immutable
+from vtbdrake.common.settings import check_settings
 from vtbdrake.components.environment.haze import HAZE, hazed
 from vtbdrake.components.environment.light import LIGHT
 from vtbdrake.components.rendering import (
@@ -34,7 +35,7 @@ from vtbdrake.components.rendering import (
 )
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream, uniform_noise
-from vtbdrake.settings import check_settings
+from vtbdrake.components.sensors.sampled import SampledValues
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
@@ -47,8 +48,12 @@ if TYPE_CHECKING:
 
     from vtbdrake.components.environment import Haze, Light
 
+# The output ports.
+_COLOR = "color_image"
+_DEPTH = "depth_image"
 # Channels of a camera's stream of random numbers.
-_PIXEL_CHANNEL, _DROPOUT_CHANNEL = 0, 2
+_PIXEL_CHANNEL = 0
+_DROPOUT_CHANNEL = 2
 # What is too bright is rendered again with these parts of the exposure.
 _BRACKET = (4.0, 16.0, 64.0)
 
@@ -76,11 +81,11 @@ class Camera(AddressedSystem):
         - depth_image (only with ``depth``)
 
     The images are state: ImageRgba8U, and ImageDepth32F with Drake's conventions (metres along z_C, 0 if too close, inf
-    if too far). Reading them renders nothing. Before the initialization they are black; the initialization takes the
-    first image, so that readers at t = 0 get the scene. A reader that is updated at the same instant by an unrestricted
-    update (a `SlowPart`) gets the previous image, one with a discrete update the new one.
+    if too far). Reading them renders nothing. What is taken at an instant is seen by the updates after it, as with a
+    `SampledSensor`. Before the initialization the images are black; the initialization takes the first one, so that
+    updates at t = 0 see the scene.
 
-    The camera frame C is that of Drake: x to the right, y down, z forward. It is fixed to the body P of ``frame``, by
+    The camera frame C is Drake's: x to the right, y down, z forward. It is fixed to the body P of ``frame``, by
     default at ``frame``; the parameter ``pose``, [x, y, z, roll, pitch, yaw] of C in P, changes that. Drake's principal
     point (cx, cy) counts from the image's left upper corner, OpenCV's from the centre of its first pixel: half a pixel
     less.
@@ -91,28 +96,33 @@ class Camera(AddressedSystem):
     length: there is no motion blur. Haze veils by the distance along each ray. A surface within ``clipping_near`` of
     the camera is not seen.
 
-    The count y of a pixel is that of the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
+    The count y of a pixel follows the linear camera of the standard EMVA 1288 (release 3.1, 2016), with the expected
     count m, n of N(0, 1), full scale S = 255, and g the gain:
 
         y = clip(round(m + sigma n), 0, S),   sigma^2 = (g noise)^2 + g photon_noise^2 m / S
 
-    The pixels of a real camera count the light on their whole area, those of VTK that at their centres, smoothed along
-    edges such that bright areas grow into dark ones by up to 0.2 pixels where edges run along rows or columns. With
-    ``supersampling`` k, a pixel is the mean of k x k points, and this error k times smaller. The time for rendering
-    grows with k^2. Where subpixels count, as in measuring markers, take 2 or more.
+    The pixels of a real camera count the light on their whole area, the pixels of VTK the light at their centres,
+    smoothed along edges such that bright areas grow into dark ones by up to 0.2 pixels where edges run along rows or
+    columns. With ``supersampling`` k, a pixel is the mean of k x k points, and this error k times smaller. The time for
+    rendering grows with k^2. Where subpixels count, as in measuring markers, take 2 or more.
 
     A pixel saturates last: m is the sum of all light after shadows and haze, and may exceed S, up to 64 S. What is
     brighter than S is rendered again with a quarter of the exposure, as often as needed, so that m is known to 1 %.
-    noise is the standard deviation of the read noise, and photon_noise that of the shot noise of a pixel at full scale,
-    both at gain 1, in counts. So gain brightens both, exposure only the image. Errors are otherwise those of the
-    `ErrorModel`: latency in periods, and drop-out, after which the last image stays; all a function of the seed.
+    noise is the standard deviation of the read noise, and photon_noise the standard deviation of the shot noise of a
+    pixel at full scale, both at gain 1, in counts. So gain brightens both, exposure only the image. Other errors are as
+    in the `ErrorModel`: latency in periods, and drop-out, after which the last image stays; all a function of the seed.
 
     The variables ``seed``, ``noise``, ``photon_noise``, ``exposure``, ``gain``, ``lamp`` (the brightness of a white
     surface at 1 m before a lamp on the camera), ``pose``, ``intrinsics`` ([fx, fy, cx, cy] in pixels), ``latency`` and
     ``dropout`` are parameters.
 
     Each Context has its own copy of the scene, with its own renderer.
+
+    Attributes:
+        optional_inputs: Names of the input ports that need not be connected.
     """
+
+    optional_inputs: ClassVar[tuple[str, ...]] = ("light", "haze")
 
     def __init__(
         self,
@@ -215,14 +225,11 @@ class Camera(AddressedSystem):
         )
 
     def _declare_state(self, depth: bool, longest: int) -> None:
-        color_image = ImageRgba8U(self._width, self._height)
-        self._color: AbstractStateIndex = self.DeclareAbstractState(Value(color_image))
-        self.DeclareStateOutputPort("color_image", self._color)
-        self._depth: AbstractStateIndex | None = None
+        models: dict[str, ImageRgba8U | ImageDepth32F] = {_COLOR: ImageRgba8U(self._width, self._height)}
         if depth:
-            depth_image = ImageDepth32F(self._width, self._height)
-            self._depth = self.DeclareAbstractState(Value(depth_image))
-            self.DeclareStateOutputPort("depth_image", self._depth)
+            models[_DEPTH] = ImageDepth32F(self._width, self._height)
+        self._has_depth = depth
+        self._images = SampledValues(self, self.period, models)
         self._transit: AbstractStateIndex | None = None
         if longest:
             black = np.zeros((longest, self._height, self._width, 4), np.uint8)
@@ -290,7 +297,7 @@ class Camera(AddressedSystem):
         return CameraInfo(self._width, self._height, *self._settings.view(context).intrinsics)
 
     def render(self, context: Context) -> ImageRgba8U:
-        """Return what the camera sees at present, without noise; nothing in the context changes.
+        """Return the image that the camera sees at present, without noise; nothing in the context changes.
 
         Args:
             context: Context of the camera.
@@ -304,11 +311,16 @@ class Camera(AddressedSystem):
         return image
 
     def resume(self, context: Context, image: ImageRgba8U | ImageDepth32F) -> None:
-        """Continue like a camera that has shown ``image`` last, which also counts as the images in transit."""
+        """Continue like a camera that has shown ``image`` last, which also counts as the images in transit.
+
+        Args:
+            context: The Context of this camera, in the state of the world from which it continues.
+            image: The last colour image (RGBA), or the last depth image (m).
+        """
         is_color = isinstance(image, ImageRgba8U)
-        if not is_color and self._depth is None:
+        if not is_color and not self._has_depth:
             raise ValueError("Camera: there is no depth image to go on with")
-        context.SetAbstractState(self._color if is_color else self._depth, image)
+        self._images.resume(context, _COLOR if is_color else _DEPTH, image)
         if self._transit is None:
             return
         transit = context.get_abstract_state(int(self._transit)).get_value()
@@ -337,7 +349,7 @@ class Camera(AddressedSystem):
         unsaturated = illumination.shadows or haze.extinction or settings.noise or settings.photon_noise
         bracket = _BRACKET if unsaturated else ()
         expected = camera.color(SUN, bracket)
-        depth = camera.depth() if illumination.shadows or haze.extinction or self._depth is not None else None
+        depth = camera.depth() if illumination.shadows or haze.extinction or self._has_depth else None
         if depth is not None and illumination.shadows:
             direction = LIGHT.view(np.asarray(light)).direction
             shade(expected, camera, depth, direction=direction, reach=self._clipping_far)
@@ -348,7 +360,7 @@ class Camera(AddressedSystem):
             airlight = FULL_SCALE * illumination.exposure * haze.airlight
             veiled = hazed(expected, distance=distance, extinction=haze.extinction, airlight=airlight)
             expected = veiled.astype(np.float32)
-        if depth is None or self._depth is None:
+        if depth is None or not self._has_depth:
             return expected, None
         nearest, farthest = self._depth_range
         return expected, np.where(depth < nearest, 0.0, np.where(depth > farthest, inf, depth)).astype(np.float32)
@@ -380,7 +392,7 @@ class Camera(AddressedSystem):
     def _begin(self, context: Context, state: State) -> EventStatus:
         """Take the first image, which also counts as all earlier ones that are in transit."""
         color, depth = self._take(context, self._tick(context))
-        self._show(state, color, depth)
+        self._images.begin(state, self._as_images(color, depth))
         if self._transit is not None:
             count = context.get_abstract_state(int(self._transit)).get_value().color.shape[0]
             images = ImagesInTransit(np.stack([color] * count), np.stack([depth] * count))
@@ -402,13 +414,19 @@ class Camera(AddressedSystem):
         if not settings.dropout or settings.dropout <= uniform_noise(
             seed=int(settings.seed), stream=self._stream(), tick=tick, channel=_DROPOUT_CHANNEL
         ):
-            self._show(state, color, depth)
+            self._images.take(state, self._as_images(color, depth))
         return EventStatus.Succeeded()
 
-    def _show(self, state: State, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> None:
-        state.get_mutable_abstract_state(int(self._color)).get_mutable_value().mutable_data[:] = color
-        if self._depth is not None:
-            state.get_mutable_abstract_state(int(self._depth)).get_mutable_value().mutable_data[..., 0] = depth
+    def _as_images(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> dict[str, ImageRgba8U | ImageDepth32F]:
+        """Return Drake's images of these counts and distances, by output port."""
+        images: dict[str, ImageRgba8U | ImageDepth32F] = {_COLOR: ImageRgba8U(self._width, self._height)}
+        images[_COLOR].mutable_data[:] = color
+        if self._has_depth:
+            images[_DEPTH] = ImageDepth32F(self._width, self._height)
+            images[_DEPTH].mutable_data[..., 0] = depth
+        return images
 
 
 def connect_camera(
@@ -419,7 +437,15 @@ def connect_camera(
     light: Light | None = None,
     haze: Haze | None = None,
 ) -> None:
-    """Connect a camera with the scene that it sees, and with the light and the haze in it."""
+    """Connect a camera with the scene that it sees, and with the light and the haze in it.
+
+    Args:
+        builder: The builder of the Diagram with all of them.
+        camera: The camera.
+        scene_graph: The scene that it sees.
+        light: Sunlight and earth-shine; None for a white light from the camera.
+        haze: The haze; None for clear air.
+    """
     builder.Connect(scene_graph.get_query_output_port(), camera.GetInputPort("geometry_query"))
     for name, system in (("light", light), ("haze", haze)):
         if system is not None:
@@ -433,7 +459,7 @@ def _pose_of(query: QueryObject, frame_number: int) -> RigidTransform:
 
 
 def _counts(expected: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return what opaque pixels count, (h, w, 4): saturated and rounded. The argument is used up."""
+    """Return the counts of opaque pixels, (h, w, 4): saturated and rounded. The argument is used up."""
     counts = np.full((*expected.shape[:2], 4), 255, np.uint8)
     counts[..., :3] = np.rint(np.clip(expected, 0.0, FULL_SCALE, out=expected), out=expected)
     return counts

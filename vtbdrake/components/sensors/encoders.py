@@ -6,47 +6,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.systems.framework import Context, DiscreteValues
 
 from vtbdrake.components.sensors.errors import ErrorModel
-from vtbdrake.components.sensors.sampled import SampledSensor
+from vtbdrake.components.sensors.sampled import SampledSensor, StateSensor
 
 if TYPE_CHECKING:
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import Joint
 
 
-class _JointSensor(SampledSensor):
-    """Measures one entry of the plant's [q; v] for each of some joints.
-
-    Attributes:
-        entries: The places of what is measured in [q; v].
-    """
-
-    def __init__(
-        self,
-        signal: str,
-        plant: MultibodyPlant,
-        entries: Sequence[int],
-        *,
-        default: NDArray[np.float64],
-        period: float,
-        unit: str,
-        stream: int | None,
-        errors: ErrorModel | None,
-    ) -> None:
-        noise = {"noise": (len(entries), unit)}
-        super().__init__(signal, default=default, period=period, unit=unit, noise=noise, stream=stream, errors=errors)
-        self.entries = np.array(entries, dtype=int)
-        self._state_port = self.DeclareVectorInputPort("state", plant.num_multibody_states())
-
-    def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
-        x: NDArray[np.float64] = self._state_port.Eval(context)
-        return x.take(self.entries)
-
-
-class JointEncoders(_JointSensor):
+class JointEncoders(StateSensor):
     """Measures the positions of joints that have one degree of freedom.
 
     .. pydrake_system::
@@ -59,6 +28,10 @@ class JointEncoders(_JointSensor):
 
     ``state`` is the plant's [q; v]; ``joint_encoders`` holds one position (rad or m) per joint, in the order of
     ``joints``. Before the first sample it shows the plant's default positions.
+
+    Args:
+        plant: The finalized plant.
+        joints: The joints, of one degree of freedom each.
     """
 
     def __init__(
@@ -74,12 +47,22 @@ class JointEncoders(_JointSensor):
         positions = plant.GetDefaultPositions()  # Before Finalize it raises; position_start would raise SystemExit.
         entries = [joint.position_start() for joint in joints]
         default, unit = positions[entries], _unit(joints)
+        noise = {"noise": (len(entries), unit)}
         super().__init__(
-            "joint_encoders", plant, entries, default=default, period=period, unit=unit, stream=stream, errors=errors
+            "joint_encoders",
+            plant,
+            entries,
+            default=default,
+            period=period,
+            unit=unit,
+            noise=noise,
+            stream=stream,
+            errors=errors,
         )
+        self.entry_names = tuple(joint.name() for joint in joints)
 
 
-class JointTachometers(_JointSensor):
+class JointTachometers(StateSensor):
     """Measures the velocities of joints that have one degree of freedom.
 
     .. pydrake_system::
@@ -92,6 +75,10 @@ class JointTachometers(_JointSensor):
 
     ``state`` is the plant's [q; v]; ``joint_velocity`` holds one velocity (rad/s or m/s) per joint, in the order of
     ``joints``. Before the first sample it shows zeros.
+
+    Args:
+        plant: The finalized plant.
+        joints: The joints, of one degree of freedom each.
     """
 
     def __init__(
@@ -106,9 +93,19 @@ class JointTachometers(_JointSensor):
         _check_single(joints, self)
         entries = [plant.num_positions() + joint.velocity_start() for joint in joints]
         default, unit = np.zeros(len(joints)), _unit(joints, "/s")
+        noise = {"noise": (len(entries), unit)}
         super().__init__(
-            "joint_velocity", plant, entries, default=default, period=period, unit=unit, stream=stream, errors=errors
+            "joint_velocity",
+            plant,
+            entries,
+            default=default,
+            period=period,
+            unit=unit,
+            noise=noise,
+            stream=stream,
+            errors=errors,
         )
+        self.entry_names = tuple(joint.name() for joint in joints)
 
 
 def _unit(joints: Sequence[Joint], per: str = "") -> str:

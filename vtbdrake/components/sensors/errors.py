@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.arrays import immutable
+from vtbdrake.common.arrays import immutable
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.sensors.noise import normal_noise, random_stream, uniform_noise
-from vtbdrake.settings import setting
 from vtbdrake.state import AddressedSystem, Quantity
 
 # Channels of a sensor's stream; 0 is its white noise.
-_DRIFT_CHANNEL, _DROPOUT_CHANNEL, _OUTLIER_CHANNEL, _OUTLIER_SIZE_CHANNEL = 1, 2, 3, 4
+_DRIFT_CHANNEL = 1
+_DROPOUT_CHANNEL = 2
+_OUTLIER_CHANNEL = 3
+_OUTLIER_SIZE_CHANNEL = 4
 
-# The settings of so many contexts are kept.
+# Number of contexts whose settings are kept.
 _KEPT = 128
 
 
@@ -39,6 +42,9 @@ class ErrorModel:
     contaminated normal distribution (Tukey, "A survey of sampling from contaminated distributions", 1960).
 
     The values hold for all entries of the sensor; by address, they can be set entry by entry, and changed at any time.
+
+    Raises:
+        ValueError: A value is not possible.
     """
 
     noise: float = setting(0.0, "Standard deviation of white noise, in the unit of the signal.", ge=0.0)
@@ -63,13 +69,16 @@ class ErrorModel:
         le=2**53,
     )
 
+    def __post_init__(self) -> None:
+        check_settings(self)
+
     def without_chance(self) -> ErrorModel:
         """Return the model without its random errors, as predictions need it."""
         return replace(self, noise=0.0, drift=0.0, dropout=0.0, outlier_probability=0.0)
 
 
 @immutable
-class _Settings:
+class _ErrorSettings:
     """The parameters of an `ErrorStage`, as they are used. None: there is no such error."""
 
     seed: int
@@ -77,7 +86,7 @@ class _Settings:
     stream: int | None = None
     noise: NDArray[np.float64] | None = None
     bias: NDArray[np.float64] | None = None
-    # Of one step of the random walk.
+    # The drift of one step of the random walk.
     drift: NDArray[np.float64] | None = None
     quantization: NDArray[np.float64] | None = None
     latency: int = 0
@@ -159,10 +168,12 @@ class ErrorStage:
                 memory["in_transit"] = Quantity(np.tile(default, (self.longest, 1)), unit)
             self.memory = sensor.declare_discrete_state(**memory)
 
-    def _settings_of(self, values: bytes) -> _Settings:
+    def _settings_of(self, values: bytes) -> _ErrorSettings:
         parameters = self.parameters.vector.view(np.frombuffer(values))
         deviations = [getattr(parameters, name) for name in self.noise]
-        settings = _Settings(int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self.noise.values()))))
+        settings = _ErrorSettings(
+            int(parameters.seed), noise=_unless_zero(np.repeat(deviations, list(self.noise.values())))
+        )
         if self.has_model:
             settings = replace(
                 settings,
@@ -179,12 +190,23 @@ class ErrorStage:
         return settings
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
-        """Let ``y`` be in transit, throughout."""
+        """Let ``y`` be in transit, throughout.
+
+        Args:
+            context: The Context of the sensor.
+            y: The reading, shape (n,), in the sensor's unit.
+        """
         if self.has_model and self.longest:
             self.memory.mutable(context.get_mutable_discrete_state()).in_transit = y
 
     def apply(self, context: Context, state: DiscreteValues, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what the sensor shows when it measures ``y``."""
+        """Return the output of the sensor when it measures ``y``.
+
+        Args:
+            context: The Context of the sensor, at the time of the sample.
+            state: The discrete state that the update of the sensor sets, with the memory of the errors.
+            y: The measurement without errors, shape (n,), in the sensor's unit.
+        """
         settings = self._settings(self.parameters.array(context).tobytes())
         key: dict[str, int] = {}
         if settings.stream is not None:
@@ -199,7 +221,7 @@ class ErrorStage:
         context: Context,
         state: DiscreteValues,
         y: NDArray[np.float64],
-        settings: _Settings,
+        settings: _ErrorSettings,
         key: Mapping[str, int],
     ) -> NDArray[np.float64]:
         n, q = self._n, settings.quantization

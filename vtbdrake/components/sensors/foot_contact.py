@@ -33,8 +33,13 @@ class ContactSensor(SampledSensor):
 
     ``foot_contact`` has one entry per body, in the order of ``bodies``; what counts is the sum of the magnitudes of the
     forces of all its contacts, in point contact and hydroelastic contact. With a continuous plant the contact results
-    follow from its state; with a discrete one they are those of its last step, and empty between a restore and the next
-    step.
+    follow from its state; with a discrete one they come from its last step, and are empty between a restore and the
+    next step.
+
+    Args:
+        plant: The finalized plant.
+        bodies: The bodies that have a switch.
+        threshold: The force (N) above which a switch closes; a parameter of the Context.
     """
 
     def __init__(

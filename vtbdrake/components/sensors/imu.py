@@ -45,8 +45,12 @@ class Imu(SampledSensor):
     in a continuous plant, and empty after a restore in a discrete one). The first sample has no predecessor: it
     shows w = 0 and f = -R_WF' g, and so does the output before it, for the plant's default pose.
 
-    The parameter ``mount``, [x, y, z, roll, pitch, yaw], is the pose of F in B. Initially it is that of ``frame``;
+    The parameter ``mount``, [x, y, z, roll, pitch, yaw], is the pose of F in B. Initially it is the pose of ``frame``;
     moving ``frame`` afterwards does not change it.
+
+    Args:
+        plant: The finalized plant.
+        frame: A frame of the plant, at which the sensor begins.
     """
 
     def __init__(
@@ -74,6 +78,7 @@ class Imu(SampledSensor):
             stream=stream,
             errors=errors,
         )
+        self.entry_names = tuple(f"{quantity} {axis}" for quantity in ("rate", "force") for axis in "xyz")
         self._settings = self.declare_parameters(mount=Quantity(mount, "m, rad"))
         # Whether there was a sample; v_WF and q_WF (wxyz) at the last one.
         self._memory = self.declare_discrete_state(
@@ -98,7 +103,7 @@ class Imu(SampledSensor):
         return self._sample_into(self._memory.mutable_array(state), context)
 
     def _sample_into(self, memory: NDArray[np.float64], context: Context) -> NDArray[np.float64]:
-        """Return the measurement; ``memory`` is that of the last sample, and becomes that of this one."""
+        """Return the measurement; ``memory`` belongs to the last sample, and is overwritten for this one."""
         return sample(
             self._motion(context),
             orientation=self._orientation,
@@ -110,7 +115,12 @@ class Imu(SampledSensor):
         )
 
     def resume(self, context: Context, y: NDArray[np.float64]) -> None:
-        """Go on as `SampledSensor.resume` does; the motion up to now is one that was measured as ``y``."""
+        """Go on as `SampledSensor.resume` does; the motion up to now is one that was measured as ``y``.
+
+        Args:
+            context: The sensor's own context, which is changed.
+            y: The last measurement, [angular velocity (rad/s), specific force (m/s^2)] in F, shape (6,).
+        """
         super().resume(context, y)
         now = context.get_time()
         # The time since the last sample; what is due now has not been sampled yet.

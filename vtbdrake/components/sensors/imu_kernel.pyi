@@ -11,7 +11,7 @@ def sample(
     memory: NDArray[np.float64],
     period: float,
 ) -> NDArray[np.float64]:
-    """Return what an IMU measures, as [angular velocity, specific force] in its frame F, in rad/s and m/s^2.
+    """Return the measurement of an IMU: [angular velocity, specific force] in its frame F, in rad/s and m/s^2.
 
     Args:
         state: Numbers that hold the motion of the body B.
@@ -19,7 +19,7 @@ def sample(
         velocity: Index in ``state`` of the first of six: w_WB in rad/s, then v_WB in m/s.
         mount: The pose of F in B: [x, y, z, roll, pitch, yaw], in m and rad.
         g_W: The acceleration of free fall in m/s^2, shape (3,).
-        memory: Of the last sample, and overwritten: [1 if there was one, v_WF (3), q_WF (4)].
+        memory: The memory of the last sample, overwritten: [1 if there was one, v_WF (3), q_WF (4)].
         period: The sample period in s.
     """
 

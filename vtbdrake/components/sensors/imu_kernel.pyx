@@ -6,7 +6,7 @@ import numpy as np
 
 cimport numpy as cnp
 
-from vtbdrake.state.arrays cimport numbers, writable
+from vtbdrake.common.array_memory cimport numbers, writable
 
 cnp.import_array()
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from math import inf, pi, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,14 @@ from pydrake.systems.framework import (
     State,
 )
 
-from vtbdrake.arrays import Array, immutable
+from vtbdrake.common.arrays import Array, immutable
+from vtbdrake.common.scan import Scan
+from vtbdrake.common.settings import check_settings, declared_settings, setting
 from vtbdrake.components.environment.haze import HAZE, false_return_ranges, two_way_transmission
 from vtbdrake.components.perception.estimate import rotation_matrix
 from vtbdrake.components.sensors.errors import ErrorModel
 from vtbdrake.components.sensors.noise import noise_generator, random_stream
-from vtbdrake.scan import Scan
-from vtbdrake.settings import check_settings, declared_settings, setting
+from vtbdrake.components.sensors.sampled import SampledValues
 from vtbdrake.state import AddressedSystem, Codec, Quantity
 from vtbdrake.state.systems import POSE_UNIT, pose_from_array, pose_to_array
 
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 _ROUNDING = 1e-9
 # The fields of an `ErrorModel` that ranges have.
 _ERRORS = ("noise", "outlier_probability", "outlier_size", "bias", "quantization", "dropout", "seed")
+# The output port.
+_SCAN = "scan"
 # The channel of the scanner's stream of random numbers.
 _CHANNEL = 0
 
@@ -59,7 +62,7 @@ class LaserScannerConfig:
     elevation: float = setting(0.5, "Height of the field of view; 0 scans one row.", unit="rad", ge=0.0, le=pi)
     rows: int = setting(
         0,
-        "Number of beams, one above the other, that turn together about z_L, as those of a spinning scanner; 0 for "
+        "Number of beams, one above the other, that turn together about z_L, as in a spinning scanner; 0 for "
         "rows and columns at about equal angular distances, which are scanned row by row.",
         ge=0,
     )
@@ -102,7 +105,7 @@ _FIELDS = tuple(field.name for field in fields(LaserScannerConfig))
 
 
 @immutable
-class _Settings:
+class _ScannerSettings:
     """The parameters as they are used."""
 
     X_BL: RigidTransform
@@ -150,14 +153,13 @@ class LaserScanner(AddressedSystem):
     The scanner is updated in slices of time. At the end of a slice, all rays are cast that were fired during it, each
     at the poses at its own firing time, which follow from poses and velocities at the end of the slice; velocities are
     assumed to be constant during it. So a moving target is distorted as in reality, with an error of up to a h^2 / 2 at
-    an acceleration a in slices of length h. A scan is shown at the end of the slice in which it ends. A reader that is
-    updated at the same instant by an unrestricted update (a `SlowPart`) sees it one slice later. The frequency need not
-    divide that of the slices. Frequency, rays per second and rows may be changed at any time, and take effect with the
-    next scan.
+    an acceleration a in slices of length h. A scan is seen by the updates after the end of the slice in which it ends,
+    as with a `SampledSensor`. The frequency need not divide the slices' frequency. Frequency, rays per second and rows
+    may be changed at any time, and take effect with the next scan.
 
     A beam is reflected by a Lambertian surface at the distance r under the angle a of incidence. It is detected if the
     received power (Hoefle and Pfeifer, "Correction of laser scanning intensity data: data and
-    model-driven approaches", 2007) reaches that of a white, perpendicular surface at the largest range:
+    model-driven approaches", 2007) reaches the power from a white, perpendicular surface at the largest range:
 
         reflectivity cos(a) exp(-2 b r) / r^2 >= 1 / max_range^2        (b: extinction of the haze)
 
@@ -174,7 +176,12 @@ class LaserScanner(AddressedSystem):
     The fields of `LaserScannerConfig`, ``pose``, ``noise``, ``outlier_probability``, ``outlier_size``, ``bias``,
     ``quantization``, ``dropout`` and ``seed`` are parameters. ``scan_start``, ``scan_period``, ``scan_rows``,
     ``scan_columns``, ``scan_by_columns`` and ``fired`` (rays) of the present scan are state.
+
+    Attributes:
+        optional_inputs: Names of the input ports that need not be connected.
     """
+
+    optional_inputs: ClassVar[tuple[str, ...]] = ("haze",)
 
     def __init__(
         self,
@@ -236,7 +243,7 @@ class LaserScanner(AddressedSystem):
         )
 
     def _declare_state(self) -> None:
-        self._scan: AbstractStateIndex = self.DeclareAbstractState(Value(Scan.empty()))
+        self._scans = SampledValues(self, self.slice_period, {_SCAN: Scan.empty()})
         self._progress: AbstractStateIndex = self.DeclareAbstractState(Value(ScanInProgress()))
         self.codecs = {int(self._progress): _PROGRESS_CODEC}
         # The state of the present scan; with 0 rows, none has begun.
@@ -248,14 +255,13 @@ class LaserScanner(AddressedSystem):
             scan_by_columns=Quantity(),
             fired=Quantity(),
         )
-        self.DeclareStateOutputPort("scan", self._scan)
 
     def points_W(self, context: Context) -> Array:
         """Return the points of the last scan in the world, each where its ray was fired, in m, shape (n, 3).
 
         The scanner is assumed to have moved with its present velocity since the scan began.
         """
-        scan: Scan = context.get_abstract_state(int(self._scan)).get_value()
+        scan: Scan = self._scans.read(context, _SCAN)
         X_WL, V_WL = self._motion(context)
         ages = scan.stamp + scan.times - context.get_time()
         turns = rotation_matrix(np.outer(ages, V_WL.rotational()))
@@ -269,22 +275,27 @@ class LaserScanner(AddressedSystem):
         return X_WB @ X_BL, V_WB.Shift(X_WB.rotation() @ X_BL.translation())
 
     def resume(self, context: Context, scan: Scan) -> None:
-        """Set the last complete scan to ``scan``, and begin a new one."""
-        context.SetAbstractState(self._scan, scan)
+        """Set the last complete scan to ``scan``, and begin a new one.
+
+        Args:
+            context: The Context of this scanner, in the state of the world from which it continues.
+            scan: The last complete scan.
+        """
+        self._scans.resume(context, _SCAN, scan)
         context.SetAbstractState(self._progress, ScanInProgress())
         context.SetDiscreteState(self._present.index, self._present.vector.array())
 
-    def _calc_settings(self, context: Context) -> _Settings:
+    def _calc_settings(self, context: Context) -> _ScannerSettings:
         values = self._parameters.view(context)
         config = LaserScannerConfig(**{name: getattr(values, name) for name in _FIELDS})
         if float(config.rows).is_integer():
             config.rows = int(config.rows)
         config.check(self.slice_period)
-        errors = ErrorModel(**{name: getattr(values, name) for name in _ERRORS})
-        return _Settings(pose_from_array(values.pose), config, errors)
+        errors = ErrorModel(**{name: getattr(values, name) for name in _ERRORS} | {"seed": int(values.seed)})
+        return _ScannerSettings(pose_from_array(values.pose), config, errors)
 
     def _end_slice(self, context: Context, state: State) -> EventStatus:
-        settings: _Settings = self._settings(context)
+        settings: _ScannerSettings = self._settings(context)
         now = context.get_time()
         present = self._present.mutable(state.get_mutable_discrete_state())
         start, period = present.scan_start, present.scan_period
@@ -313,7 +324,7 @@ class LaserScanner(AddressedSystem):
                 break
             returns = ScanInProgress(slices).returns()
             scan = Scan(returns[:, :3], returns[:, 3], np.minimum(returns[:, 4] - period, 0.0), start + period)
-            state.get_mutable_abstract_state(int(self._scan)).set_value(scan)
+            self._scans.take(state, {_SCAN: scan})
             start, slices, fired = start + period, (), 0
             period, rows, columns, by_columns = _next_scan(settings.config)
         state.get_mutable_abstract_state(int(self._progress)).set_value(ScanInProgress(slices))
@@ -322,7 +333,7 @@ class LaserScanner(AddressedSystem):
         present.fired = fired
         return EventStatus.Succeeded()
 
-    def _is_random(self, context: Context, settings: _Settings) -> bool:
+    def _is_random(self, context: Context, settings: _ScannerSettings) -> bool:
         errors = settings.errors
         random = settings.config.divergence or errors.noise or errors.outlier_probability or errors.dropout
         return bool(random) or self._haze_port.HasValue(context)
@@ -330,12 +341,12 @@ class LaserScanner(AddressedSystem):
     def _fire(
         self,
         context: Context,
-        settings: _Settings,
+        settings: _ScannerSettings,
         generator: np.random.Generator,
         directions: Array,
         times: Array,
     ) -> tuple[NDArray[np.intp], Array]:
-        """Return which rays are reported, and their ranges (m).
+        """Return the indices of the rays that are reported, and their ranges (m).
 
         Args:
             context: The Context at the end of the slice.
@@ -376,7 +387,14 @@ class LaserScanner(AddressedSystem):
 def connect_laser_scanner(
     builder: DiagramBuilder, scanner: LaserScanner, plant: MultibodyPlant, *, haze: Haze | None = None
 ) -> None:
-    """Connect a laser scanner with its plant, and with the haze."""
+    """Connect a laser scanner with its plant, and with the haze.
+
+    Args:
+        builder: The builder of the Diagram with all of them.
+        scanner: The scanner.
+        plant: The plant that it is mounted on, for its pose and its motion.
+        haze: The haze; None for clear air.
+    """
     for name in ("body_poses", "body_spatial_velocities"):
         builder.Connect(plant.GetOutputPort(name), scanner.GetInputPort(name))
     if haze is not None:
@@ -404,7 +422,7 @@ def raster(rows: int, columns: int, azimuth: float, elevation: float, *, by_colu
         columns: Number of rays in each row, which follow each other from the right.
         azimuth: Width of the field of view about z, in rad.
         elevation: Height of the field of view, in rad.
-        by_columns: Whether all rays of a column are fired before those of the next, instead of row by row.
+        by_columns: Whether all rays of a column are fired before the next column's, instead of row by row.
     """
     up = elevation * (0.5 - (np.arange(rows) + 0.5) / rows)
     left = azimuth * ((np.arange(columns) + 0.5) / columns - 0.5)

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vtbdrake.components.sensors.noise_kernel import fill
 from vtbdrake.state.declarations import weakly
 from vtbdrake.state.systems import UNNAMED, class_name
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
 
-# A generator costs more than its samples: many ticks share one.
+# Many ticks share a counter: a call costs more than the samples of one tick.
 _BATCH = 512
 _KEPT = 128
 
@@ -31,28 +32,77 @@ def normal_noise(size: int, *, seed: int, stream: int, tick: int, channel: int =
 
     The generator is Philox 4x64, a function of a key and a counter (Salmon et al., "Parallel Random Numbers: As Easy as
     1, 2, 3", 2011). The key is (seed, stream). Ticks are drawn in batches, whose number is the counter's second word,
-    and the channel its third, so that the draws of one batch never reach those of the next.
+    and the channel its third, so that the draws of one batch never reach the next batch's.
+
+    Args:
+        size: Number of samples.
+        seed: Seed of the experiment.
+        stream: Number of the sensor's stream.
+        tick: Number of the sample in time.
+        channel: Number of the kind of noise within the sensor.
     """
     batch, place = divmod(tick, _ticks(size))
-    return _normal(size, seed, stream, batch, channel)[place]
+    return _batch(size, seed, stream, batch, channel, True)[place]
 
 
 def uniform_noise(*, seed: int, stream: int, tick: int, channel: int = 0) -> float:
-    """Return a sample of the uniform distribution over [0, 1), of the same generator as `normal_noise`."""
+    """Return a sample of the uniform distribution over [0, 1), of the same generator as `normal_noise`.
+
+    Args:
+        seed: Seed of the experiment.
+        stream: Number of the sensor's stream.
+        tick: Number of the sample in time.
+        channel: Number of the kind of noise within the sensor.
+    """
     batch, place = divmod(tick, _ticks(1))
-    return _uniform(seed, stream, batch, channel)[place]
+    return float(_batch(1, seed, stream, batch, channel, False)[place, 0])
+
+
+def noise_of_seeds(
+    size: int,
+    *,
+    seeds: NDArray[np.uint64],
+    stream: int,
+    ticks: NDArray[np.int64],
+    channel: int = 0,
+    normal: bool = True,
+) -> NDArray[np.float64]:
+    """Return the samples of `normal_noise` or `uniform_noise` for many seeds and ticks, shape (n, m, size).
+
+    Args:
+        size: Number of samples per tick; 1 for `uniform_noise`.
+        seeds: Seeds of the experiments, shape (n,).
+        stream: Number of the sensor's stream.
+        ticks: Numbers of the samples in time, shape (m,); quickly if they increase.
+        channel: Number of the kind of noise within the sensor.
+        normal: Whether the samples are normal; else uniform.
+    """
+    out = np.empty((len(seeds), len(ticks), size))
+    batches, places = np.divmod(ticks, _ticks(size))
+    fill(out, seeds, stream, batches.astype(np.uint64), places, channel, normal)
+    return out
 
 
 def noise_generator(*, seed: int, stream: int, tick: int, channel: int) -> np.random.Generator:
-    """Return a generator for the many random numbers of one tick, such as those of an image.
+    """Return a generator for the many random numbers of one tick, such as an image's noise.
 
     The stream's ``channel`` is its own: `normal_noise` and `uniform_noise` use the same generator.
+
+    Args:
+        seed: Seed of the experiment.
+        stream: Number of the sensor's stream.
+        tick: Number of the sample in time.
+        channel: Number of the kind of noise within the sensor.
     """
     return _generator(seed, stream, tick, channel)
 
 
 def random_stream(system: System, number: int | None) -> Callable[[], int]:
-    """Return a function that returns the random stream of a system: ``number``, or that of `stream_of` for None.
+    """Return a function that returns the random stream of a system: ``number``, or `stream_of` for None.
+
+    Args:
+        system: The system, which is not kept alive by the function.
+        number: The number of the stream, from 0 to 2^64 - 1; None for the one that follows from the system's name.
 
     Raises:
         ValueError: The number is no stream.
@@ -89,15 +139,13 @@ def _ticks(size: int) -> int:
 
 
 @lru_cache(_KEPT)
-def _normal(size: int, seed: int, stream: int, batch: int, channel: int) -> NDArray[np.float64]:
-    drawn = _generator(seed, stream, batch, channel).standard_normal((_ticks(size), size))
+def _batch(size: int, seed: int, stream: int, batch: int, channel: int, normal: bool) -> NDArray[np.float64]:
+    """Return the noise of all ticks of a batch, shape (ticks, size), read-only."""
+    ticks = np.arange(_ticks(size), dtype=np.int64) + batch * _ticks(size)
+    seeds = np.array([seed], dtype=np.uint64)
+    drawn = noise_of_seeds(size, seeds=seeds, stream=stream, ticks=ticks, channel=channel, normal=normal)[0]
     drawn.flags.writeable = False
     return drawn
-
-
-@lru_cache(_KEPT)
-def _uniform(seed: int, stream: int, batch: int, channel: int) -> list[float]:
-    return _generator(seed, stream, batch, channel).random(_ticks(1)).tolist()
 
 
 def _generator(seed: int, stream: int, batch: int, channel: int) -> np.random.Generator:

@@ -37,9 +37,13 @@ class ForceTorqueSensor(SampledSensor):
     Drake's reaction force F_CJc_Jc acts on the child; this is its opposite. Whatever the joint carries is in it:
     gravity and inertia of all bodies beyond.
 
-    In a discrete plant whose output ports are sampled, reaction forces are those of the last step, and empty between a
+    In a discrete plant whose output ports are sampled, reaction forces come from the last step, and are empty between a
     restore and the next step; copies continue exactly where the plant has ``use_sampled_output_ports=False``. Then, and
     in a continuous plant, they follow from state and actuation of the same instant.
+
+    Args:
+        plant: The finalized plant.
+        joint: The joint.
     """
 
     def __init__(
@@ -61,6 +65,7 @@ class ForceTorqueSensor(SampledSensor):
             stream=stream,
             errors=errors,
         )
+        self.entry_names = tuple(f"{quantity} {axis}" for quantity in ("torque", "force") for axis in "xyz")
         self._port = self.DeclareAbstractInputPort("reaction_forces", Value[list[SpatialForce]]())
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
@@ -82,6 +87,11 @@ class JointTorqueSensors(SampledSensor):
     ``joint_torque`` (N m, or N) holds for each of ``joints`` what its drive exerts on the child about or along the
     joint's axis: the drive's torque, less what accelerates its rotor. Before the first sample it shows ``initial``, a
     scalar or one torque per joint. About restored contexts, see `ForceTorqueSensor`.
+
+    Args:
+        plant: The finalized plant.
+        joints: The joints, revolute or prismatic.
+        initial: The reading before the first sample, a scalar or shape (n,).
     """
 
     def __init__(
@@ -100,6 +110,7 @@ class JointTorqueSensors(SampledSensor):
                     f"Joint '{joint.name()}' is {joint.type_name()}; JointTorqueSensors measures revolute and "
                     "prismatic joints."
                 )
+        self.entry_names = tuple(joint.name() for joint in joints)
         self.places = places(plant, joints)
         # In Jc and in the frame of the parent, an axis has the same components. A torque is the power at unit rate.
         self.motions = [_unit_velocity(joint) for joint in joints]
@@ -128,6 +139,11 @@ def _unit_velocity(joint: Joint) -> SpatialVelocity:
 
 
 def places(plant: MultibodyPlant, joints: Sequence[Joint]) -> list[int]:
-    """Return the places of the joints' forces in the plant's reaction forces, which follow the order of its joints."""
+    """Return the places of the joints' forces in the plant's reaction forces, which follow the order of its joints.
+
+    Args:
+        plant: The plant, finalized.
+        joints: Joints of the plant, in the order of the result.
+    """
     order = {int(index): k for k, index in enumerate(plant.GetJointIndices())}
     return [order[int(joint.index())] for joint in joints]

@@ -1,20 +1,20 @@
 """The semantic world model: objects with class, pose and attributes, from files and observations, to simulate in."""
 
-from vtbdrake.components.world_model.association import Sighting, associate, mahalanobis
 from vtbdrake.components.world_model.geojson import GeoJsonError, load_geojson, save_geojson
 from vtbdrake.components.world_model.geometry import Part, add_to_plant
 from vtbdrake.components.world_model.local_frame import LocalFrame
-from vtbdrake.components.world_model.model import WORLD_MODEL_CODEC, WorldModel
-from vtbdrake.components.world_model.objects import Quantity, Relation, WorldObject, position_estimate
+from vtbdrake.components.world_model.object_association import Sighting, associate, mahalanobis
+from vtbdrake.components.world_model.objects import AttributeValue, Relation, WorldObject, position_estimate
 from vtbdrake.components.world_model.observing import LifeCycleConfig, fused, observe
+from vtbdrake.components.world_model.world_model import WORLD_MODEL_CODEC, WorldModel
 
 __all__ = [
     "WORLD_MODEL_CODEC",
+    "AttributeValue",
     "GeoJsonError",
     "LifeCycleConfig",
     "LocalFrame",
     "Part",
-    "Quantity",
     "Relation",
     "Sighting",
     "WorldModel",

@@ -27,16 +27,17 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.json_data import plain
 from vtbdrake.components.perception.estimate import PoseEstimate
 from vtbdrake.components.world_model.local_frame import LocalFrame
-from vtbdrake.components.world_model.model import WorldModel
 from vtbdrake.components.world_model.objects import (
     CONFIRMED,
-    Quantity,
+    AttributeValue,
     Relation,
     WorldObject,
 )
+from vtbdrake.components.world_model.world_model import WorldModel
 from vtbdrake.state.archive import whole_file
 
 _Read = TypeVar("_Read")
@@ -101,12 +102,9 @@ def _feature(world_object: WorldObject, place: Array) -> dict[str, Any]:
         properties[name] = quantity.value
         if quantity.is_measured:
             properties[name + _DEVIATION] = quantity.deviation
-    covariance = [
-        [value if isfinite(value) else None for value in row] for row in world_object.pose.covariance.tolist()
-    ]
     properties |= {
         "orientation": json.dumps(world_object.X_WO.rotation().ToQuaternion().wxyz().tolist()),
-        "covariance": json.dumps(covariance),
+        "covariance": json.dumps(plain(world_object.pose.covariance)),
         "relations": json.dumps([asdict(relation) for relation in world_object.relations]),
     }
     geometry = {"type": "Point", "coordinates": place.tolist()}
@@ -122,9 +120,9 @@ def load_geojson(
 ) -> WorldModel:
     """Read a world model from a GeoJSON file.
 
-    Of the properties, only ``class`` is needed: others have the defaults of `WorldObject`, an orientation along W, and
-    a covariance that is infinite for the rotation and that of `deviation` for the position. A property that is null is
-    left out.
+    Only the property ``class`` is needed: others have the defaults of `WorldObject`, an orientation along W, and
+    a covariance that is infinite for the rotation and follows from `deviation` for the position. A property that is
+    null is left out.
 
     Args:
         path: The file.
@@ -139,7 +137,7 @@ def load_geojson(
     """
     try:
         data = json.loads(Path(path).read_text("utf-8-sig"), parse_constant=_reject, object_pairs_hook=_unique)
-        return _Reader(data, frame, units or {}, deviation).model()
+        return _GeoJsonReader(data, frame, units or {}, deviation).model()
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise GeoJsonError(f"{path}: no JSON in UTF-8, convert other formats to GeoJSON: {error}") from error
     except (ValueError, RecursionError) as error:
@@ -157,7 +155,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-class _Reader:
+class _GeoJsonReader:
     """Makes a model of what JSON gave."""
 
     def __init__(self, data: Any, frame: LocalFrame | None, units: Mapping[str, str], deviation: float) -> None:
@@ -181,12 +179,12 @@ class _Reader:
     def model(self) -> WorldModel:
         places = [self._named(number, self._place) for number in range(len(self._features))]
         # All at once: one at a time, this took a third of the time of reading.
-        self._positions = self._frame.from_geographic(np.array(places, dtype=float).reshape(-1, 3))
+        positions = self._frame.from_geographic(np.array(places, dtype=float).reshape(-1, 3))
         identities: set[str] = set()
-        return WorldModel(self._named(number, self._object, identities) for number in range(len(self._features)))
+        return WorldModel(self._named(k, self._object, positions[k], identities) for k in range(len(self._features)))
 
     def _named(self, number: int, read: Callable[..., _Read], *further: Any) -> _Read:
-        """Return what ``read(number, *further)`` returns; an error names the feature of this number."""
+        """Return the result of ``read(number, *further)``; an error names the feature of this number."""
         try:
             return read(number, *further)
         except (ValueError, TypeError, OverflowError) as error:
@@ -212,8 +210,8 @@ class _Reader:
             raise ValueError(f"its coordinates are degrees of longitude and latitude, not {longitude}, {latitude}")
         return [longitude, latitude, height]
 
-    def _object(self, number: int, identities: set[str]) -> WorldObject:
-        """Return the object of a feature; its identity joins those that were ``seen``."""
+    def _object(self, number: int, position: Array, identities: set[str]) -> WorldObject:
+        """Return the object of a feature at a position (m); its identity joins the ``identities`` before it."""
         feature = self._features[number]
         properties = feature.get("properties")
         if not isinstance(properties, dict):
@@ -232,7 +230,7 @@ class _Reader:
         return WorldObject(
             str(identity),
             kind,
-            self._pose(self._positions[number], properties),
+            self._pose(position, properties),
             attributes=self._attributes(properties),
             relations=_relations(_plain(properties.get("relations", []))),
             source=_text(properties, "source", ""),
@@ -263,8 +261,8 @@ class _Reader:
             raise ValueError(f"its time is a number in seconds, not {time!r}")
         return PoseEstimate.of(RigidTransform(rotation, position), covariance, time=time)
 
-    def _attributes(self, properties: Mapping[str, Any]) -> dict[str, Quantity]:
-        attributes: dict[str, Quantity] = {}
+    def _attributes(self, properties: Mapping[str, Any]) -> dict[str, AttributeValue]:
+        attributes: dict[str, AttributeValue] = {}
         names = [name for name in properties if name not in _OWN]
         for name in names:
             value = properties[name]
@@ -273,7 +271,7 @@ class _Reader:
                 if owner not in properties:
                     raise ValueError(f"its property {name} is the deviation of an attribute that it does not have")
             elif isinstance(value, str):
-                attributes[name] = Quantity(value)
+                attributes[name] = AttributeValue(value)
             elif not _are_numbers([value]):
                 raise ValueError(f"its attribute {name} is a number or a text, not {value!r}")
             elif name not in self._units:
@@ -283,7 +281,7 @@ class _Reader:
                 if not _are_numbers([deviation]):
                     raise ValueError(f"its property {name}{_DEVIATION} is a number, not {deviation!r}")
                 try:
-                    attributes[name] = Quantity(value, self._units[name], deviation)
+                    attributes[name] = AttributeValue(value, self._units[name], deviation)
                 except ValueError as error:
                     raise ValueError(f"its attribute {name}: {error}") from error
         return attributes

@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING
 
 from pydrake.math import RigidTransform
 
-from vtbdrake.components.world_model.model import WorldModel
 from vtbdrake.components.world_model.objects import WorldObject
+from vtbdrake.components.world_model.world_model import WorldModel
 
 if TYPE_CHECKING:
     from pydrake.geometry import Shape
     from pydrake.multibody.plant import MultibodyPlant
 
-# Of a crown without its own attributes, as shares of the tree's height; assumed.
-_CROWN_BASE, _CROWN_DIAMETER = 0.45, 0.2
+# Height at which a crown without its own attributes begins, as a share of the tree's height; assumed.
+_CROWN_BASE = 0.45
+# Diameter of a crown without its own attributes, as a share of the tree's height; assumed.
+_CROWN_DIAMETER = 0.2
 
-_BARK, _LEAVES, _STONE, _FOIL = (
-    (0.36, 0.27, 0.2, 1.0),
-    (0.2, 0.42, 0.2, 1.0),
-    (0.45, 0.43, 0.4, 1.0),
-    (0.7, 0.6, 0.3, 1.0),
-)
+_BARK = (0.36, 0.27, 0.2, 1.0)
+_LEAVES = (0.2, 0.42, 0.2, 1.0)
+_STONE = (0.45, 0.43, 0.4, 1.0)
+_FOIL = (0.7, 0.6, 0.3, 1.0)
 
 
 @dataclass(frozen=True)

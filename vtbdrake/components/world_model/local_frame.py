@@ -8,7 +8,7 @@ from math import isfinite, radians
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 
 # The ellipsoid of WGS84 (NIMA TR8350.2): semi-major axis in m, flattening.
 _A = 6378137.0

@@ -14,10 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
 from vtbdrake.components.perception.estimate import PoseEstimate
 
-TENTATIVE, CONFIRMED, REVISED, RETIRED = STATUSES = ("tentative", "confirmed", "revised", "retired")
+TENTATIVE = "tentative"
+CONFIRMED = "confirmed"
+REVISED = "revised"
+RETIRED = "retired"
+STATUSES = (TENTATIVE, CONFIRMED, REVISED, RETIRED)
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 _SYMBOL = r"(?:kg|mol|cd|rad|Pa|Hz|[msAKNJWV])(?:\^-?\d+)?"
@@ -25,7 +29,7 @@ _UNIT = re.compile(rf"1|(?:1|{_SYMBOL})(?:[*/]{_SYMBOL})*")
 
 
 @dataclass(frozen=True)
-class Quantity:
+class AttributeValue:
     """The value of an attribute.
 
     Attributes:
@@ -105,7 +109,7 @@ class WorldObject:
     identity: str
     kind: str
     pose: PoseEstimate
-    attributes: Mapping[str, Quantity] = field(default_factory=dict)
+    attributes: Mapping[str, AttributeValue] = field(default_factory=dict)
     relations: tuple[Relation, ...] = ()
     source: str = ""
     status: str = CONFIRMED
@@ -195,14 +199,19 @@ def position_estimate(
 
 
 def finite_part(covariance: Array) -> NDArray[np.bool_]:
-    """Return which of the six components [rotation; translation] a covariance (6, 6) says something about."""
+    """Return a mask (6,) of the components [rotation; translation] with a finite variance in a covariance (6, 6)."""
     return np.isfinite(np.diag(covariance))
 
 
 def check_pose(owner: str, pose: PoseEstimate) -> None:
-    """Raise a ValueError if a pose is not an estimate whose covariance is one, possibly infinite in some components."""
+    """Raise a ValueError if a pose is not an estimate whose covariance is one, possibly infinite in some components.
+
+    Args:
+        owner: Whose pose it is, for the error message.
+        pose: The pose, with the covariance (6, 6) in rad and m.
+    """
     if not pose.valid:
-        raise ValueError(f"the pose of {owner} is missing: leave objects out of which no pose is known")
+        raise ValueError(f"the pose of {owner} is missing: leave out objects without a known pose")
     if not np.isfinite(pose.matrix).all() or not isfinite(pose.time):
         raise ValueError(f"pose and time of {owner} are finite numbers")
     part = finite_part(pose.covariance)
@@ -211,6 +220,8 @@ def check_pose(owner: str, pose: PoseEstimate) -> None:
         raise ValueError(f"the covariance of {owner} has variances of at least 0, not {diagonal}")
     if part[:3].any() and not part[:3].all():
         raise ValueError(f"the variances of the rotation of {owner} are all finite or all infinite, not {diagonal[:3]}")
+    if np.count_nonzero(pose.covariance) == np.count_nonzero(diagonal):
+        return  # A diagonal matrix, as most maps have it: variances of at least 0 are all that it needs.
     block = pose.covariance[np.ix_(part, part)]
     mixed = pose.covariance[~np.outer(part, part) & ~np.eye(6, dtype=bool)]
     scale = float(np.max(np.abs(block), initial=0.0))
@@ -220,11 +231,16 @@ def check_pose(owner: str, pose: PoseEstimate) -> None:
         raise ValueError(f"the covariance of {owner} is not positive semidefinite")
 
 
-def checked_attributes(owner: str, attributes: Mapping[str, Quantity]) -> Mapping[str, Quantity]:
-    """Return a read-only copy of the attributes, after a check of their names and types."""
+def checked_attributes(owner: str, attributes: Mapping[str, AttributeValue]) -> Mapping[str, AttributeValue]:
+    """Return a read-only copy of the attributes, after a check of their names and types.
+
+    Args:
+        owner: Whose attributes they are, for the error message.
+        attributes: The attributes by name, an identifier in lower case.
+    """
     for name, quantity in attributes.items():
         if not _NAME.fullmatch(name):
             raise ValueError(f"the attribute {name!r} of {owner} is not named like an identifier in lower case")
-        if not isinstance(quantity, Quantity):
-            raise ValueError(f"the attribute {name} of {owner} is a Quantity, not {quantity!r}")
+        if not isinstance(quantity, AttributeValue):
+            raise ValueError(f"the attribute {name} of {owner} is a AttributeValue, not {quantity!r}")
     return MappingProxyType(dict(attributes))

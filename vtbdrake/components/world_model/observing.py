@@ -8,21 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from vtbdrake.arrays import Array
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.components.estimation import kalman_update, one_to_one, weighted_mean
 from vtbdrake.components.perception.estimate import PoseEstimate, rotation_matrix
-from vtbdrake.components.world_model.association import Sighting, associate, check_units
-from vtbdrake.components.world_model.model import WorldModel
+from vtbdrake.components.world_model.object_association import Sighting, associate, check_units
 from vtbdrake.components.world_model.objects import (
     CONFIRMED,
     RETIRED,
     REVISED,
     TENTATIVE,
-    Quantity,
+    AttributeValue,
     WorldObject,
     finite_part,
 )
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.components.world_model.world_model import WorldModel
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _moved(prior: PoseEstimate, delta: Array) -> Array:
     return np.column_stack([rotation, prior.matrix[:, 3] + delta[3:]])
 
 
-def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[str, Quantity]:
+def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[str, AttributeValue]:
     """Return attributes after a sighting: measured numbers are fused, exact ones and texts are kept, new ones added."""
     attributes = dict(world_object.attributes)
     for name, measured in sighting.attributes.items():
@@ -175,7 +175,7 @@ def _fused_attributes(world_object: WorldObject, sighting: Sighting) -> Mapping[
             value, deviation = weighted_mean(
                 float(prior.value), prior.deviation, float(measured.value), measured.deviation
             )
-            attributes[name] = Quantity(value, prior.unit, deviation)
+            attributes[name] = AttributeValue(value, prior.unit, deviation)
     return attributes
 
 

@@ -4,7 +4,7 @@ Unmodified LCM clients connect to it: ``lcm.LCM(hub.url)``, ``DrakeLcm(hub.url)`
 byte for byte, to all clients that subscribed to its channel, including the publisher. It listens on loopback by
 default.
 
-* **Admission.** Clients of the hub's own user and of root may connect, and those of ``users`` (or ``all_users``). LCM
+* **Admission.** Clients of the hub's own user and of root may connect, and clients of ``users`` (or ``all_users``). LCM
   has no authentication: the kernel reports the user of a client. Beyond loopback it cannot, and every client is
   admitted. A rejected client is sent the reason.
 * **Isolation.** The hub never waits for a client.
@@ -43,9 +43,9 @@ default.
   sending cycle.
 """
 
-from vtbdrake.lcm.hub.process import Hub, HubError, serve
+from vtbdrake.lcm.hub.hub_process import Hub, HubError, serve
+from vtbdrake.lcm.hub.hub_server import HubAddressError, HubConfig, HubServer
 from vtbdrake.lcm.hub.routing import ChannelStatistics, HubStatistics
-from vtbdrake.lcm.hub.server import HubAddressError, HubConfig, HubServer
 from vtbdrake.lcm.hub.tcpq import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, client_name
 
 __all__ = [

@@ -58,7 +58,7 @@ class ClientConnection:
 
     @property
     def memory(self) -> int:
-        """Return how many bytes the hub keeps for the client: its backlog and its incomplete message."""
+        """Return the number of bytes that the hub keeps for the client: its backlog and its incomplete message."""
         return self.queued + self.reader.buffered
 
     def acknowledge(self) -> None:
@@ -71,6 +71,10 @@ class ClientConnection:
 
     def send(self, messages: list[bytes | bytearray], now: float) -> int:
         """Send messages, and queue what cannot be sent at once.
+
+        Args:
+            messages: The messages as they are on the wire, in this order.
+            now: The time on the hub's clock, in seconds.
 
         Returns:
             Number of messages that were dropped because the backlog exceeded ``max_queue``.

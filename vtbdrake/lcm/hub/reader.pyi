@@ -1,5 +1,5 @@
+from vtbdrake.common.streams import Stream
 from vtbdrake.lcm.hub.tcpq import Record
-from vtbdrake.streams import Stream
 
 def publish_record(channel: bytes, data: bytes) -> bytes: ...
 

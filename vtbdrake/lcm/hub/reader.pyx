@@ -7,7 +7,7 @@ from libc.string cimport memcpy
 
 from vtbdrake.lcm.byte_order cimport get_uint32, put_uint32
 from vtbdrake.lcm.hub.tcpq import MAGIC_CLIENT, MAX_CHANNEL, VERSION, RecordType, TcpqError
-from vtbdrake.streams cimport Stream
+from vtbdrake.common.streams cimport Stream
 
 cdef Py_ssize_t _MAX_CHANNEL = MAX_CHANNEL
 cdef uint32_t _GREETING = RecordType.GREETING

@@ -16,37 +16,59 @@ from vtbdrake.lcm.hub.tcpq import RecordType
 
 _log = logging.getLogger(__package__)
 
-# Clients may publish on any number of channels; the subscribers of at most so many are remembered.
+# Largest number of channels whose subscribers are remembered; clients may publish on any number.
 _MAX_ROUTES = 4096
 
-# Cost of handling a record, and of one on a channel whose subscribers must be found first, in the same unit.
-_RECORD, _NEW_CHANNEL = 1, 16
+# Cost of handling a record.
+_RECORD = 1
+# Cost of handling a record on a channel whose subscribers must be found first, in the same unit.
+_NEW_CHANNEL = 16
 
 
 @dataclass
 class ChannelStatistics:
-    """Statistics of a protected channel."""
+    """Statistics of a protected channel.
 
-    owner: str | None = None  # name of the owner, also of one that has disconnected until its lease expires
-    lease_over: bool = False  # whether the owner's lease has expired
-    refused: int = 0  # rejected publications and rejected requests to take over the channel
-    last_refused: str | None = None  # name of the client that was rejected last
-    taken: int = 0  # times that the channel was taken over from an owner whose lease had expired
+    Attributes:
+        owner: Name of the owner, also of one that has disconnected until its lease expires.
+        lease_over: Whether the owner's lease has expired.
+        refused: Rejected publications and rejected requests to take over the channel.
+        last_refused: Name of the client that was rejected last.
+        taken: Times that the channel was taken over from an owner whose lease had expired.
+    """
+
+    owner: str | None = None
+    lease_over: bool = False
+    refused: int = 0
+    last_refused: str | None = None
+    taken: int = 0
 
 
 @dataclass
 class HubStatistics:
-    """Statistics of a hub since its start."""
+    """Statistics of a hub since its start.
 
-    clients: int = 0  # connected clients
-    messages: int = 0  # accepted publications
-    volume: int = 0  # size of the accepted publications on the wire, in bytes
-    delivered: int = 0  # messages that were sent, or queued to be sent, to a client
-    dropped: int = 0  # messages that were dropped from the backlogs of slow clients
-    queued: int = 0  # size of all backlogs, in bytes
-    refused: int = 0  # rejected publications
-    disconnected: dict[str, int] = field(default_factory=dict)  # disconnected and rejected clients by reason
-    protected: dict[str, ChannelStatistics] = field(default_factory=dict)  # by channel
+    Attributes:
+        clients: Connected clients.
+        messages: Accepted publications.
+        volume: Size of the accepted publications on the wire, in bytes.
+        delivered: Messages that were sent, or queued to be sent, to a client.
+        dropped: Messages that were dropped from the backlogs of slow clients.
+        queued: Size of all backlogs, in bytes.
+        refused: Rejected publications.
+        disconnected: Disconnected and rejected clients by reason.
+        protected: The statistics of protected channels, by channel.
+    """
+
+    clients: int = 0
+    messages: int = 0
+    volume: int = 0
+    delivered: int = 0
+    dropped: int = 0
+    queued: int = 0
+    refused: int = 0
+    disconnected: dict[str, int] = field(default_factory=dict)
+    protected: dict[str, ChannelStatistics] = field(default_factory=dict)
 
     def to_json(self) -> bytes:
         """Return one line of JSON in UTF-8."""
@@ -77,7 +99,12 @@ class ProtectedChannel:
         self._statistics = ChannelStatistics()
 
     def publish(self, client: ClientConnection, now: float) -> bool:
-        """Decide about a publication; return whether it is accepted."""
+        """Decide about a publication; return whether it is accepted.
+
+        Args:
+            client: The client that publishes.
+            now: The time on the hub's clock, in seconds.
+        """
         self.keep(client, now)
         if client is self.owner:
             return True
@@ -85,14 +112,24 @@ class ProtectedChannel:
         return False
 
     def keep(self, client: ClientConnection, now: float) -> None:
-        """Renew the owner's lease; a client that is not the owner gets the channel only if it is free."""
+        """Renew the owner's lease; a client that is not the owner gets the channel only if it is free.
+
+        Args:
+            client: The client that has asked to keep the channel, or has published on it.
+            now: The time on the hub's clock, in seconds, from which the lease counts.
+        """
         if client is self.owner:
             self._renewed = now
         elif self.owner is None and self._lease_over(now):
             self._set_owner(client, now)
 
     def take_over(self, client: ClientConnection, now: float) -> bool:
-        """Decide about a request to take over the channel; return whether the client is the owner now."""
+        """Decide about a request to take over the channel; return whether the client is the owner now.
+
+        Args:
+            client: The client that asks for the channel.
+            now: The time on the hub's clock, in seconds.
+        """
         if self.owner is not None and client is not self.owner:
             if not self._lease_over(now):
                 self._reject(client, "takeover")
@@ -155,6 +192,10 @@ class _Route(NamedTuple):
 class Router:
     """Decides for every record where it goes; it neither reads nor writes sockets.
 
+    Args:
+        protect: The names of the protected channels.
+        lease: How long an owner that is silent keeps a protected channel, in seconds.
+
     Attributes:
         outgoing: Messages to send, by client: those that arrive together leave together, so that the client wakes up
             once. The server sends and removes them.
@@ -175,7 +216,12 @@ class Router:
         self._clients.append(client)
 
     def remove(self, client: ClientConnection, reason: str) -> None:
-        """Remove a client that has disconnected."""
+        """Remove a client that has disconnected.
+
+        Args:
+            client: The client.
+            reason: Why it disconnected, as `HubStatistics` counts it, such as ``closed`` or ``lost``.
+        """
         self._clients.remove(client)
         self._routes.clear()
         self.count_disconnected(reason)
@@ -189,6 +235,11 @@ class Router:
 
     def handle(self, client: ClientConnection, record: tcpq.Record, now: float) -> int:
         """Handle a record of a client.
+
+        Args:
+            client: The client that has sent the record.
+            record: Kind, channel and content of the record.
+            now: The time on the hub's clock, in seconds.
 
         Returns:
             Cost of handling it: 1, or 16 if the subscribers of a channel had to be found.

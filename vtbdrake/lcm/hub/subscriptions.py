@@ -25,11 +25,15 @@ _PARTS = re.compile(rf"({_ATOM})({_REPETITION}?)")
 
 
 class Pattern(NamedTuple):
-    """A compiled pattern that can match more than one channel."""
+    """A compiled pattern that can match more than one channel.
 
-    # returns something true for a channel that matches, as liblcm decides: ``^pattern$`` is found in it
+    Attributes:
+        matches: Returns something true for a channel that matches, as liblcm decides: ``^pattern$`` is found in it.
+        cost: Upper bound of the steps per character of a channel that matching takes.
+    """
+
     matches: Callable[[str], object]
-    cost: int  # upper bound of the steps per character of a channel that matching takes
+    cost: int
 
 
 def literal(pattern: str) -> str | None:

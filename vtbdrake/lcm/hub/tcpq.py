@@ -59,7 +59,12 @@ _DIAG_ANSWER = struct.Struct("=IHHII BBBB48s III II")  # header; state, addresse
 
 
 class TcpqError(Exception):
-    """A client violated the protocol or its limits."""
+    """A client violated the protocol or its limits.
+
+    Args:
+        reason: The kind of the violation, as `HubStatistics.disconnected` counts it.
+        message: The violation in a sentence.
+    """
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -67,7 +72,7 @@ class TcpqError(Exception):
 
 
 def rejection(reason: str) -> bytes:
-    """Return what the hub sends, instead of its greeting, to a client that it rejects."""
+    """Return the bytes that the hub sends, instead of its greeting, to a client that it rejects."""
     text = reason.encode()[:MAX_REJECTION]
     return _PAIR.pack(MAGIC_REJECTION, len(text)) + text
 
@@ -88,21 +93,28 @@ def peer_user(sock: socket.socket) -> int | None:
 
     The kernel knows the users of open sockets on this machine.
     """
-    with contextlib.suppress(OSError, struct.error):
-        return _user_of(sock.getpeername(), sock.getsockname())
+    with contextlib.suppress(OSError):
+        return user_of(sock.getpeername(), sock.getsockname())
     return None
 
 
-def _user_of(address: tuple[str, int], peer: tuple[str, int]) -> int | None:
-    """Return the user of the socket with this address that is connected to ``peer``."""
-    request = _DIAG_REQUEST.pack(
-        *(_DIAG_REQUEST.size, _SOCK_DIAG_BY_FAMILY, _NLM_F_REQUEST, 1, 0),
-        *(socket.AF_INET, socket.IPPROTO_TCP, 0, 0, 0xFFFFFFFF),  # in any state
-        *(socket.htons(address[1]), socket.htons(peer[1]), socket.inet_aton(address[0]), socket.inet_aton(peer[0])),
-        *(0, 0xFFFFFFFF, 0xFFFFFFFF),  # any interface, any socket
-    )
-    with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, _NETLINK_SOCK_DIAG) as kernel:
-        kernel.send(request)  # The kernel answers before it returns.
-        _, kind, *_, user, inode = _DIAG_ANSWER.unpack_from(kernel.recv(4096))
-    # A socket that its process has closed has no owner; the kernel may report root as its user.
-    return int(user) if kind == _SOCK_DIAG_BY_FAMILY and inode else None
+def user_of(address: tuple[str, int], peer: tuple[str, int]) -> int | None:
+    """Return the user id of the socket with this IPv4 address that is connected to ``peer``; None if it is not known.
+
+    Args:
+        address: Host and port of the socket.
+        peer: Host and port of the other end.
+    """
+    with contextlib.suppress(OSError, struct.error):
+        request = _DIAG_REQUEST.pack(
+            *(_DIAG_REQUEST.size, _SOCK_DIAG_BY_FAMILY, _NLM_F_REQUEST, 1, 0),
+            *(socket.AF_INET, socket.IPPROTO_TCP, 0, 0, 0xFFFFFFFF),  # in any state
+            *(socket.htons(address[1]), socket.htons(peer[1]), socket.inet_aton(address[0]), socket.inet_aton(peer[0])),
+            *(0, 0xFFFFFFFF, 0xFFFFFFFF),  # any interface, any socket
+        )
+        with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, _NETLINK_SOCK_DIAG) as kernel:
+            kernel.send(request)  # The kernel answers before it returns.
+            _, kind, *_, user, inode = _DIAG_ANSWER.unpack_from(kernel.recv(4096))
+        # A socket that its process has closed has no owner; the kernel may report root as its user.
+        return int(user) if kind == _SOCK_DIAG_BY_FAMILY and inode else None
+    return None

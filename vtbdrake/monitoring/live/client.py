@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vtbdrake.closing import Closing
+from vtbdrake.common.closing import Closing
 from vtbdrake.control.bridge import BridgeError
 from vtbdrake.lcm.connections import LcmLink
 from vtbdrake.lcm.hub import STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
@@ -232,11 +232,7 @@ def _samples(
                     return
                 begun = True
                 if "values" in message:
-                    values = _arrays(message, addresses, WATCHED)
-                    for name in ("time", "since"):
-                        if not is_number(message.get(name)):
-                            raise _invalid(WATCHED, f"a number of seconds in {name!r}", message)
-                    yield message["time"], message["since"], values
+                    yield _sample(message, addresses)
             if time.monotonic() >= last + timeout:
                 if begun and link.connected:
                     raise LiveTimeoutError(
@@ -247,6 +243,15 @@ def _samples(
     finally:
         link.publish((WATCH, to_json({**request, "watch": []})))
         link.close()
+
+
+def _sample(message: Mapping[str, Any], addresses: Sequence[str]) -> tuple[float, float, Values]:
+    """Return ``time``, ``since`` and the watched values of a message."""
+    values = _arrays(message, addresses, WATCHED)
+    for name in ("time", "since"):
+        if not is_number(message.get(name)):
+            raise _invalid(WATCHED, f"a number of seconds in {name!r}", message)
+    return message["time"], message["since"], values
 
 
 class LiveWatch(Closing):
@@ -306,6 +311,10 @@ class LiveWatch(Closing):
 
     def wait(self, count: int, *, timeout: float = 10.0) -> None:
         """Wait until ``count`` samples have come in all.
+
+        Args:
+            count: Number of samples since the watch began.
+            timeout: Longest wait, in s.
 
         Raises:
             LiveError: The DPS rejects the watch.

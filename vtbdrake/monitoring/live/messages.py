@@ -18,20 +18,26 @@ was time to read all of them in one cycle. Numbers that are not finite are writt
 Infinity. An empty list of addresses ends a watch. ``{"id": ID, "ended": true}`` says that the DPS has ended. A reset
 releases the latch of the guards, unless a cause persists, and returns the reasons for which it had latched.
 
-Every client of the bus may send requests. ``vtbdrake hub`` protects VTB_SET and VTB_RESET: one client at a time may
-publish there, the next one half a second later.
+Every client of the bus may send requests, and each is answered: what arrives last counts, whoever sends it, whatever
+its clock. On a hub that protects VTB_SET (``vtbdrake hub --protect VTB_SET``) one client at a time may publish there,
+and an operator waits for as long as a planner goes on.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from operator import methodcaller
 from typing import Any
 
-SET, GET, RESET, STATUS, WATCH = "VTB_SET", "VTB_GET", "VTB_RESET", "VTB_STATUS", "VTB_WATCH"
+SET = "VTB_SET"
+GET = "VTB_GET"
+RESET = "VTB_RESET"
+STATUS = "VTB_STATUS"
+WATCH = "VTB_WATCH"
 WATCHED = "VTB_WATCHED/"
 ANSWER = "_ANSWER"
 
@@ -39,8 +45,10 @@ MAX_LENGTH = 1 << 16
 """Limit on the bytes of a request."""
 MAX_ADDRESSES = 64
 """Limit on the addresses of a request."""
-SHORTEST_LEASE, LONGEST_LEASE = 0.1, 60.0
-"""Limits on a lease, in seconds."""
+SHORTEST_LEASE = 0.1
+"""Shortest lease, in seconds."""
+LONGEST_LEASE = 60.0
+"""Longest lease, in seconds."""
 
 _ID = re.compile(r"[\w.:-]{1,40}")
 
@@ -51,7 +59,12 @@ class RequestError(ValueError):
 
 @dataclass(frozen=True)
 class SetRequest:
-    """A request to set variables, by address: all of them or none."""
+    """A request to set variables, by address: all of them or none.
+
+    Attributes:
+        id: The id of the request, which the answer repeats.
+        values: Numbers or lists of numbers, by address.
+    """
 
     id: str
     values: dict[str, Any]
@@ -59,11 +72,18 @@ class SetRequest:
 
 @dataclass(frozen=True)
 class ReadRequest:
-    """A request to read variables and output ports: once, or every ``every`` cycles for ``lease`` seconds."""
+    """A request to read variables and output ports: once, or every ``every`` cycles for ``lease`` seconds.
+
+    Attributes:
+        id: The id of the request, which the answer repeats.
+        addresses: The addresses of the variables and ports.
+        every: Period in cycles; 0 to read once.
+        lease: The time for which values are sent, in seconds; 0 to read once.
+    """
 
     id: str
     addresses: tuple[str, ...]
-    every: int = 0  # period in cycles; 0 to read once
+    every: int = 0
     lease: float = 0.0
 
 
@@ -140,6 +160,10 @@ def request_id(data: bytes) -> str:
 def parse_request(channel: str, data: bytes) -> Request:
     """Return the request in a message.
 
+    Args:
+        channel: The LCM channel of the message, such as ``VTB_SET``.
+        data: The content of the message, JSON.
+
     Raises:
         RequestError: The message is not a valid request.
     """
@@ -203,7 +227,15 @@ def _check_value(address: str, value: Any) -> None:
     if isinstance(value, list):
         for item in value:
             _check_value(address, item)
-    elif not is_number(value) or not abs(value) < 1e308 or not isfinite(value):
+        return
+    if not is_number(value):
+        raise RequestError(f"the value of {address} must be a number or a list of numbers, not {_short(value)}")
+    if abs(value) > sys.float_info.max and value not in (inf, -inf):
+        raise RequestError(
+            f"the value of {address} must lie within +-{sys.float_info.max:.3g}, the largest number, "
+            f"unlike {_short(value)}"
+        )
+    if not isfinite(value):
         raise RequestError(f"the value of {address} must be a finite number or a list of them, not {_short(value)}")
 
 

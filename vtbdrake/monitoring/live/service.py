@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from vtbdrake.closing import Closing
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import FAILURES
+from vtbdrake.common.frames import unpack
 from vtbdrake.control.background_process import BackgroundProcess
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import Cycle
 from vtbdrake.control.switching import SwitchRefusedError
-from vtbdrake.failures import FAILURES
-from vtbdrake.frames import unpack
+from vtbdrake.monitoring.live.live_server import OUTCOME, VALUES, Record, serve
 from vtbdrake.monitoring.live.messages import LoopStatus, ReadRequest, Request, SetRequest, StatusRequest
-from vtbdrake.monitoring.live.server import OUTCOME, VALUES, Record, serve
 from vtbdrake.testbed import DpsAlone
 from vtbdrake.testbed.switch import Position
 
@@ -65,7 +65,7 @@ class LiveService(Closing):
         addresses = runtime.target.addresses()
         self._ports = frozenset(addresses)
         self._requests: deque[bytes] = deque()
-        self._readings: deque[_Reading] = deque()
+        self._readings: deque[_ValueReading] = deque()
         self._records: list[Record] = []
         self._flush_at = -inf
 
@@ -112,7 +112,7 @@ class LiveService(Closing):
                 self._post(number, {"unknown": unknown[0]})
             else:
                 readers = [self._runtime.target.reader(address) for address in request.addresses]
-                self._readings.append(_Reading(number, request.addresses, readers, request.every))
+                self._readings.append(_ValueReading(number, request.addresses, readers, request.every))
         elif isinstance(request, StatusRequest):
             self._post(number, self._status())
         else:
@@ -176,7 +176,7 @@ class LiveService(Closing):
                 break
         return busy
 
-    def _finish(self, reading: _Reading, cycle: Cycle) -> bool:
+    def _finish(self, reading: _ValueReading, cycle: Cycle) -> bool:
         """Send the values of a round, and return whether there will be another one."""
         if reading.error:
             self._post(reading.number, {"error": reading.error})
@@ -196,7 +196,7 @@ class LiveService(Closing):
 
 
 def loop_status(runtime: Runtime) -> LoopStatus:
-    """Return how a loop is, between two cycles."""
+    """Return the status of a loop, between two cycles."""
     target, now = runtime.target, runtime.clock.now()
     if isinstance(target, DpsAlone):
         act = "idle" if runtime.idle else Position.REAL.value
@@ -220,7 +220,7 @@ def loop_status(runtime: Runtime) -> LoopStatus:
     )
 
 
-class _Reading:
+class _ValueReading:
     """Values that are read together, once or in rounds."""
 
     def __init__(

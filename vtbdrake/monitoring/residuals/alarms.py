@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vtbdrake.arrays import Array
-from vtbdrake.monitoring.residuals.comparison import ResidualConfig, Window
+from vtbdrake.common.arrays import Array
+from vtbdrake.monitoring.residuals.comparison import ResidualConfig, ResidualWindow
 
 _BATCH = 100  # consecutive windows from which a calibration takes one mean and deviation
 _MIN_WINDOWS = 2 * _BATCH
@@ -31,15 +31,21 @@ class NominalResidualsError(ValueError):
 
 @dataclass(frozen=True)
 class NominalResiduals:
-    """Mean and deviation of every residual in nominal operation, as plain data."""
+    """Mean and deviation of every residual in nominal operation, as plain data.
 
-    # mean, deviation: one number per entry, by signal (``sense.<name>``, ``act.<name>``); the deviation is that of
-    # independent values whose sums scatter as much (see `nominal_residuals`)
+    Attributes:
+        mean, deviation: One number per entry, by signal (``sense.<name>``, ``act.<name>``); the deviation of
+            independent values whose sums scatter as much (see `nominal_residuals`).
+        windows: Number of windows that it was made of.
+        horizon: Length of these windows in periods.
+        period: Length of a period in seconds.
+    """
+
     mean: Mapping[str, list[float]]
     deviation: Mapping[str, list[float]]
-    windows: int  # number of windows that it was made of
-    horizon: int  # length of these windows in periods
-    period: float  # length of a period in seconds
+    windows: int
+    horizon: int
+    period: float
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as JSON."""
@@ -72,10 +78,10 @@ def nominal_residuals(
     A cumulative sum test takes a slow change within the run for a shift, and values that resemble the ones before (an
     imperfect model during a motion) add up faster than independent ones. So the deviation is the largest deviation of a
     batch of 100 consecutive windows (a standstill may be noisier than a motion, or the reverse), times the largest
-    ratio, over L = 1, 2, 4 .. 64, of the deviation of sums of L consecutive windows to sqrt(L) times that of one. For
-    an autocorrelation rho^n, this ratio tends to sqrt((1 + rho) / (1 - rho)). The standard error of the ratio in n
-    windows is about e = sqrt(L / (3 n)) of it (from overlapping sums), and L is at most n / 8. A ratio up to 1 + 3 e is
-    taken for chance, so that independent values keep their deviation; two such errors are added to a larger one.
+    ratio, over L = 1, 2, 4 .. 64, of the deviation of sums of L consecutive windows to sqrt(L) times the deviation of
+    one. For an autocorrelation rho^n, this ratio tends to sqrt((1 + rho) / (1 - rho)). The standard error of the ratio
+    in n windows is about e = sqrt(L / (3 n)) of it (from overlapping sums), and L is at most n / 8. A ratio up to 1 + 3
+    e is taken for chance, so that independent values keep their deviation; two such errors are added to a larger one.
 
     The deviation is also at least four times the largest distance of a batch's mean from the overall mean: then a
     lasting offset takes no more than half of the allowance of 1/2 (`Cusum`).
@@ -144,13 +150,22 @@ def run_length(threshold: float, allowance: float) -> float:
 
     For one side, it is (exp(2 k b) - 2 k b - 1) / (2 k^2) with b = h + 1.166 (Siegmund, "Sequential Analysis", 1985,
     eq. 2.57); two sides alarm twice as often.
+
+    Args:
+        threshold: The threshold h, in standard deviations.
+        allowance: The allowance k > 0 that is subtracted from every value, in standard deviations.
     """
     exponent = 2.0 * allowance * (threshold + _EXCESS)
     return (expm1(exponent) - exponent) / (2.0 * allowance**2) / 2.0
 
 
 def threshold_for(length: float, allowance: float) -> float:
-    """Return the threshold for which `run_length` is ``length``, or 0 if it is longer with any threshold."""
+    """Return the threshold for which `run_length` is ``length``, or 0 if it is longer with any threshold.
+
+    Args:
+        length: The mean number of values between two false alarms.
+        allowance: The allowance k > 0 of the test, in standard deviations.
+    """
     if run_length(0.0, allowance) >= length:
         return 0.0
     # Importing scipy costs 40 MB, which a loop without residuals does not need.
@@ -201,16 +216,25 @@ class Cusum:
 
 @dataclass(frozen=True)
 class Alarm:
-    """A persistent difference between the machine and its model."""
+    """A persistent difference between the machine and its model.
 
-    signal: str  # ``sense.<name>``, or ``act.<name>`` if the reported actuator command differs
-    entry: int  # index of the entry of the signal
-    # began, ended: time of the DPS in seconds; the end is infinite while the alarm lasts
+    Attributes:
+        signal: ``sense.<name>``, or ``act.<name>`` if the reported actuator command differs.
+        entry: Index of the entry of the signal.
+        began, ended: Time of the DPS in seconds; the end is infinite while the alarm lasts.
+        residual: Measured less predicted value in the window at whose end the alarm began, in the signal's unit.
+        scale: Scale of the residual in nominal operation.
+        statistic: The sum (see `Cusum`) that exceeded the threshold, in scales; at most twice the threshold.
+        threshold: Threshold of the statistic.
+    """
+
+    signal: str
+    entry: int
     began: float
-    residual: float  # measured less predicted value in the window at whose end the alarm began, in the signal's unit
-    scale: float  # scale of the residual in nominal operation
-    statistic: float  # the sum (see `Cusum`) that exceeded the threshold, in scales; at most twice the threshold
-    threshold: float  # threshold of the statistic
+    residual: float
+    scale: float
+    statistic: float
+    threshold: float
     ended: float = inf
 
     def __str__(self) -> str:
@@ -277,7 +301,7 @@ class AlarmDetector:
             raise error(f"the residual of {name} has {size} entries, but a value of shape {np.shape(value)} was given")
         target[place] = value
 
-    def update(self, window: Window) -> list[Alarm]:
+    def update(self, window: ResidualWindow) -> list[Alarm]:
         """Return the alarms that end and begin with this window, those with the largest residuals first."""
         threshold = self._cusum.threshold
         z = (window.residual - self.mean) / self.scale

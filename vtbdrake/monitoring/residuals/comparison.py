@@ -1,4 +1,4 @@
-"""Comparison of the measurements of a machine with the predictions of its model, window by window."""
+"""ResidualGenerator of the measurements of a machine with the predictions of its model, window by window."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vtbdrake.arrays import Array
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.settings import check_settings, setting
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.common.settings import check_settings, setting
 from vtbdrake.testbed import Interface, Scenario
 from vtbdrake.testbed.prediction import Predictor
 
 _log = logging.getLogger(__name__)
 
 
-SHADOW, TWIN = "shadow", "twin"
-INDEX, TIME = 0, 1
+SHADOW = "shadow"
+TWIN = "twin"
+INDEX = 0
+TIME = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +33,8 @@ class ResidualConfig:
     `Scenario.deployment` contains the configuration of a scenario.
 
     Attributes:
-        scenario: Scenario of the predicted world; by default that of the loop's target. It has the latencies of the
-            sensors, but no random errors.
+        scenario: Scenario of the predicted world; by default the scenario of the loop's target. It has the latencies of
+            the sensors, but no random errors.
         values: Values of variables of the predicted world by address, such as the assumed payload.
         tolerance: By signal (``sense.<name>``, ``act.<name>``), the least scale of a residual, for all entries or
             each; persistent residuals below half of it are not reported.
@@ -127,7 +129,12 @@ class RowLayout:
 
 
 def slices(sizes: Mapping[str, int], begin: int = 0) -> dict[str, slice]:
-    """Return consecutive slices of the given sizes."""
+    """Return consecutive slices of the given sizes.
+
+    Args:
+        sizes: The number of entries of each slice, by name, in their order.
+        begin: Where the first slice begins.
+    """
     ends = accumulate(sizes.values(), initial=begin)
     return {name: slice(a, b) for name, (a, b) in zip(sizes, pairwise(ends), strict=True)}
 
@@ -136,24 +143,34 @@ def _indices(places: Iterable[slice]) -> list[int]:
     return [k for place in places for k in range(place.start, place.stop)]
 
 
-class Window(NamedTuple):
-    """The residuals of one prediction."""
+class ResidualWindow(NamedTuple):
+    """The residuals of one prediction.
 
-    time: float  # time of the DPS at its end, in seconds
-    # mean of measured less predicted values over its samples, all signals concatenated; NaN where there was no sample
+    Attributes:
+        time: Time of the DPS at its end, in seconds.
+        residual: Mean of measured less predicted values over its samples, all signals concatenated; NaN where there was
+            no sample.
+        statistic: Statistic of each entry that an alarm compares with its threshold; None without alarm detection.
+    """
+
+    time: float
     residual: Array
-    # statistic of each entry that an alarm compares with its threshold; None without alarm detection
     statistic: Array | None = None
 
 
 def residual_places(interface: Interface, reported: Collection[str]) -> dict[str, slice]:
-    """Return the slices of a window by signal: ``sense.<name>``, and ``act.<name>`` of reported actuator commands."""
+    """Return the slices of a window by signal: ``sense.<name>``, and ``act.<name>`` of reported actuator commands.
+
+    Args:
+        interface: The interface of the DPS, whose abstract signals get empty slices.
+        reported: The names of the actuator signals whose commands the machine reports.
+    """
     sizes = {f"sense.{signal.name}": signal.size or 0 for signal in interface.sense}
     sizes |= {f"act.{signal.name}": signal.size or 0 for signal in interface.act if signal.name in reported}
     return slices(sizes)
 
 
-class Comparison:
+class ResidualGenerator:
     r"""Predicts the samples of each window from the belief at its beginning and compares them with the measured ones.
 
     With the machine's samples y_i at instants i T, the belief b_s about its state at s T, the actuator commands c_j
@@ -165,6 +182,12 @@ class Comparison:
 
     The DPS's actuator command in the row of y_i is for j = i + delay; the one that is reported beside y_i acted in
     j = i - 1. A twin is driven by the DPS's actuator commands, a shadow by the reported ones: they are what acts.
+
+    Args:
+        predictor: The model.
+        rows: The layout of the rows, which hold the machine's samples.
+        config: The length of a window, and what alarms need.
+        mode: ``twin`` or ``shadow``.
 
     Attributes:
         skipped: Number of windows without a result, because rows, a belief or actuator commands were missing.
@@ -186,8 +209,9 @@ class Comparison:
         self._newest: int | None = None
         self._next = 0
         self._settled = 0
+        self._started = False  # Whether the predictor has its time since the last restart.
 
-    def add(self, rows: Array) -> list[Window]:
+    def add(self, rows: Array) -> list[ResidualWindow]:
         """Add rows, of shape (n, width), and return the windows that they complete."""
         horizon, windows = self._config.horizon, []
         for row in rows:
@@ -209,7 +233,7 @@ class Comparison:
         return windows
 
     def _complete(self, index: int, late: Array) -> None:
-        """Add late values to a row. Of two actuator commands for one period the second one acts."""
+        """Add late values to a row. The second of two actuator commands for one period acts."""
         row = self._rows.get(index)
         if row is None:
             return
@@ -228,7 +252,7 @@ class Comparison:
         self._settled = -self._config.settle
         self._started = False
 
-    def _window(self, s: int) -> Window | None:
+    def _window(self, s: int) -> ResidualWindow | None:
         try:
             differences, whole = self._compare(s)
         except FAILURES as error:
@@ -248,7 +272,7 @@ class Comparison:
         is_number = ~np.isnan(differences)
         with np.errstate(invalid="ignore"):
             mean = np.where(is_number, differences, 0.0).sum(axis=0) / is_number.sum(axis=0)
-        return Window(float(self._rows[s + self._config.horizon][TIME]), mean)
+        return ResidualWindow(float(self._rows[s + self._config.horizon][TIME]), mean)
 
     def _compare(self, s: int) -> tuple[Array, bool]:
         """Return the differences, of shape (horizon, all residuals), and whether nothing was missing for them."""

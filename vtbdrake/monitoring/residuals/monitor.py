@@ -10,14 +10,14 @@ from math import ceil, inf, isnan, prod
 
 import numpy as np
 
-from vtbdrake.arrays import Array
-from vtbdrake.closing import Closing
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.common.frames import FrameConnection
 from vtbdrake.control.background_process import START_TIMEOUT, BackgroundProcess
 from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.control.stepping import ChangeKind, Cycle
-from vtbdrake.failures import FAILURES, error_text
-from vtbdrake.frames import FrameConnection
 from vtbdrake.monitoring.residuals.alarms import (
     Alarm,
     AlarmDetector,
@@ -30,10 +30,10 @@ from vtbdrake.monitoring.residuals.comparison import (
     SHADOW,
     TIME,
     TWIN,
-    Comparison,
     ResidualConfig,
+    ResidualGenerator,
+    ResidualWindow,
     RowLayout,
-    Window,
     residual_places,
 )
 from vtbdrake.testbed import Interface, Scenario, VirtualTestbed
@@ -43,8 +43,10 @@ from vtbdrake.testbed.switch import Position
 _log = logging.getLogger(__name__)
 
 _MAX_WAITING = 100  # blocks of rows that may wait for the worker process; older ones are skipped
-# This many windows without a result, if they are this share of all windows, cause a warning.
-_BLIND_WINDOWS, _BLIND_SHARE = 50, 0.2
+# This number of windows without a result causes a warning,
+_BLIND_WINDOWS = 50
+# if they are at least this share of all windows.
+_BLIND_SHARE = 0.2
 _REPORT_WINDOWS = 10  # windows, with or without a result, after which a report is sent, if there is no alarm before
 
 
@@ -63,7 +65,7 @@ class ResidualMonitor(Closing):
     the DPS raises, it has no estimates, and their windows have no result.
 
     A window lacks a result if a sample is missing. If the machine has a clock of its own, and the loop another one,
-    there are cycles without a new sample, and cycles with two, of which the first is missed. So let the machine's
+    there are cycles without a new sample, and cycles with two, whose first one is missed. So let the machine's
     messages begin the cycles (`Deployment.pace`). A warning is logged if at least 50 windows, and a fifth of all, have
     no result.
 
@@ -71,7 +73,7 @@ class ResidualMonitor(Closing):
         runtime: The loop, which does not run yet.
         mode: ``shadow``: the actuator commands that the machine reports drive the prediction, and the DPS's commands
             are compared with them; ``twin``: the commands that the DPS sends drive the prediction.
-        config: Configuration; by default that of the scenario's deployment.
+        config: Configuration; by default the configuration of the scenario's deployment.
         calibration: The residuals of nominal operation; without it, tolerances are needed.
         learn: Whether to collect residuals for `calibrate` instead of raising alarms.
         worker: Whether a worker process computes. Otherwise the loop's process computes, and the loop waits: for tests,
@@ -118,11 +120,11 @@ class ResidualMonitor(Closing):
         self.places = residual_places(interface, reported)
         self._size = max(place.stop for place in self.places.values())
         self.alarms: deque[Alarm] = deque(maxlen=memory)
-        self.history: deque[Window] = deque(maxlen=memory)
+        self.history: deque[ResidualWindow] = deque(maxlen=memory)
         self.skipped = self.failed = 0
         self.error = ""
         self._worker: BackgroundProcess | None = None
-        self._comparison: Comparison | None = None
+        self._comparison: ResidualGenerator | None = None
         self._detector = None if learn else AlarmDetector(self.places, config, calibration)
         if worker:
             self._worker = BackgroundProcess(_serve, scenario, config, mode, self._detector, name="residuals")
@@ -136,7 +138,7 @@ class ResidualMonitor(Closing):
         if self._worker is not None:
             self._worker.post(self._rows)
         else:
-            self._comparison = Comparison(predictor, self._rows, config, mode=mode)
+            self._comparison = ResidualGenerator(predictor, self._rows, config, mode=mode)
         self.keep = keep
         self._recent: deque[Array] = deque(maxlen=ceil(keep / config.window))
         self._results = 0
@@ -148,7 +150,7 @@ class ResidualMonitor(Closing):
             else "the loop is late, or messages are lost"
         )
         self._sampler = Sampler(runtime, self._rows, estimates, mode=mode, horizon=config.horizon)
-        self._begin_block()
+        self._block, self._filled = self._empty_block(), 0
         self._open = True
         runtime.watch(self)
 
@@ -180,9 +182,11 @@ class ResidualMonitor(Closing):
             self._send_block()
 
     def _begin_block(self) -> None:
+        self._block, self._filled = self._empty_block(), 0
+
+    def _empty_block(self) -> Array:
         # A cycle brings no more rows than it has signals.
-        self._block: Array = self._rows.empty(self.config.horizon + len(self._rows.sense))
-        self._filled = 0
+        return self._rows.empty(self.config.horizon + len(self._rows.sense))
 
     def _send_block(self) -> None:
         block = self._block[: self._filled]
@@ -219,7 +223,7 @@ class ResidualMonitor(Closing):
                     self.alarms[k] = alarm
 
     def _cause(self) -> str:
-        """Return why windows were skipped."""
+        """Return the reason why windows were skipped."""
         if self._sampler.error:
             return self._sampler.error
         return "the worker process is too slow" if self._late or self.dropped else self._missing
@@ -268,8 +272,8 @@ class ResidualMonitor(Closing):
 
         Returns:
             By signal, ``sense.<name>`` and ``act.<name>``, times (n,) by the machine's samples in s, the first of them
-            at ``since``, and values (n, size). Actuator commands are those that the machine reports, else those of the
-            DPS, at the times from which on they acted.
+            at ``since``, and values (n, size). Actuator commands are the ones that the machine reports, else the DPS's
+            commands, at the times from which on they acted.
         """
         blocks = [block[block[:, TIME] >= since] for block in self._recent]
         rows = np.concatenate([*blocks, self._rows.empty(0)])
@@ -391,6 +395,10 @@ class Sampler:
     def fill(self, rows: Array, cycle: Cycle) -> int:
         """Fill empty rows with the new values of a cycle.
 
+        Args:
+            rows: Rows of the layout, shape (n, width), all NaN; the first ones are filled.
+            cycle: The cycle, which the loop has just ended.
+
         Returns:
             The number of rows: 0 without a new sample, several if some of its samples are older than others.
         """
@@ -456,18 +464,24 @@ class Sampler:
 
 @dataclass
 class ResidualReport:
-    """The results since the last report."""
+    """The results since the last report.
 
-    windows: list[Window] = field(default_factory=list)  # the windows
-    alarms: list[Alarm] = field(default_factory=list)  # alarms that began or ended
-    # skipped, failed, error: see `Comparison`
+    Attributes:
+        windows: The windows.
+        alarms: Alarms that began or ended.
+        skipped, failed, error: See `ResidualGenerator`.
+        late: Whether the worker process has left out rows, because it is too slow.
+    """
+
+    windows: list[ResidualWindow] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
     skipped: int = 0
     failed: int = 0
     error: str = ""
-    late: bool = False  # whether the worker process has left out rows, because it is too slow
+    late: bool = False
 
 
-def _checked(comparison: Comparison, detector: AlarmDetector | None, rows: Array) -> ResidualReport:
+def _checked(comparison: ResidualGenerator, detector: AlarmDetector | None, rows: Array) -> ResidualReport:
     """Return the results of further rows, of shape (n, width of a `RowLayout`), in order."""
     windows, alarms = comparison.add(rows), []
     if detector:
@@ -492,11 +506,11 @@ def _serve(
         return
     connection.send(predictor.estimates)
     layout: RowLayout = connection.receive()
-    comparison = Comparison(predictor, layout, config, mode=mode)
+    comparison = ResidualGenerator(predictor, layout, config, mode=mode)
     pending, late, reported, ended = ResidualReport(), False, 0, False
     while not ended:
         blocks, ended = _waiting_blocks(connection)
-        late |= len(blocks) > _MAX_WAITING  # `Comparison` counts the windows that are left out.
+        late |= len(blocks) > _MAX_WAITING  # `ResidualGenerator` counts the windows that are left out.
         for block in blocks[-_MAX_WAITING:]:
             report = _checked(comparison, detector, np.frombuffer(block).reshape(-1, layout.width))
             report.windows = pending.windows + report.windows

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
+from vtbdrake.common.argument_checks import as_number, as_whole
+from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.optimization.solvers.auto import Auto
 from vtbdrake.optimization.solvers.bayesian import Bayesian
@@ -88,11 +90,12 @@ def make_solver(
     factory = solver_type(name)
     canonical = _find(name) if isinstance(name, str) else name.__name__
     allowed = _options(factory)
-    for option in options:
-        if option not in allowed:
-            near = difflib.get_close_matches(option, allowed, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise SolverError(f"{canonical} has no option {option!r}{hint}; it has {allowed}")
+    for option, value in options.items():
+        if option in allowed:
+            options[option] = _checked(f"the option {option} of {canonical}", value, allowed[option])
+        else:
+            near = did_you_mean(option, allowed, count=1)
+            raise SolverError(f"{canonical} has no option {option!r}{near}; it has {[*allowed]}")
     if not space and factory.needs_parameters:
         raise SolverError("there is no parameter to vary; give at least one, or take grid, which evaluates one point")
     search = Search(
@@ -108,9 +111,21 @@ def make_solver(
 
 
 @cache
-def _options(kind: type[Solver]) -> list[str]:
-    """Return the names of a solver's options; cached, as a reasoner makes a solver for each decision."""
-    return [option for option in inspect.signature(kind).parameters if option not in ("search", "name")]
+def _options(kind: type[Solver]) -> dict[str, str]:
+    """Return a solver's options with their types; cached, as a reasoner makes a solver for each decision."""
+    parameters = inspect.signature(kind).parameters
+    return {name: str(parameter.annotation) for name, parameter in parameters.items() if name not in ("search", "name")}
+
+
+def _checked(name: str, value: Any, annotation: str) -> Any:
+    """Return an option, after a check of those that are a number."""
+    if value is None and annotation.endswith("| None"):
+        return value
+    check = {"int": as_whole, "float": as_number}.get(annotation.removesuffix(" | None"))
+    try:
+        return value if check is None else check(name, value)
+    except (ValueError, OverflowError) as error:
+        raise SolverError(str(error)) from None
 
 
 def _find(name: object) -> str:

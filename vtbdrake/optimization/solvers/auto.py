@@ -27,15 +27,29 @@ PROGRESS = 1e-6
 PATIENCE = 5
 # A Gaussian process helps with up to this many parameters; beyond, a quadratic model is expensive, too.
 MODEL_SIZE = 20
-# Points of the model: per parameter and one more, and in all; with wide batches at least so many of these.
-MODEL_POINTS, MODEL_LIMIT, MODEL_BATCHES = 25, 120, 4
-# CMA-ES needs so many generations. Of a budget without them, one part in so many goes to a local search, if that is at
-# least so many points per continuous parameter and one more: the 2 n + 1 of BOBYQA's first model, and some steps.
-GENERATIONS, LOCAL_PART, LOCAL_POINTS = 10, 3, 5
-# Half widths of the boxes of local searches, as parts of the ranges: after the model, and last.
-LOCAL_RADIUS, POLISH_RADIUS = 0.1, 0.02
-# The same for searches in other basins, which end with this tolerance; so many in a row may find nothing better.
-BASIN_RADIUS, BASIN_TOLERANCE, BASINS = 0.2, 1e-3, 3
+# Points of the model per parameter and one more.
+MODEL_POINTS = 25
+# Largest number of points of the model.
+MODEL_LIMIT = 120
+# Least number of batches of points of the model, where batches are wide.
+MODEL_BATCHES = 4
+# Least number of generations that CMA-ES needs.
+GENERATIONS = 10
+# Without generations, the budget that is left divided by this number goes to a local search.
+LOCAL_PART = 3
+# A local search needs at least this number of points per continuous parameter and one more: the 2 n + 1 of BOBYQA's
+# first model, and some steps.
+LOCAL_POINTS = 5
+# Half width of the box of the local search after the model, as a part of the ranges.
+LOCAL_RADIUS = 0.1
+# Half width of the box of the last local search.
+POLISH_RADIUS = 0.02
+# Half width of the box of local searches in other basins.
+BASIN_RADIUS = 0.2
+# Tolerance at which they end.
+BASIN_TOLERANCE = 1e-3
+# Number of basins in a row that may have nothing better.
+BASINS = 3
 
 
 class Auto(Solver):
@@ -60,11 +74,11 @@ class Auto(Solver):
     each, the best value of this start has not improved by more than 1e-6 of the spread of the values before it.
     Then it restarts at a random point with twice the population (IPOP); every third start is differential evolution.
     After five starts in a row without such an improvement the solver ends, with success. Last, if the best point is
-    better than that of the model, a tenth of the budget at most goes into another local search, and the rest into
+    better than the model's, a tenth of the budget at most goes into another local search, and the rest into
     Bayesian optimization.
 
     The local searches (BOBYQA, or COBYQA with constraints or one continuous parameter) stay in a box around the point
-    from which they begin, and keep its integers. They need at most 20 parameters, of which at least one is continuous.
+    from which they begin, and keep its integers. They need at most 20 parameters, at least one of them continuous.
 
     Auger, A. and Hansen, N. (2005): A restart CMA evolution strategy with increasing population size, CEC 2005.
     """

@@ -17,14 +17,23 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solv
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
-# Candidates of the acquisition: over the whole space, around the best points, and around each of the best candidates,
-# in steps of decreasing widths, as parts of the ranges.
-SPREAD, AROUND, REFINED = 500, 200, 10
+# Candidates of the acquisition over the whole space.
+SPREAD = 500
+# Candidates around the best points.
+AROUND = 200
+# Candidates around each of the best candidates, per step of `WIDTHS`.
+REFINED = 10
+# Number of the best candidates.
 BEST = 5
+# Widths of these steps, as parts of the ranges.
 WIDTHS = (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003)
-# Prior of the logarithms of the kernel's hyperparameters (signal, length scales as parts of the ranges, noise): median,
-# width.
-SIGNAL, LENGTH, NOISE = (1.0, 1.0), (0.5, 1.0), (1e-4, 3.0)
+# Priors of the logarithms of the kernel's hyperparameters: median, width.
+# The signal.
+SIGNAL = (1.0, 1.0)
+# The length scales, as parts of the ranges.
+LENGTH = (0.5, 1.0)
+# The noise.
+NOISE = (1e-4, 3.0)
 # Draws of the posterior of several objectives.
 DRAWS = 64
 
@@ -37,7 +46,7 @@ class Bayesian(Solver):
     hold. Within a batch, the model takes its own predictions of the earlier points as known. Several objectives are
     weighed at random for every point (ParEGO), which covers the whole Pareto front.
 
-    The kernel is Matern 5/2, with a length scale per parameter, and noise; its hyperparameters are those of the largest
+    The kernel is Matern 5/2, with a length scale per parameter, and noise; its hyperparameters have the largest
     posterior density. Choices are coded one-hot. Objectives are transformed towards a normal distribution (Yeo and
     Johnson). A failed simulation counts as the worst value so far. Choosing a point takes tens of milliseconds: where a
     rollout takes less, CMA-ES may be the better choice.
@@ -124,8 +133,8 @@ class Bayesian(Solver):
     def mean(self, units: np.ndarray) -> np.ndarray:
         """Return the values that the models expect in places of the unit cube, (k, n) -> (k, objectives).
 
-        A mean is that of the transformed values, transformed back: rather a median. It lies between the worst and the
-        best value so far. Without any value it is NaN.
+        A mean is taken over the transformed values and transformed back: rather a median. It lies between the worst and
+        the best value so far. Without any value it is NaN.
         """
         from threadpoolctl import threadpool_limits
 

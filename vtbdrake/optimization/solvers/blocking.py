@@ -11,7 +11,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from vtbdrake.failures import error_text
+from vtbdrake.common.failures import error_text
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver
 
 _log = logging.getLogger(__name__)

@@ -8,13 +8,17 @@ from math import prod
 
 import numpy as np
 
+from vtbdrake.common.argument_checks import as_whole
 from vtbdrake.optimization.parameter import Choice, Dimension
-from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
+from vtbdrake.optimization.solvers.solver import BudgetTooSmallError, Evaluation, Point, Search, Solver, SolverError
 
 # A power of two, so that a Sobol sequence is balanced batch by batch; enough to keep a machine busy.
 BATCH = 64
-# A batch ends when its last rollout does, and workers wait for that; with so many rollouts for each, they hardly do.
+# A batch ends when its last rollout does, and workers wait for that; with this number of rollouts for each, they hardly
+# do.
 ROUNDS = 16
+# The largest number of values of one parameter in a grid.
+MOST_VALUES = 1_000_000
 
 
 class Design(Solver):
@@ -81,7 +85,7 @@ class Grid(Design):
         self._axes = _axes(search, points)
         count = prod(len(axis) for axis in self._axes)
         if search.budget is not None and count > search.budget:
-            raise SolverError(
+            raise BudgetTooSmallError(
                 f"the grid has {count} points, and the budget is {search.budget} evaluations; give fewer points"
             )
         super().__init__(search, name=name)
@@ -91,7 +95,11 @@ class Grid(Design):
 
 
 class Listed(Design):
-    """Given points, in their order."""
+    """Given points, in their order.
+
+    Args:
+        points: The points, in their order.
+    """
 
     def __init__(self, search: Search, *, name: str, points: Sequence[Point]) -> None:
         self._listed = points
@@ -186,7 +194,7 @@ def _count(search: Search, points: int | None) -> int:
     if points < 1:
         raise SolverError(f"a design has at least one point, not {points}")
     if search.budget is not None and points > search.budget:
-        raise SolverError(f"the design has {points} points, and the budget is {search.budget} evaluations")
+        raise BudgetTooSmallError(f"the design has {points} points, and the budget is {search.budget} evaluations")
     return points
 
 
@@ -202,6 +210,10 @@ def _axes(search: Search, points: int | Sequence[int] | Mapping[str, int] | None
         if len(each) != len(space):
             raise SolverError(f"points has one number per parameter, {len(space)}, not {len(each)}")
         counts = [count if parameter.is_continuous else None for count, parameter in zip(each, space, strict=True)]
+    try:
+        counts = [None if count is None else as_whole("a number of points", count) for count in counts]
+    except (ValueError, OverflowError) as error:
+        raise SolverError(str(error)) from None
     fair = _fair_count(search)
     return [_axis(parameter, count, fair) for parameter, count in zip(space, counts, strict=True)]
 
@@ -211,9 +223,15 @@ def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
         if count is not None:
             raise SolverError(f"{parameter.address} has {len(parameter.options)} options, and a grid takes all of them")
         return list(parameter.options)
-    if parameter.integer and count is None:
-        return list(range(int(parameter.lower), int(parameter.upper) + 1))
+    whole = int(parameter.upper) - int(parameter.lower) + 1 if parameter.integer and count is None else None
     count = fair if count is None else count
+    if (size := count if whole is None else whole) > MOST_VALUES:
+        raise SolverError(
+            f"a grid has at most {MOST_VALUES:,} values of one parameter, not {size:,} of {parameter.address}: give "
+            "fewer points (points={...}), or take another solver"
+        )
+    if whole is not None:
+        return list(range(int(parameter.lower), int(parameter.upper) + 1))
     if count < 2:
         raise SolverError(f"a grid has at least two values of {parameter.address}, not {count}")
     values = (parameter.from_unit(u) for u in np.linspace(0.0, 1.0, count))

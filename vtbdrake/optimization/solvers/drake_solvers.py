@@ -13,7 +13,7 @@ Drake lists more, which are not offered because
 * they report success far from the optimum under a linear constraint: LD_MMA (LD_CCSAQ is its successor);
 * they end at once with more than ten parameters: GN_AGS;
 * they are hardly ever better than the others on the functions of `benchmarks/auto_regret.py`: GN_MLSL_LDS, GD_MLSL_LDS;
-* Drake cannot run them: those of Luksan (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which it omits, and those that
+* Drake cannot run them: Luksan's (LD_LBFGS, LD_VAR1, LD_VAR2, LD_TNEWTON...), which it omits, and those that
   need a second algorithm inside (AUGLAG, AUGLAG_EQ, G_MLSL, G_MLSL_LDS), which it cannot name.
 
 https://nlopt.readthedocs.io/en/latest/NLopt_Algorithms/
@@ -70,8 +70,8 @@ RESULTS = {
 
 AUTODIFF = "autodiff"
 
-# Differences: multiples of the step at which neighbours lie, and the weight of each neighbour's value minus that of the
-# point, divided by the step; first inside the range, then where its end leaves no room on one side.
+# Differences: multiples of the step at which neighbours lie, and the weight of each neighbour's value minus the
+# point's, divided by the step; first inside the range, then where its end leaves no room on one side.
 FORMULAS = {
     "forward": (((1.0,), (1.0,)), ((1.0,), (1.0,))),
     "central": (((1.0, -1.0), (0.5, -0.5)), ((1.0, 2.0), (2.0, -0.5))),
@@ -145,7 +145,7 @@ class ProgramSolver(BlockingSolver):
 
     @abstractmethod
     def _status(self, result: MathematicalProgramResult) -> str:
-        """Return how the solver ended, in its own words."""
+        """Return the end of the solver, in its own words."""
 
     def _solve(self) -> tuple[bool, str]:
         start = self.search.start_unit()

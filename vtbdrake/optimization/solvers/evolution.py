@@ -93,8 +93,8 @@ def _strategy(mean: np.ndarray, sigma: float, counts: np.ndarray, population: in
     # Imported here because it is slow: it loads scipy.stats.
     from cmaes import CMA, CMAwM
 
-    # What lies outside is drawn again, and moved to the bounds in the end. Of more than a hundred numbers one is nearly
-    # always outside, and the package multiplies two matrices for each draw.
+    # What lies outside is drawn again, and moved to the bounds in the end. Among more than a hundred numbers one is
+    # nearly always outside, and the package multiplies two matrices for each draw.
     options: dict[str, Any] = {
         "bounds": np.tile([0.0, 1.0], (len(mean), 1)),
         "n_max_resampling": 100 if len(mean) <= 100 else 5,

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from vtbdrake.lazy import extra_module
+from vtbdrake.common.extras import extra_module
 from vtbdrake.optimization.parameter import Choice, Dimension
 from vtbdrake.optimization.solvers.solver import Evaluation, Point, Search, Solver, SolverError
 
@@ -142,7 +142,12 @@ def import_optuna(name: str) -> Any:
 
 
 def distribution(parameter: Dimension, optuna: Any) -> BaseDistribution:
-    """Return the range of a parameter as Optuna's distribution; that of a choice holds the indices of its options."""
+    """Return the range of a parameter as Optuna's distribution; for a choice, of the indices of its options.
+
+    Args:
+        parameter: A parameter, or a choice.
+        optuna: The module ``optuna``, which is imported only when it is needed.
+    """
     distributions = optuna.distributions
     if isinstance(parameter, Choice):
         # By index: for Optuna, 1 and True are equal.

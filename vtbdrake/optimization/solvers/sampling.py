@@ -70,7 +70,7 @@ class SamplingSolver(Solver):
 
         Args:
             U: The batch in the unit cube, shape (N, n).
-            evaluations: The N evaluations of the batch, of which at least one did not fail.
+            evaluations: The N evaluations of the batch; at least one did not fail.
         """
 
 

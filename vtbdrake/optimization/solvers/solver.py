@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vtbdrake.argument_checks import counted
+from vtbdrake.common.argument_checks import counted
 from vtbdrake.optimization.parameter import Choice, Dimension, Parameter, checked_points
 
 # A point s^0: one value per parameter, in their order.
@@ -22,9 +22,16 @@ Point = tuple[Any, ...]
 # Seeds are below this, as numpy's legacy generators require (cmaes, Optuna).
 SEEDS = 2**32
 
+# The largest number of points in a batch, which all are in memory.
+MOST_IN_BATCH = 1_000_000
+
 
 class SolverError(ValueError):
     """A solver is unknown, or cannot solve the problem."""
+
+
+class BudgetTooSmallError(SolverError):
+    """A design has more points than the budget has evaluations."""
 
 
 class PointValues:
@@ -37,7 +44,7 @@ class PointValues:
     @property
     def failed(self) -> bool:
         """Return whether the point has no value because a simulation failed."""
-        # An infinite bound is no failure: it belongs to a dropped point of which little is known.
+        # An infinite bound is no failure: it belongs to a dropped point, about which little is known.
         return not all(map(isfinite, self.values)) and (self.exact or any(map(isnan, self.values)))
 
     @property
@@ -172,9 +179,16 @@ class Search:
     def batch(self, usual: int, *, requested: int | None = None, least: int = 1) -> int:
         """Return the size of a batch: the requested one, or the usual one or as many as are evaluated side by side.
 
+        Args:
+            usual: The usual size of the method's batch.
+            requested: The size that the user asks for; None: none.
+            least: The smallest size that the method can work with.
+
         Raises:
-            SolverError: The requested number is below ``least``.
+            SolverError: The requested number is below ``least``, or above `MOST_IN_BATCH`.
         """
+        if requested is not None and requested > MOST_IN_BATCH:
+            raise SolverError(f"a batch has at most {MOST_IN_BATCH:,} points, not {requested:,}: take fewer")
         if requested is not None and requested < least:
             raise SolverError(f"a batch has at least {counted(least, 'point')}, not {requested}")
         return max(usual, self.parallel or 1) if requested is None else requested
@@ -404,6 +418,10 @@ class Asker(Protocol):
 
 def ask_within(solver: Asker, seconds: float) -> list[Point] | None:
     """Return the points that a solver asks for; None if it has not answered after ``seconds``: it must be closed then.
+
+    Args:
+        solver: The solver, or what has its method ``ask``.
+        seconds: The longest wall time to wait, in seconds; infinity: ask in this thread, without a limit.
 
     Raises:
         Exception: Any error of the method.

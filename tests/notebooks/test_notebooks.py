@@ -1,0 +1,76 @@
+"""Every notebook runs, and is stored as it runs."""
+
+from collections.abc import Mapping
+
+import pytest
+
+from tests.notebooks.checks import check_runs, check_stored
+from tools.run_notebooks import FOLDER
+
+LARGEST = 1_000_000  # bytes
+
+# Pieces of the code of each notebook, and what replaces them, so that the same cells take less time.
+SHORTER: dict[str, Mapping[str, str]] = {
+    # Two recordings are fitted, and one is predicted; tests/calibration/test_calibration.py takes more.
+    "calibration": {"logs[0::2]": "logs[0:4:2]", "for log in held_out])": "for log in held_out[:1]])"},
+    "camera": {
+        "np.geomspace(0.1, 100.0, 13)": "np.geomspace(0.1, 10.0, 3)",
+        "horizon=24.0": "horizon=4.0",
+        "problem.sweep(5, ": "problem.sweep(2, ",
+        "tried = lights": 'tried = {"beside, 70 deg": lights["beside, 70 deg"]}',
+        "assert worst[1] < worst[0]": "assert worst[1] < worst[0] + 1.0",
+    },
+    "capture": {
+        "[0.5, 7.0, 12.0]": "[0.5, 1.0, 1.5]",
+        "horizon=16.0": "horizon=8.5",
+        "[0.5, 1.0, 2.0, 4.0, 16.0]": "[2.0]",
+    },
+    "cart_pole": {},
+    "controller": {},
+    "crater": {
+        "heading_reasoner(scenario)": "heading_reasoner(scenario, candidates=3, executor='serial')",
+        "import explain, passes": "import COUNTERFACTUALS, explain, passes\n\n"
+        "del COUNTERFACTUALS['boulders'], COUNTERFACTUALS['the gully']",
+        "explain(scenario, failing)": "explain(scenario, failing, executor='serial')",
+        "most=2, count=20": "most=1, count=4",
+    },
+    "forest": {
+        "width=640, height=400": "width=160, height=100",
+        "length=25.0": "length=2.0",
+        "cycles=200": "cycles=60",
+        "PARTED, END = 18.0, 25.0": "PARTED, END = 3.0, 5.0",
+    },
+    "payload": {
+        "values=[0, 20, 30, 40, 60]": "values=[0, 60]",
+        "resolution=2.0, coarse=10.0": "resolution=5.0, coarse=15.0",
+        "horizon=15.0": "horizon=10.0",
+    },
+    "steering": {
+        "study.run(rollouts=60": "study.run(rollouts=30",
+        '"budget", rollouts=120': '"budget", rollouts=60',
+        "study.run(rollouts=120": "study.run(rollouts=60",
+        'solver="bayesian", seed=1).run(rollouts=120': 'solver="bayesian", seed=1).run(rollouts=20',
+    },
+}
+
+
+def test_every_notebook_has_a_test() -> None:
+    names = {path.stem for path in FOLDER.glob("*.ipynb")}
+    assert names
+    assert set(SHORTER) == names
+
+
+def test_every_notebook_is_smaller_than_1_mb() -> None:
+    sizes = {path.name: path.stat().st_size for path in FOLDER.glob("*.ipynb")}
+    assert {name: size for name, size in sizes.items() if size > LARGEST} == {}
+
+
+@pytest.mark.parametrize("name", SHORTER)
+def test_is_stored_with_text_and_plots(name: str) -> None:
+    check_stored(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHORTER)
+def test_runs(name: str) -> None:
+    check_runs(name, shorter=SHORTER[name])

@@ -1,0 +1,1 @@
+"""Tools that every folder may use: arrays, settings, checks of arguments, errors, child processes, Ctrl-C, splines."""

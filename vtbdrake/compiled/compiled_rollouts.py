@@ -1,0 +1,562 @@
+"""Many rollouts of a compiled Diagram in one call."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import inf
+from typing import Any, NoReturn
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from vtbdrake.common.argument_checks import as_addresses, as_array, as_flag, as_number, as_whole
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.lru import LruDict
+from vtbdrake.compiled.equations import Timing, UnsupportedTestbedError
+from vtbdrake.compiled.schedule import Instant, schedule
+from vtbdrake.compiled.walker import InstantOutputs, Walker
+from vtbdrake.components.casadi_system.kernel import TRANSLATIONS, Buffers
+from vtbdrake.drake_workarounds.making import making
+from vtbdrake.state import Variables
+from vtbdrake.testbed.addressed import check_root
+from vtbdrake.testbed.instants import sample_instants, sample_times
+
+_log = logging.getLogger(__name__)
+
+# Steps that are called one after the other before they become a function of their own.
+_UNROLLED = 16
+# Largest number of rollouts in one call of a function.
+_MOST_ROLLOUTS = 128
+# Largest size of the arguments and results of one call, in bytes.
+MOST_BYTES = 8_000_000
+# Number of batch sizes for which a function is kept, with its memory.
+_MAX_SIZES = 16
+# Number of lengths of rollouts, in instants, for which a program is kept.
+_MAX_PROGRAMS = 8
+
+# Samples and updates of a rollout; ten million take about 5 GB.
+_MOST_INSTANTS = 1e7
+
+
+@dataclass(frozen=True)
+class CompiledBatch:
+    """The results of n rollouts.
+
+    Attributes:
+        times: The sample times from the begin, shape (m,), in seconds.
+        outputs: The recorded values by address, each of shape (n, m, ...).
+        final: The vectors z of state and parameters at the end, shape (n, nz).
+        valid: Mask of the rollouts that equal the Diagram's, shape (n,): all state is finite all the time, and no joint
+            reaches a stop, which the compiled plant does not have, also in what is recorded at the samples.
+    """
+
+    times: Array
+    outputs: Mapping[str, Array]
+    final: Array
+    valid: NDArray[np.bool_]
+
+
+class CompiledRollouts:
+    """A Diagram as one function for a whole rollout; see `VirtualTestbed.compiled`.
+
+    A rollout is the one that Drake's Simulator makes: the same updates in the same order. Several threads may call it
+    at once.
+
+    Attributes:
+        walker: The Diagram as expressions.
+        parameters: The addresses that a call can vary; others that lie in the compiled state can be, too.
+        outputs: The addresses that are recorded.
+        times: The sample times from the begin (s), shape (m,).
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        variables: Variables,
+        context: Context,
+        *,
+        horizon: float,
+        sample_period: float,
+        parameters: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+        measures: Mapping[str, tuple[casadi.Function, Sequence[str]]] | None = None,
+        timings: Sequence[tuple[float, float]] | None = None,
+        compile: bool | None = None,
+        check: bool = True,
+        workers: int = 1,
+    ) -> None:
+        """Compile a Diagram; raises the errors of `VirtualTestbed.compiled`.
+
+        Args:
+            diagram: The Diagram.
+            variables: Its variables.
+            context: A root context: the begin of a rollout, and what is compiled in.
+            horizon: The length of a rollout (s).
+            sample_period: The period of the samples (s).
+            parameters: Addresses that will vary.
+            outputs: Addresses to be recorded.
+            compile: Whether to make machine code; None: if there is a C compiler.
+            check: Whether to compare rollouts with Drake's.
+            workers: The number of threads for large batches.
+            measures: Functions of outputs that are recorded as well: name -> (function, addresses of its arguments).
+            timings: (period, offset) of all periodic events; by default the events of the compiled systems.
+        """
+        _check_times(horizon, sample_period)
+        _check_options(compile, check, workers)
+        check_root(diagram, context)
+        self.parameters = parameters = as_addresses("what varies", parameters)
+        self.outputs = as_addresses("what to record", outputs)
+        self._measures = dict(measures or {})
+        self._translate = TRANSLATIONS[compile]
+        self._workers = workers
+        # One thread at a time: CasADi counts the references to its expressions without atomics.
+        with making():
+            self.walker = Walker(diagram, context.Clone(), variables, parameters)
+            self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
+            self._w = casadi.SX.sym("w", max(1, self.walker.noise))
+            recorded, doubt = self._recorded_values()
+            self._shapes = {
+                name: variables[name].shape if name in variables else (value.numel(),)
+                for name, value in recorded.items()
+            } | dict.fromkeys(self._measures, ())
+            ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self._shapes.values())]).tolist()
+            self._columns = {name: slice(*ends[k : k + 2]) for k, name in enumerate(self._shapes)}
+            result = casadi.densify(casadi.vertcat(*recorded.values(), doubt))
+            self._record = casadi.Function("record", [self._z, self._time, self._w], [result], {"cse": True})
+            self._updates = [self._update(timing) for timing in self.walker.timings]
+        for address in parameters:
+            self.walker.place(address)
+        _refuse_many_instants(horizon, sample_period, [timing.period for timing in self.walker.timings])
+        self.times = sample_times(horizon, sample_period)
+        by_default = [(timing.period, timing.offset) for timing in self.walker.timings]
+        self._timings = by_default if timings is None else list(timings)
+        self._z0 = self.walker.read(self.walker.context)
+        self._programs: LruDict[int, _Program] = LruDict(_MAX_PROGRAMS)
+        self._last_schedule: tuple[float, list[Instant]] = np.nan, []
+        self._last_plan: tuple[list[Instant], _Program, Array] | None = None
+        self._last_noise: tuple[object, Array] = None, np.zeros(0)
+        self._lock = threading.Lock()
+        self._refuse_initialization()
+        program = self._program(self.schedule_at(context.get_time()))
+        if compile is None and not program.is_machine_code:
+            _log.warning("the testbed is interpreted by CasADi, several times more slowly: see `vtbdrake doctor`")
+        if check:
+            from vtbdrake.compiled.agreement import check_rollouts
+
+            check_rollouts(self, self.walker.context)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "compiled rollouts cannot be pickled or copied: send the scenario, build it and compile it there; machine "
+            "code that is there already is found"
+        )
+
+    def __call__(
+        self, values: Mapping[str, ArrayLike] | None = None, *, context: Context | None = None
+    ) -> CompiledBatch:
+        """Make n rollouts.
+
+        Args:
+            values: Address -> values that are set at the begin: of all rollouts, in the variable's shape, or of each,
+                with n in front.
+            context: The root context from which the rollouts begin, by default the one that was compiled.
+
+        Raises:
+            ValueError: An address cannot be varied, or a value has another shape, is not finite, out of bounds, or
+                impossible in another way; or the context is another Diagram's.
+            UnsupportedTestbedError: The context differs from the compiled one in what is compiled in.
+        """
+        if values is not None and not isinstance(values, Mapping):
+            raise ValueError(f"give what varies as {{address: values, ...}}, not as {values!r}")
+        start = self.walker.context if context is None else context
+        return self.from_z(self.filled(self.z_of(start), values or {}), start.get_time())
+
+    def z_of(self, context: Context) -> Array:
+        """Return the vector of state and parameters of a root context, shape (nz,)."""
+        if context is self.walker.context:
+            return self._z0.copy()
+        check_root(self.walker.diagram, context)
+        self.walker.check(context)
+        return self.walker.read(context)
+
+    def filled(self, z: Array, values: Mapping[str, ArrayLike]) -> Array:
+        """Return n copies of z with values by address, shape (n, nz); see `__call__`.
+
+        Args:
+            z: State and parameters, shape (nz,).
+            values: Values by address; an array has n rows, one per copy.
+        """
+        arrays = {address: self._checked(address, value) for address, value in values.items()}
+        counts = {len(array) for array in arrays.values()} - {1}
+        if len(counts) > 1:
+            numbers = ", ".join(f"{len(array)} of {address}" for address, array in arrays.items())
+            raise ValueError(f"each rollout takes one value of each variable, but there are {numbers}")
+        batch = np.repeat(z[np.newaxis], counts.pop() if counts else 1, axis=0)
+        for address, array in arrays.items():
+            batch[:, self.walker.place(address)] = array
+        self.walker.settle(z, batch, arrays)
+        return batch
+
+    def _checked(self, address: str, value: ArrayLike) -> Array:
+        """Return the values of a variable, of one rollout or of n, as an array of shape (1 or n, size)."""
+        variable = self.walker.variables[address]
+        array = as_array(address, value)
+        many = array.ndim == len(variable.shape) + 1
+        if array.shape[many:] != variable.shape:
+            raise ValueError(f"{address} has the shape {variable.shape} or (n, ...) of it, not {array.shape}")
+        lower, upper = variable.bounds
+        allowed = np.isfinite(array) & (array >= lower) & (array <= upper)
+        if not allowed.all():
+            raise ValueError(
+                f"{address} must be finite and lie in {variable.bounds_text()}, but one value is {array[~allowed][0]}"
+            )
+        if not array.size and many:
+            raise ValueError(f"there are no values of {address}: give one, or one for each of the rollouts")
+        return array.reshape(len(array) if many else 1, -1)
+
+    def from_z(self, z: Array, t0: float) -> CompiledBatch:
+        """Make the rollouts that begin at the vectors z, shape (n, nz), and the time t0 (s).
+
+        Args:
+            z: State and parameters at the start, shape (n, nz).
+            t0: The time at the start, in s.
+        """
+        self.walker.check_fixed(z, self._z0)
+        instants = self.schedule_at(t0)
+        program, plan = self._planned(instants)
+        chunks = [z[k : k + program.most] for k in range(0, len(z), program.most)]
+
+        def run(chunk: Array) -> tuple[Array, Array]:
+            return program.run(chunk, self._noise(chunk, instants, program.count), plan)
+
+        if len(chunks) <= 1:
+            final, recorded = run(z)
+        else:
+            with ThreadPoolExecutor(self._workers) as pool:
+                results = list(pool.map(run, chunks))
+            final, recorded = (np.concatenate(parts) for parts in zip(*results, strict=True))
+        valid: NDArray[np.bool_] = np.all(recorded[:, :, -1] <= 0.0, axis=1)
+        outputs = {
+            name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self._shapes[name])
+            for name, columns in self._columns.items()
+        }
+        return CompiledBatch(self.times, outputs, final, valid)
+
+    def expressions(self, values: Mapping[str, Any]) -> dict[str, casadi.MX]:
+        """Return the outputs of one rollout as expressions, for CasADi's solvers and its derivatives.
+
+        They are interpreted, and so slower than a call. A mass does not scale an inertia that ``parameters`` names:
+        give both.
+
+        Args:
+            values: Address -> an expression of its value, a column; the rest is as in the compiled context.
+
+        Returns:
+            Address -> the recorded values, shape (size, m): one column per sample.
+
+        Raises:
+            ValueError: An address cannot be varied, or a value is no expression of its shape.
+        """
+        z = casadi.MX(self._z0)
+        for address, value in values.items():
+            place = self.walker.place(address)
+            size = place.stop - place.start
+            try:
+                expression = casadi.MX(value)
+            except NotImplementedError:  # An SX, or no number.
+                expression = casadi.MX(0, 0)
+            if expression.shape not in ((1, 1), (size, 1)):
+                raise ValueError(
+                    f"{address} takes a casadi.MX of the shape ({size}, 1), or numbers, not {type(value).__name__} of "
+                    f"{getattr(value, 'shape', None) or np.shape(value)}"
+                )
+            z[place] = expression
+        _, recorded = self.function(z, *self.arguments())
+        samples = [k for k, i in enumerate(self.schedule_at(self.walker.context.get_time())) if i.is_sample]
+        return {name: recorded[columns, samples] for name, columns in self._columns.items()}
+
+    def advanced(self, z: Array, instant: Instant) -> Array:
+        """Return z, shape (nz,), after what happens at an instant; it is interpreted.
+
+        Args:
+            z: State and parameters, shape (nz,).
+            instant: The instant, with its events.
+        """
+        w = self._noise_at(z, instant)
+        for unrestricted in (True, False):
+            before = z
+            for k in instant.updates:
+                if self.walker.timings[k].unrestricted == unrestricted:
+                    z = self._updates[k](before, z, instant.time, w).full().ravel()
+        return z
+
+    def recorded(self, z: Array, instant: Instant) -> tuple[dict[str, Array], float]:
+        """Return the recorded values of an instant by address, flat, and the doubt about them; it is interpreted.
+
+        Args:
+            z: State and parameters, shape (nz,).
+            instant: The instant.
+        """
+        values = self._record(z, instant.time, self._noise_at(z, instant)).full().ravel()
+        return {name: values[columns] for name, columns in self._columns.items()}, values[-1]
+
+    def read(self, address: str, context: Context) -> Any:
+        """Return the value of an output in a root context.
+
+        Args:
+            address: Address of the output.
+            context: A root context of the testbed.
+        """
+        return self.walker.reader(address)(context)
+
+    @property
+    def function(self) -> casadi.Function:
+        """Return the function of one rollout for CasADi's solvers: (z, instants, w) -> (z at the end, recorded).
+
+        It is interpreted, and has derivatives. z is made by `filled`, its entries are told by ``walker.place``; the
+        other arguments are returned by `arguments`. The recorded values have a column per instant; the last one is
+        positive where z or they differ from the Diagram's.
+        """
+        return self._program(self.schedule_at(self.walker.context.get_time())).function
+
+    def arguments(self) -> tuple[Array, Array]:
+        """Return the arguments of `function` beside z: the instants, shape (m, count), and the random numbers of s0."""
+        instants = self.schedule_at(self.walker.context.get_time())
+        program, plan = self._planned(instants)
+        noise = self._noise(self._z0[np.newaxis], instants, program.count)
+        return plan.T, np.zeros((self._w.numel(), program.count)) if noise is None else noise[0].T
+
+    # -- how it is done
+
+    def _refuse_initialization(self) -> None:
+        probe = self.walker.context.Clone()
+        simulator = Simulator(self.walker.diagram, probe)
+        simulator.Initialize()
+        z = self.walker.read(probe)
+        for block in self.walker.blocks.values():
+            if not np.array_equal(z[block.entries], self._z0[block.entries], equal_nan=True):
+                raise UnsupportedTestbedError(
+                    f"{block.path} is changed by an initialization event, which is not compiled: keep this testbed in "
+                    "Drake, or compile it in a context that is initialized"
+                )
+
+    def _outputs_at_instant(self) -> InstantOutputs:
+        return InstantOutputs(self.walker, self._z, self._time, self._w)
+
+    def _recorded_values(self) -> tuple[dict[str, casadi.SX], casadi.SX]:
+        """Return the recorded values by name, and the doubt."""
+        measured = (address for _, of in self._measures.values() for address in of)
+        addresses = list(dict.fromkeys([*self.outputs, *measured]))
+        values, doubt = self.walker.record(addresses, self._outputs_at_instant())
+        recorded = {address: values[address] for address in self.outputs}
+        for name, (function, of) in self._measures.items():
+            recorded[name] = casadi.densify(function(*(values[address] for address in of)))
+        return recorded, doubt
+
+    def _update(self, timing: Timing) -> casadi.Function:
+        """Return the function (before, z, time, w) -> z of the updates of a timing.
+
+        ``before`` is the z before all updates of its kind, which are unrestricted or not.
+        """
+        z = casadi.SX.sym("z", self.walker.size)
+        following = self.walker.update(timing, self._outputs_at_instant(), z)
+        return casadi.Function("update", [self._z, z, self._time, self._w], [following], {"cse": True})
+
+    def schedule_at(self, t0: float) -> list[Instant]:
+        """Return the instants of a rollout that begins at t0 (s)."""
+        t_last, instants = self._last_schedule
+        if t_last != t0:
+            instants = schedule(self.walker.timings, sample_instants(self.times, t0, self._timings))
+            self._last_schedule = t0, instants
+        return instants
+
+    def _program(self, instants: Sequence[Instant]) -> _Program:
+        """Return a program for as many instants; updates may coincide at any of them."""
+        with self._lock, making():
+            needed = len(instants)
+            for count, program in self._programs.items():
+                if needed <= count <= 1.25 * needed + 4:
+                    self._programs.use(count)
+                    return program
+            # Rollouts of this length that begin at other times may have some more.
+            count = needed + len(self.walker.timings)
+            unrestricted = [timing.unrestricted for timing in self.walker.timings]
+            function = _rollout(self._updates, unrestricted, self._record, count)
+            program = _Program(function, count, self._translate)
+            self._programs.add(count, program)
+            return program
+
+    def _noise_at(self, z: Array, instant: Instant) -> Array:
+        """Return the random numbers of one instant, shape (noise,)."""
+        w: Array = self.walker.draw_numbers(self.walker.seeds(z[np.newaxis]), [instant], 1)[0, 0]
+        return w
+
+    def _planned(self, instants: list[Instant]) -> tuple[_Program, Array]:
+        """Return the program for some instants, and its plan of them; both are kept for the last begin."""
+        last = self._last_plan
+        if last is None or last[0] is not instants:
+            program = self._program(instants)
+            last = self._last_plan = instants, program, program.plan(instants)
+        return last[1:]
+
+    def _noise(self, z: Array, instants: Sequence[Instant], count: int) -> Array | None:
+        """Return the random numbers of all rollouts and instants, shape (n, count, noise), or (1, ...) if all agree."""
+        if not self.walker.noise:
+            return None
+        seeds = self.walker.seeds(z)
+        if (seeds == seeds[0]).all():
+            seeds = seeds[:1]
+        key = seeds.tobytes(), instants[0].time, count
+        last = self._last_noise
+        if last[0] != key:
+            last = self._last_noise = key, self.walker.draw_numbers(seeds, instants, count)
+        return last[1]
+
+
+class _Program:
+    """The rollout over a number of instants as machine code.
+
+    Attributes:
+        count: The number of instants.
+        function: The function of one rollout; see `_rollout`.
+        most: The largest number of rollouts in one call of `run`.
+    """
+
+    def __init__(
+        self, function: casadi.Function, count: int, translate: Callable[[casadi.Function], casadi.Function]
+    ) -> None:
+        self.count = count
+        self.function = function
+        arguments = self.function.mx_in()
+        results: Any = self.function(*arguments)
+        packed = casadi.Function("rollout", arguments, [casadi.vertcat(*map(casadi.vec, results))])
+        self._packed = translate(packed)
+        self.is_machine_code = self._packed is not packed
+        bytes_each = 8 * (packed.nnz_in() + packed.nnz_out())
+        self.most = min(max(MOST_BYTES // bytes_each, 1), _MOST_ROLLOUTS)
+        self._buffers: LruDict[int, Buffers] = LruDict(_MAX_SIZES)
+        self._lock = threading.Lock()
+
+    def plan(self, instants: Sequence[Instant]) -> Array:
+        """Return [time, whether to record, whether each timing is due] of each instant, shape (count, 2 + timings)."""
+        plan = np.zeros((self.count, self.function.size1_in(1)))
+        for row, instant in zip(plan, instants, strict=False):
+            row[:2] = instant.time, instant.is_sample
+            row[[2 + k for k in instant.updates]] = 1.0
+        return plan
+
+    def run(self, z: Array, noise: Array | None, plan: Array) -> tuple[Array, Array]:
+        """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny); see `plan`."""
+        n, nz = z.shape
+        with self._lock:
+            buffers = self._buffers.use(n)
+            if buffers is None:
+                buffers = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
+                self._buffers.add(n, buffers)
+        arguments, evaluate, result = buffers.parts
+        arguments[: n * nz] = z.ravel()
+        arguments[n * nz : n * (nz + plan.size)].reshape(n, -1)[:] = plan.ravel()
+        if noise is not None:
+            arguments[n * (nz + plan.size) :].reshape(n, -1)[:] = noise.reshape(len(noise), -1)
+        evaluate()
+        # The thread's next call overwrites the result.
+        rows = result.reshape(n, -1)
+        recorded = rows[:, nz:].reshape(n, self.count, -1)
+        return rows[:, :nz].copy(), recorded[:, plan[:, 1] != 0.0]
+
+
+def _check_options(compile: bool | None, check: bool, workers: int) -> None:
+    if as_whole("the number of workers", workers) < 1:
+        raise ValueError(f"compiled rollouts need at least one worker, not {workers}")
+    if compile is not None:
+        as_flag("compile", compile)
+    as_flag("check", check)
+
+
+def _check_times(horizon: float, sample_period: float) -> None:
+    for name, time in {"horizon": horizon, "sample period": sample_period}.items():
+        if not 0.0 < as_number(f"the {name}", time) < inf:
+            raise ValueError(f"the {name} is a positive time in seconds, not {time}")
+
+
+def _refuse_many_instants(horizon: float, sample_period: float, periods: Sequence[float]) -> None:
+    """Refuse a rollout whose samples, and updates with these periods (s), do not fit into memory."""
+    instants = horizon / sample_period + sum(horizon / period for period in periods)
+    if instants > _MOST_INSTANTS:
+        raise ValueError(
+            f"a rollout of {horizon:g} s, with a sample each {sample_period:g} s, has {instants:.3g} samples and "
+            f"updates, but at most {_MOST_INSTANTS:g} fit into memory when it is compiled: take a longer sample "
+            "period, or a shorter horizon"
+        )
+
+
+def _rollout(
+    updates: Sequence[casadi.Function], unrestricted: Sequence[bool], record: casadi.Function, count: int
+) -> casadi.Function:
+    """Return the function (z, instants, w) -> (z, recorded) of ``count`` instants.
+
+    A column of ``instants`` is [time, whether to record, whether each of the updates is due]. Unrestricted updates come
+    first; all of one kind begin with the same z.
+
+    Args:
+        updates: The functions (before, z, time, w) -> z of the updates.
+        unrestricted: Whether each of them is an unrestricted update.
+        record: The function (z, time, w) of what is recorded.
+        count: The number of instants.
+    """
+    z, time, w = record.sx_in()
+    nothing = casadi.Function("nothing", [z, time, w], [casadi.SX.zeros(record.numel_out(0), 1)])
+    sample = casadi.Function.if_else("sample", record, nothing)
+    begin, instant, random = (
+        casadi.MX.sym(name, size) for name, size in (("z", z.numel()), ("instant", 2 + len(updates)), ("w", w.numel()))
+    )
+    state = begin
+    for kind in (True, False):
+        before = state
+        for k, update in enumerate(updates):
+            if unrestricted[k] == kind:
+                other = casadi.SX.sym("before", z.numel())
+                keep = casadi.Function(f"keep_{k}", [other, z, time, w], [z])
+                if_due = casadi.Function.if_else(f"due_{k}", update, keep)
+                state = if_due(instant[2 + k], before, state, instant[0], random)
+    recorded = sample(instant[1], begin, instant[0], random)
+    return _repeated(casadi.Function("step", [begin, instant, random], [state, recorded]), count)
+
+
+def _repeated(step: casadi.Function, count: int) -> casadi.Function:
+    """Return the function of ``count`` instants: blocks of blocks of steps, so that its code stays short."""
+    blocks = {1: step}
+    while max(blocks) * _UNROLLED < count:
+        size = max(blocks)
+        blocks[size * _UNROLLED] = _chained([blocks[size]] * _UNROLLED, [size] * _UNROLLED)
+    sizes: list[int] = []
+    for size in sorted(blocks, reverse=True):
+        sizes += [size] * ((count - sum(sizes)) // size)
+    return _chained([blocks[size] for size in sizes], sizes)
+
+
+def _chained(functions: Sequence[casadi.Function], sizes: Sequence[int]) -> casadi.Function:
+    """Return the function of the instants of several functions, one after the other."""
+    total = sum(sizes)
+    begin, instants, w = (
+        casadi.MX.sym(name, rows, columns)
+        for name, rows, columns in (
+            ("z", functions[0].size1_in(0), 1),
+            ("instants", functions[0].size1_in(1), total),
+            ("w", functions[0].size1_in(2), total),
+        )
+    )
+    ends = np.cumsum([0, *sizes]).tolist()
+    z, recorded = begin, []
+    parts = zip(functions, casadi.horzsplit(instants, ends), casadi.horzsplit(w, ends), strict=True)
+    for function, when, random in parts:
+        z, y = function(z, when, random)
+        recorded.append(y)
+    return casadi.Function(f"rollout_{total}", [begin, instants, w], [z, casadi.horzcat(*recorded)])

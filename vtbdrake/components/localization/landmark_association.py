@@ -1,0 +1,205 @@
+"""Association of the detections of a scan with the landmarks of a map, around a pose that is known roughly.
+
+Pairs of detection and landmark within a gate on the Mahalanobis distance, d² = νᵀ S⁻¹ ν with the innovation ν and its
+covariance S, are hypotheses. The one that agrees with most others, after the state has been conditioned on it, decides
+which pairs are possible; the best one-to-one assignment among them is taken. Diameters count in the assignment.
+
+The first match of a landmark, which is not in the state yet, may be wrong: its probability p is its density, divided by
+the sum of the densities of this pair, of all pairs that exclude it, and of what the map does not show. It must be at
+least 0.8, and d² within a narrower gate, because another landmark may be near on the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vtbdrake.common.arrays import Array, Indices
+from vtbdrake.components.estimation import chi_square_quantile, one_to_one, squared_distances
+from vtbdrake.components.localization.landmarks import Landmarks
+from vtbdrake.components.localization.planar import transform
+
+# Hypotheses that are tried in the association of a scan.
+_HYPOTHESES = 40
+
+# The density that competes with a first match is the density of all detections times these odds that a detection shows
+# something that is not on the map: assumed, on the safe side for a map that lacks a third of the trees.
+_UNMAPPED_ODDS = 2.0
+# Least probability of a first match.
+_LEAST_PROBABILITY = 0.8
+
+# The upper limit of -2 times the log-likelihood ratio of a diameter, as for three deviations: trunks are not cylinders.
+_DIAMETER_CAP = 9.0
+
+# Larger standard deviations of a diameter, in m, are cut to this one: the diameter is unknown.
+_NO_DIAMETER = 10.0
+
+
+class MatchedPairs(NamedTuple):
+    """Matches of detections with landmarks.
+
+    Attributes:
+        pairs: Indices of the detection and of the landmark on the map, (k, 2).
+        squares: Their d², (k,).
+        probability: The probabilities that they are right, (k,).
+    """
+
+    pairs: Indices
+    squares: Array
+    probability: Array
+
+    @classmethod
+    def none(cls) -> MatchedPairs:
+        """Return no matches."""
+        return cls(np.zeros((0, 2), dtype=np.intp), np.zeros(0), np.zeros(0))
+
+    def select(self, mask: NDArray[np.bool_]) -> MatchedPairs:
+        """Return the matches for which a mask (k,) is true."""
+        return MatchedPairs(self.pairs[mask], self.squares[mask], self.probability[mask])
+
+    def first(self, count: int) -> MatchedPairs:
+        """Return the first ``count`` matches."""
+        return self.select(np.arange(len(self.pairs)) < count)
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedDetections:
+    """The detections that are expected of m landmarks of a map.
+
+    Attributes:
+        indices: The indices of the landmarks on the map, (m,).
+        is_first: Whether each of them would be matched for the first time, (m,).
+        positions: The expected detections in the level frame H in m, (m, 2).
+        covariance: The covariances of all of them with each other in m², (m, m, 2, 2), without the noise of detections.
+    """
+
+    indices: Indices
+    is_first: NDArray[np.bool_]
+    positions: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """The association described in the module, for one map.
+
+    Attributes:
+        landmarks: The map, in W.
+        usable: Indices of the landmarks that may be matched, (n,).
+        variances: Variances of the expected detections of these in m², (n,), without the pose's variance.
+        field_of_view: The horizontal field of view in rad, for the density of detections.
+        gate: The share of right pairs that the gate lets pass.
+        first_gate: The same of first matches.
+    """
+
+    landmarks: Landmarks
+    usable: Indices
+    variances: Array
+    field_of_view: float
+    gate: float
+    first_gate: float
+    _tree: cKDTree = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_tree", cKDTree(self.landmarks.positions[self.usable]))
+
+    def nearby(self, X_WH: Array, covariance: Array, detections: Landmarks) -> Indices:
+        """Return the landmarks of the map that can be within the gate of a detection.
+
+        Args:
+            X_WH: The pose of the carrier, (3,).
+            covariance: The covariance P of the pose, (3, 3).
+            detections: The detections, in H, with their noise.
+        """
+        places = transform(X_WH, detections.positions)
+        levers = (detections.positions**2).sum(axis=1)
+        noise = np.trace(detections.covariances, axis1=1, axis2=2)
+        spread = noise + covariance[0, 0] + covariance[1, 1] + levers * covariance[2, 2]
+        gate = chi_square_quantile(self.gate, 2)
+        around = self._tree.query_ball_point(places, np.sqrt(gate * (spread + self.variances.max())))
+        rows = np.repeat(np.arange(len(places)), [len(neighbours) for neighbours in around])
+        near = np.concatenate([*around, []]).astype(np.intp)
+        squares = ((self._tree.data[near] - places[rows]) ** 2).sum(axis=1)
+        return self.usable[np.unique(near[squares <= gate * (spread[rows] + self.variances[near])])]
+
+    def matched(self, detections: Landmarks, expected: ExpectedDetections) -> MatchedPairs:
+        """Return the matches of detections, in H with their noise, with those that are expected.
+
+        Args:
+            detections: The detections of the scan, in H.
+            expected: The detections that are expected of landmarks nearby.
+        """
+        m = np.arange(len(expected.indices))
+        innovations = detections.positions[:, None] - expected.positions
+        covariances = expected.covariance[m, m] + detections.covariances[:, None]
+        squares = squared_distances(innovations, covariances)
+        threshold = chi_square_quantile(self.gate, 2)
+        i, j = np.nonzero(squares < threshold)
+        if not len(i):
+            return MatchedPairs.none()
+        agreeing, determinant = _agreeing(i, j, innovations[i, j], covariances[i, j], expected.covariance, threshold)
+        cost = agreeing + np.log(determinant) + self._diameter_cost(detections, i, expected.indices[j])
+        gain = np.zeros(squares.shape)
+        is_possible = agreeing < threshold
+        gain[i, j] = np.where(is_possible, 1.0 + cost[is_possible].max() - cost, 0.0)
+        rows, columns = one_to_one(gain)
+        density = np.zeros(squares.shape)
+        density[i, j] = np.exp(-0.5 * cost) / (2.0 * np.pi)
+        area = 0.5 * self.field_of_view * max(1.0, float((detections.positions**2).sum(axis=1).max()))
+        unmapped = _UNMAPPED_ODDS * len(detections) / area
+        rivals = density.sum(axis=0) + density.sum(axis=1)[:, None] - density
+        probability = (density / (unmapped + rivals))[rows, columns]
+        pairs = np.column_stack([rows, expected.indices[columns]])
+        matches = MatchedPairs(pairs, squares[rows, columns], probability)
+        is_sure = (probability >= _LEAST_PROBABILITY) & (matches.squares < chi_square_quantile(self.first_gate, 2))
+        return matches.select(is_sure | ~expected.is_first[columns])
+
+    def _diameter_cost(self, detections: Landmarks, rows: Indices, indices: Indices) -> Array:
+        """Return -2 times the log-likelihood ratio of diameters, of a right pair against any landmark of the map.
+
+        Args:
+            detections: The detections.
+            rows: The detections of the pairs, (k,).
+            indices: The landmarks of the pairs, (k,).
+        """
+        mapped, measured = self.landmarks.diameters, detections.diameters[rows]
+        noise = np.minimum(detections.diameter_deviations[rows], _NO_DIAMETER) ** 2
+        right = np.minimum(self.landmarks.diameter_deviations[indices], _NO_DIAMETER) ** 2 + noise
+        any_other = mapped.var() + noise
+        ratio = (measured - mapped[indices]) ** 2 / right + np.log(right / any_other)
+        # A diameter that is known no better than all diameters together carries no information.
+        cost = np.where(right < any_other, ratio - (measured - mapped.mean()) ** 2 / any_other, 0.0)
+        return np.minimum(cost, _DIAMETER_CAP)
+
+
+def _agreeing(i: Indices, j: Indices, nu: Array, S: Array, joint: Array, threshold: float) -> tuple[Array, Array]:
+    """Return the d² (k,) of pairs after conditioning on the one with which most others agree.
+
+    Also returned are the determinants, (k,) in m^4, of the conditional covariances; that pair keeps its own.
+
+    Args:
+        i: The detections of the pairs, (k,).
+        j: The landmarks of the pairs, (k,), as rows of ``joint``.
+        nu: Their innovations, (k, 2).
+        S: The covariances of those, (k, 2, 2).
+        joint: The covariances of all expected detections with each other, (m, m, 2, 2).
+        threshold: The largest d² of pairs that agree.
+    """
+    tried = np.unique(np.linspace(0, len(i) - 1, _HYPOTHESES).astype(int))
+    C = joint[j[:, None], j[tried]]
+    K = C @ np.linalg.inv(S[tried])
+    rest = nu[:, None] - np.einsum("pqij,qj->pqi", K, nu[tried])
+    spread = S[:, None] - K @ C.transpose(0, 1, 3, 2)
+    spread[tried, np.arange(len(tried))] = S[tried]
+    squares = squared_distances(rest, spread)
+    is_itself = np.arange(len(i))[:, None] == tried
+    is_rival = (i[:, None] == i[tried]) | (j[:, None] == j[tried])
+    squares = np.where(is_itself, 0.0, np.where(is_rival, np.inf, squares))
+    agreement = np.zeros((i.max() + 1, len(tried)))
+    np.maximum.at(agreement, i, np.maximum(threshold - squares, 0.0))
+    best = np.argmax(agreement.sum(axis=0))
+    return squares[:, best], np.maximum(np.linalg.det(spread[:, best]), 1e-12)

@@ -1,0 +1,323 @@
+// A watched variable: its entries with names, units and ranges, to be read, set and plotted.
+
+import { element, number } from "./common.js";
+import { draggables } from "./pad.js";
+import { Plot } from "./plot.js";
+import { shownUnit } from "./search.js";
+
+const ENTRIES = 12; // entries of an array that are shown
+
+/**
+ * A variable as the session describes it.
+ *
+ * @typedef {{ kind: string, shape: number[], unit: string, bounds: [(number | null)[], (number | null)[]],
+ *   settable: boolean, entries: string[], choices: { value: number, name: string }[] }} Variable
+ */
+
+/**
+ * An entry of a variable, with its controls.
+ *
+ * @typedef {{ text: any, slider?: any, choice?: any, row: any, lower: number | null, upper: number | null,
+ *   ranged: boolean }} Entry
+ */
+
+/**
+ * @param {string} unit of a variable; one of entries of several kinds lists the units of their groups, "rad/s, m/s"
+ * @param {number} size
+ * @returns {string[]} the unit of each entry; empty texts where groups are not of one size
+ */
+export function unitsOfEntries(unit, size) {
+  const units = unit.startsWith("(") ? [unit] : unit.split(", ");
+  if (units.length === 1) return Array(size).fill(shownUnit(unit));
+  if (size % units.length) return Array(size).fill("");
+  return Array.from({ length: size }, (_, index) => shownUnit(units[Math.floor((index * units.length) / size)]));
+}
+
+/**
+ * @param {number | null | undefined} lower
+ * @param {number | null | undefined} upper
+ * @returns {string} the range as text; empty if there is no bound
+ */
+function rangeText(lower, upper) {
+  const [least, most] = [lower, upper].map((bound) =>
+    bound === null || bound === undefined ? "" : String(Number(bound.toPrecision(3))),
+  );
+  if (least && most) return least === `-${most}` ? `±${most}` : `${least} to ${most}`;
+  if (least) return `from ${least}`;
+  return most ? `to ${most}` : "";
+}
+
+export class Watched {
+  /** @type {any[]} */
+  values = [];
+  draft = "none"; // "open" while a slider is dragged, "cancelled" until it is released
+  typing = false;
+  /** @type {Plot | null} */
+  plot = null;
+
+  /**
+   * @param {any} page
+   * @param {string} address
+   * @param {Variable} variable
+   */
+  constructor(page, address, variable) {
+    this.page = page;
+    this.address = address;
+    this.variable = variable;
+    const size = variable.shape.reduce((product, n) => product * n, 1);
+    this.size = Math.min(size, ENTRIES);
+    this.units = unitsOfEntries(variable.unit, size);
+    this.entries = Array.from({ length: this.size }, (_, index) => this.#entry(index));
+    this.draggables = variable.choices.length ? [] : draggables(this);
+    this.plotButton = element("button", {
+      className: "plain",
+      title: `plot ${address}`,
+      "aria-pressed": "false",
+      onclick: () => {
+        this.togglePlot();
+        this.plot?.root.scrollIntoView({ block: "nearest" });
+      },
+    });
+    this.plotButton.textContent = "plot";
+    this.pads = this.draggables.filter(({ root }) => !root.isConnected).map(({ root }) => root); // not in the scene
+    for (const pad of this.pads) pad.hidden = true;
+    this.root = element(
+      "section",
+      { className: "vtb-watched", "aria-label": address },
+      element(
+        "header",
+        {},
+        element("b", { title: address }, ...named(address)),
+        variable.shape.length ? element("span", { className: "vtb-unit" }, this.#summary()) : "",
+        ...this.pads.map((pad) => this.#padButton(pad)),
+        this.plotButton,
+        element(
+          "button",
+          { className: "plain", title: "remove", "aria-label": `remove ${address}`, onclick: () => page.unwatch(this) },
+          "×",
+        ),
+      ),
+      ...this.entries.map((entry) => entry.row),
+      ...this.pads,
+      size > ENTRIES ? element("small", {}, `and ${size - ENTRIES} more entries`) : "",
+    );
+    this.root.dataset.address = address;
+  }
+
+  /** @param {HTMLElement} pad */
+  #padButton(pad) {
+    const name = pad.classList.contains("dial") ? "dial" : "pad";
+    const shows = element("button", {
+      className: "plain",
+      title: `${name} of ${this.address}`,
+      "aria-pressed": "false",
+    });
+    shows.textContent = name;
+    shows.onclick = () => {
+      pad.hidden = !pad.hidden;
+      shows.setAttribute("aria-pressed", String(!pad.hidden));
+      pad.scrollIntoView({ block: "nearest" });
+    };
+    return shows;
+  }
+
+  // Unit and range, as far as they hold for all entries.
+  #summary() {
+    const units = new Set(this.units);
+    const unit = units.size > 1 ? "" : this.units[0] || shownUnit(this.variable.unit);
+    const ranges = new Set(this.entries.map(({ lower, upper }) => rangeText(lower, upper)));
+    this.hasOneRange = ranges.size === 1;
+    const range = this.hasOneRange && !this.variable.choices.length ? [...ranges][0] : "";
+    return [range, unit].filter(Boolean).join(" ");
+  }
+
+  /**
+   * @param {number} index
+   * @returns {string} the name of an entry: its own, or its indices
+   */
+  label(index) {
+    const { shape, entries } = this.variable;
+    if (!shape.length) return "";
+    if (entries.length) return entries[index];
+    return `[${shape.length === 2 ? `${Math.floor(index / shape[1])}, ${index % shape[1]}` : index}]`;
+  }
+
+  /**
+   * @param {number} index
+   * @returns {Entry}
+   */
+  #entry(index) {
+    const { settable, bounds, choices } = this.variable;
+    const [lower, upper] = bounds.map((side) => side[index]);
+    const label = this.label(index);
+    const name = label ? `${this.address} ${label}` : this.address;
+    const unit = this.units[index];
+    const title = [rangeText(lower, upper), unit].filter(Boolean).join(" ");
+    const caption = label
+      ? [element("span", { className: "vtb-label", title: label }, label, " ", element("small", {}, unit))]
+      : [];
+    const text = element("input", {
+      type: "text",
+      inputMode: "decimal",
+      readOnly: !settable,
+      title,
+      "aria-label": unit ? `${name} in ${unit}` : name,
+      onchange: () => {
+        this.typing = false; // What was refused gives way to the present value.
+        this.commit({ [index]: text.value.trim() ? Number(text.value) : NaN });
+      },
+      onfocus: () => (this.typing = true),
+      oninput: () => (this.typing = true),
+      onblur: () => (this.typing = false),
+    });
+    const after = label || !title ? [] : [element("span", { className: "vtb-unit" }, title)];
+    const entry = { text, lower, upper, ranged: false };
+    const row = (/** @type {any[]} */ ...controls) =>
+      element("div", { className: "vtb-entry" }, ...caption, ...controls);
+    if (choices.length) {
+      const choice = element(
+        "select",
+        {
+          "aria-label": name,
+          disabled: !settable,
+          onchange: () => this.commit({ [index]: Number(choice.value) }),
+        },
+        ...choices.map((option) => element("option", { value: String(option.value) }, option.name)),
+      );
+      return { ...entry, choice, row: row(choice) };
+    }
+    if (!settable) return { ...entry, row: row(text, ...after) };
+    const slider = element("input", {
+      type: "range",
+      step: "any",
+      title,
+      "aria-label": name,
+      onpointerdown: () => (this.draft = "none"),
+      oninput: () => this.preview({ [index]: Number(slider.value) }),
+      onchange: () => this.commit({ [index]: Number(slider.value) }),
+    });
+    return { ...entry, slider, row: row(slider, text, ...after) };
+  }
+
+  /**
+   * @param {Record<number, number>} changes entries by index
+   * @returns {any} the value of the variable with them
+   */
+  #with(changes) {
+    return this.#shaped(this.#changed(changes));
+  }
+
+  /** @param {any[]} values */
+  #shaped(values) {
+    return this.variable.shape.length ? this.page.shaped(values, this.variable.shape) : values[0];
+  }
+
+  /** @param {Record<number, number>} changes */
+  #changed(changes) {
+    return this.values.map((old, index) => changes[index] ?? old);
+  }
+
+  /**
+   * A drag is a draft: a fork of now runs ahead with it.
+   *
+   * @param {Record<number, number>} changes
+   */
+  preview(changes) {
+    if (this.draft === "cancelled") return;
+    this.draft = "open";
+    for (const [index, value] of Object.entries(changes)) {
+      const entry = this.entries[Number(index)];
+      entry.row.classList.add("draft");
+      entry.text.value = number(value);
+      entry.slider.value = value;
+    }
+    for (const part of this.draggables) part.show(this.#changed(changes));
+    this.page.preview(this, { [this.address]: this.#with(changes) });
+  }
+
+  /**
+   * The release commits, unless the draft was cancelled.
+   *
+   * @param {Record<number, number>} changes
+   */
+  commit(changes) {
+    const cancelled = this.draft === "cancelled";
+    this.close("none");
+    if (cancelled) return;
+    if (!Object.values(changes).every(Number.isFinite)) return this.page.say(`${this.address} takes a number`, "bad");
+    const before = this.values.every(Number.isFinite) ? { [this.address]: this.#shaped(this.values) } : null;
+    this.page.commit({ [this.address]: this.#with(changes) }, before);
+  }
+
+  /** @param {string} draft */
+  close(draft) {
+    this.draft = draft;
+    for (const { row } of this.entries) row.classList.remove("draft");
+  }
+
+  /**
+   * Shows a value. Where a state has none, as after a failure, the last one stays, marked.
+   *
+   * @param {number} time
+   * @param {any} value
+   */
+  show(time, value) {
+    const isKnown = value !== null;
+    this.root.classList.toggle("vtb-stale", !isKnown);
+    this.root.title = isKnown ? "" : "this state has no such value: the last one is shown";
+    if (isKnown || !this.values.length) this.values = Array.isArray(value) ? value : [value];
+    for (const [index, entry] of this.entries.entries()) this.#showEntry(entry, this.values[index]);
+    if (this.draft !== "open") for (const part of this.draggables) part.show(this.values);
+    if (isKnown) this.plot?.extend(time, this.values);
+  }
+
+  /**
+   * @param {Entry} entry
+   * @param {any} now
+   */
+  #showEntry(entry, now) {
+    if (this.draft === "open" || this.typing) return;
+    entry.text.value = typeof now === "string" ? now : number(now);
+    if (entry.choice && document.activeElement !== entry.choice) entry.choice.value = String(now);
+    const { slider } = entry;
+    if (!slider) return;
+    if (!entry.ranged || now < Number(slider.min) || now > Number(slider.max)) {
+      const reach = Math.max(2 * Math.abs(now), 1);
+      slider.min = entry.lower ?? now - reach;
+      slider.max = entry.upper ?? now + reach;
+      entry.ranged = true;
+    }
+    slider.value = now;
+  }
+
+  togglePlot() {
+    const plots = !this.plot;
+    this.plot?.destroy();
+    this.plot = null;
+    this.plotButton.setAttribute("aria-pressed", String(plots));
+    if (plots) {
+      const unit = new Set(this.units).size === 1 ? this.units[0] : this.variable.unit;
+      const names = this.entries.map((_, index) => this.label(index) || this.address.split(".").slice(-2).join("."));
+      this.plot = new Plot(this.address, unit, names);
+      this.root.append(this.plot.root);
+      this.plot.begin();
+    }
+    this.page.keepLayout();
+  }
+
+  remove() {
+    this.plot?.destroy();
+    for (const part of this.draggables) part.remove();
+    this.root.remove();
+  }
+}
+
+/**
+ * @param {string} address
+ * @returns {any[]} the address with its beginning, which many have, in a soft colour; it may break behind its dots
+ */
+function named(address) {
+  const parts = address.split(/(?<=\.)/);
+  const end = parts.slice(-2).flatMap((part) => [element("wbr"), part]);
+  return [element("i", {}, ...parts.slice(0, -2).flatMap((part) => [part, element("wbr")])), ...end];
+}

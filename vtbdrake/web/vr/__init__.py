@@ -1,0 +1,1 @@
+"""Headsets that open a live page lead a robot."""
