@@ -22,11 +22,15 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """The folder of the compiled functions, and the log of a compiler that writes down each of its runs."""
+    """The folder of the compiled functions, and the log of a compiler that writes down the arguments of its runs.
+
+    Here it optimizes.
+    """
     compiler = tmp_path / "logging_cc"
-    compiler.write_text(f'#!/bin/sh\necho run >> {tmp_path}/log\nexec {shutil.which("cc")} "$@"\n')
+    compiler.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/log\nexec {shutil.which("cc")} "$@"\n')
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.delenv("CFLAGS")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path
 
@@ -81,6 +85,15 @@ def test_a_function_is_compiled_once(cache):
     assert _runs(cache) == 1
     CasadiSystem(function(factor=3.0), compile=True)
     assert _runs(cache) == 2
+
+
+def test_flags_of_the_environment_override_the_optimization(cache, monkeypatch):
+    CasadiSystem(function(), compile=True)
+    monkeypatch.setenv("CFLAGS", "-O0 -DNAME='two words'")
+    CasadiSystem(function(), compile=True)
+    optimized, other = (cache / "log").read_text().splitlines()
+    assert optimized.startswith("-O2 -fPIC") and other.startswith("-O2 -O0 -DNAME=two words -fPIC")
+    assert " -ffp-contract=off " in optimized and " -ffp-contract=off " in other
 
 
 def test_what_the_compiled_function_need_not_compute_is_not_compiled(cache):

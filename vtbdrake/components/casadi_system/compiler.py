@@ -25,8 +25,6 @@ from vtbdrake.state.archive import whole_file
 
 _log = logging.getLogger(__name__)
 
-# Products and sums are rounded one by one, as the interpreted function does it.
-_FLAGS = ("-O2", "-fPIC", "-shared", "-ffp-contract=off")
 LONGEST_COMPILATION = 600.0
 """s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
 _ONE_AT_A_TIME = threading.Lock()
@@ -56,7 +54,7 @@ def compiled(function: casadi.Function) -> casadi.Function:
         raise ValueError(
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
-    command = (*compiler_command(), *_FLAGS)
+    command = _command_with_flags()
     recipe = "\n".join((source, *command, platform.system(), platform.machine(), "with its digest"))
     library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
     with _ONE_AT_A_TIME:
@@ -127,6 +125,16 @@ def compiler_command() -> tuple[str, ...]:
     return ("cc",)
 
 
+def _command_with_flags() -> tuple[str, ...]:
+    """Return the compiler's command with its flags, among them those in the environment variable CFLAGS.
+
+    With ``-O0`` there, a function is compiled several times as fast and computes the same, more slowly: in any case
+    products and sums are rounded one by one, as the interpreted function does it.
+    """
+    flags = shlex.split(os.environ.get("CFLAGS") or "")
+    return (*compiler_command(), "-O2", *flags, "-fPIC", "-shared", "-ffp-contract=off")
+
+
 def compile_library(source: str, library: Path) -> None:
     """Compile C code to a shared library, which is written whole or not at all, and ends with its digest.
 
@@ -137,7 +145,7 @@ def compile_library(source: str, library: Path) -> None:
     Raises:
         CompilerError: The compiler is missing or fails, or does not end.
     """
-    command = (*compiler_command(), *_FLAGS)
+    command = _command_with_flags()
     if shutil.which(command[0]) is None:
         raise CompilerError(
             f"compile=True needs a C compiler, and there is no {command[0]!r}: install one (such as gcc, or the extra "
