@@ -20,8 +20,8 @@ from hypothesis import settings
 # other take several times as long. Set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# A function that is compiled without optimization computes the same: most of the tests' functions are evaluated for less
-# time than a compiler needs to optimize them.
+# A function that is compiled without optimization computes the same: most of the tests' functions are evaluated for
+# less time than a compiler needs to optimize them.
 os.environ.setdefault("CFLAGS", "-O0")
 
 # How long an example takes depends on what else the computer does.

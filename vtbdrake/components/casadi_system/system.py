@@ -88,7 +88,8 @@ def CasadiSystem_(T: type) -> type:
             bounds: (lower, upper) of the entries of states and parameters, by name; infinite if left out.
             compile: Evaluates machine code, which gives the same results. The first time, it is made by the C compiler
                 ``cc`` (or CC, from the environment, with its CFLAGS), and kept in ``~/.cache/vtbdrake`` (or
-                XDG_CACHE_HOME). None does so where it is possible. A Jacobian of more than 100,000 operations is interpreted.
+                XDG_CACHE_HOME). None does so where it is possible. A Jacobian of more than 100,000 operations is
+                interpreted.
 
         Raises:
             ValueError: Names, sizes or arguments that do not fit together.
