@@ -383,3 +383,16 @@ def test_a_run_that_ends_in_the_fallbacks_has_failed(hub: Hub, ending: signal.Si
     assert program.returncode == 1
     assert "Error: the fallbacks took over: " in errors
     assert "sensor signal position is stale" in output
+
+
+@pytest.mark.slow
+def test_ctrl_c_before_the_first_cycle_is_a_proper_end(hub: Hub) -> None:
+    program = (
+        "import os, signal; import vtbdrake.cli.run as command\n"
+        "command.show = lambda *_: os.kill(os.getpid(), signal.SIGINT)\n"
+        "from vtbdrake.cli import main; main(prog_name='vtbdrake')"
+    )
+    command = [sys.executable, "-c", program, "run", SERVO, "--url", hub.url, "--priority", "0"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0, ended.stderr
+    assert "interrupted" in ended.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import click
@@ -40,7 +41,7 @@ page_options = grouped(
 browser_option = option("--browser/--no-browser", "Open the page in a browser.", name="browser", default=True)
 
 
-def serve(page: WebPage, *, browser: bool) -> None:
+def serve(page: WebPage, *, browser: bool, ready: Callable[[], object] | None = None) -> None:
     """Print an address of a page, open it, and return after Ctrl-C.
 
     An address is good for one browser: when one has used it, the next one is printed.
@@ -48,12 +49,15 @@ def serve(page: WebPage, *, browser: bool) -> None:
     Args:
         page: The page, which is served already.
         browser: Whether to open it in the user's browser.
+        ready: Called when Ctrl-C is the proper end.
     """
     ended = threading.Event()
     ends_well()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores it.
             signal.signal(number, lambda *_: ended.set())
+    if ready is not None:
+        ready()
 
     def print_next() -> None:
         say(f"for another browser: {page.address(used=print_next)}")

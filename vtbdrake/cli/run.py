@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,7 +118,7 @@ def run(
     try:
         with logging_in_thread(), loop as runtime:
             begin = runtime.clock.now()
-            with RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
+            with _until_interrupted(), RealTime(priority=priority or None, lock_memory=lock_memory) as real_time:
                 show(real_time, {"real_time": real_time.grants})
                 _run(runtime, wait=wait, seconds=seconds)
     except RunawayError as error:
@@ -149,8 +151,17 @@ def _report_faults(guards: Guards, begin: float) -> None:
         raise FailedError(f"the fallbacks took over: {'; '.join(causes)}")
 
 
+@contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Leave the block at Ctrl-C: from here on, that is how a run ends."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _log.info("interrupted")
+
+
 def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
-    """Take over, and run until the time is up or Ctrl-C."""
+    """Take over, and run until the time is up."""
     from vtbdrake.control.switching import SwitchRefusedError
 
     try:
@@ -159,5 +170,3 @@ def _run(runtime: Runtime, *, wait: float, seconds: float | None) -> None:
         runtime.run(seconds=seconds)
     except SwitchRefusedError as error:
         raise FailedError(f"not switched to the machine {one_line(error)}") from error
-    except KeyboardInterrupt:
-        _log.info("interrupted")

@@ -196,6 +196,4 @@ def view(
         viewed = None if scenario.record() == type(scenario)().record() else scenario
     page |= {"problem": problem, "study": study, "trusted": trusted, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
-        if play:
-            running.session.play()
-        serve(running, browser=browser)
+        serve(running, browser=browser, ready=running.session.play if play else None)

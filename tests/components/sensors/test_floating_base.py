@@ -32,7 +32,7 @@ def base(plant: MultibodyPlant) -> RigidBody:
 
 def test_sensors_show_pose_and_twist(plant: MultibodyPlant) -> None:
     context = plant.CreateDefaultContext()
-    plant.SetFreeBodySpatialVelocity(context=context, body=base(plant), V_PB=V_WB)
+    plant.SetFreeBodySpatialVelocity(context, base(plant), V_WB)
     state = plant.GetPositionsAndVelocities(context)
     pose, twist = BasePoseSensor(plant, base(plant), period=0.01), BaseTwistSensor(plant, base(plant), period=0.01)
     expected = [*X_WB.rotation().ToQuaternion().wxyz(), *X_WB.translation()]
