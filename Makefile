@@ -15,6 +15,9 @@ STAMP := $(VENV)/.vtbdrake-installed
 ASKED := $(if $(filter file,$(origin PYTHON)),,$(PYTHON))
 STALE := $(shell tools/setup.sh --check "$(VENV)" "$(ASKED)" || echo stale)
 
+# Every child process of the tests imports the package, and starts sooner with byte code.
+unexport PYTHONDONTWRITEBYTECODE
+
 # What is compiled, and what lcm-gen makes modules of.
 SOURCES := $(shell find vtbdrake diagrams -name '*.pyx' -o -name '*.pxd' -o -name '*.lcm')
 

@@ -9,7 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from tools.house import ROOT, function_lines, homonyms, packed_constant_lines, packed_constants, syntax_trees
+from tools.house import (
+    ROOT,
+    function_lines,
+    homonyms,
+    packed_constant_lines,
+    packed_constants,
+    source_files,
+    syntax_trees,
+)
 
 pytestmark = pytest.mark.one_python
 
@@ -110,9 +118,9 @@ POINTING_ANYWHERE = re.compile(r"that of|those of|so many|of which|\bOf [a-z]")
 # A docstring says the type first: "Return the indices of ...", not "Return which ...".
 UNTYPED = re.compile(r"Returns? (?:all that|how|that|what|when|where|which|who|why)\b")
 SOURCES = ("vtbdrake", "diagrams", "benchmarks", "tests", "tools")
-FILES = {folder: [path for path in syntax_trees(folder) if path != Path(__file__)] for folder in SOURCES} | {
-    "docs": [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
-}
+FILES = {
+    folder: [path for path in source_files(".py", folder=folder) if path != Path(__file__)] for folder in SOURCES
+} | {"docs": [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]}
 
 
 def prose(source: str) -> Iterator[tuple[int, str]]:

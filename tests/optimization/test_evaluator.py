@@ -1,6 +1,8 @@
 """Racing: what it leaves out never changes the best point, for every problem, risk and solver."""
 
+import functools
 import importlib.util
+import itertools
 import random
 
 import numpy as np
@@ -53,12 +55,12 @@ def problem(conditions: int, risk, *, quality=QUALITIES["maximized up to 1"], co
 
 
 LIMIT = Constraint(abs, THETA, at_most=1.0)
-STATED = {
-    (n, quality, constrained): problem(n, "worst", quality=QUALITIES[quality], constraints=[LIMIT] * constrained)
-    for n in (2, 4, 7)
-    for quality in QUALITIES
-    for constrained in (False, True)
-}
+KINDS = list(itertools.product((2, 4, 7), QUALITIES, (False, True)))
+
+
+@functools.cache
+def stated_problem(conditions: int, quality: str, constrained: bool) -> Problem:
+    return problem(conditions, "worst", quality=QUALITIES[quality], constraints=[LIMIT] * constrained)
 
 
 def outcome(value: float, violation: float | None = None, end: str = "horizon") -> Outcome:
@@ -94,13 +96,13 @@ def by_definition(risk: Risk, h: np.ndarray) -> float:
 @given(
     st.integers(0, 10_000),
     st.one_of(risks, st.just(Weighted())),
-    st.sampled_from(list(STATED)),
+    st.sampled_from(KINDS),
     st.sampled_from([0.0, 0.05, 0.9]),
     st.sampled_from([10, 60, np.inf]),
 )
 def test_racing_finds_the_winner_of_brute_force_with_no_more_rollouts(seed, risk, kind, failing, budget):
     rng = np.random.default_rng(seed)
-    stated, conditions, sign = STATED[kind], kind[0], -1.0 if kind[1] == "minimized" else 1.0
+    stated, conditions, sign = stated_problem(*kind), kind[0], -1.0 if kind[1] == "minimized" else 1.0
     stated.risk = risk
     points = [(float(p),) for p in rng.permutation(24) / 24.0]
 
