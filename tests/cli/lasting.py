@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from pydrake.systems.framework import Context, LeafSystem
 
@@ -50,9 +48,3 @@ def judge(angle: float) -> float:
     """Return a quality that is computed for ever."""
     last(JUDGING)
     return angle
-
-
-def problem() -> Callable[..., Any]:
-    """Make a problem for ever."""
-    last(BUILDING)
-    return problem

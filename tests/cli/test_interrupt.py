@@ -1,4 +1,7 @@
-"""One Ctrl-C ends every command, in every state: real processes, interrupted as soon as they say where they are."""
+"""One Ctrl-C ends a command in every kind of state: real processes, interrupted as soon as they say where they are.
+
+Commands share how they import and build a scenario: one of them shows it, or one of each kind of loop.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,6 @@ ONCE = ("--horizon", 0.3, "--sample-period", 0.1)
 GRID = ("--vary", f"{ANGLE}=-1:1:50", "--quality", ANGLE, *ONCE)
 SEARCH = ("--vary", f"{ANGLE}=-1:1", "--quality", ANGLE, *ONCE, "--solver", "sobol", "--rollouts", 100_000)
 LIMIT = ("--vary", f"{ANGLE}=0:1", "--threshold", 0.5, "--resolution", 0.1, "--coarse", 0.1, "--quality", ANGLE, *ONCE)
-FIT = ("--position", "joint_state", "--torque", "torque", "--vary", "sim.sys.Pendulum.theta.damping=0:1")
 SERIAL, THREADS = ("--executor", "serial"), ("--executor", "threads", "--workers", 2)
 PROCESSES = ("--executor", "processes", "--workers", 2)
 PAGE = "--no-browser"
@@ -67,7 +69,7 @@ class Places:
 
     def filled(self, word: object) -> str:
         text = str(word)
-        for name in ("tmp", "log", "snapshot", "study", "campaign", "hub"):
+        for name in ("tmp", "log", "study", "campaign", "hub"):
             if f"{{{name}}}" in text:
                 text = text.replace(f"{{{name}}}", str(getattr(self, f"_{name}")))
         return text
@@ -92,12 +94,6 @@ class Places:
         with Recorder(servo.runtime, path):
             servo.runtime.run(cycles=20)
         return path
-
-    @property
-    def _snapshot(self) -> Path:
-        testbed = PendulumScenario().build()
-        testbed.snapshot(testbed.default_context()).save(self._folder / "a.vtb")
-        return self._folder / "a.vtb"
 
     @property
     def _study(self) -> Path:
@@ -149,58 +145,32 @@ def case(name: str, *arguments: object, until: str, code: int = 1, marks: Any = 
     [
         # A testbed is looked at.
         case("variables, importing", "variables", IMPORT, until=IMPORTING),
-        case("variables, building", "variables", BUILD, until=BUILDING, marks=slow),
-        case("diagram, building", "diagram", BUILD, "-o", "{tmp}/a.svg", until=BUILDING, marks=slow),
         case("rollout, building", "rollout", BUILD, *ONCE[:2], until=BUILDING, marks=slow),
         case("rollout, stepping", "rollout", STEP, *ONCE[:2], until=STEPPING, marks=slow),
         # Rollouts.
-        case("sweep, importing", "sweep", IMPORT, *GRID, until=IMPORTING, marks=slow),
-        case("sweep, building", "sweep", BUILD, *GRID, until=BUILDING, marks=slow),
         case("sweep, serial", "sweep", STEP, *GRID, *SERIAL, until=STEPPING),
-        case("sweep, threads", "sweep", STEP, *GRID, *THREADS, until=STEPPING, marks=slow),
         case("sweep, processes", "sweep", STEP, *GRID, *PROCESSES, until=STEPPING, marks=slow),
         case("boundary, stepping", "boundary", STEP, *LIMIT, *SERIAL, until=STEPPING, marks=slow),
-        case("study run, importing", "study", "run", "{tmp}/a.db", IMPORT, *SEARCH, until=IMPORTING, marks=slow),
-        case("study run, building", "study", "run", "{tmp}/a.db", BUILD, *SEARCH, until=BUILDING, marks=slow),
         case("study run, serial", "study", "run", "{tmp}/a.db", STEP, *SEARCH, *SERIAL, until=STEPPING),
         case("study run, threads", "study", "run", "{tmp}/a.db", STEP, *SEARCH, *THREADS, until=STEPPING, marks=slow),
-        case(
-            "study run, processes", "study", "run", "{tmp}/a.db", STEP, *SEARCH, *PROCESSES, until=STEPPING, marks=slow
-        ),
         case("study continue", "study", "continue", "{study}", "--rollouts", 9, *TRUST, until=JUDGING, marks=slow),
         case("campaign, judging", "campaign", "{campaign}", until=JUDGING, marks=slow),
-        case("calibrate, importing", "calibrate", IMPORT, "{log}", *FIT, until=IMPORTING, marks=slow),
         # Pages.
-        case("view, importing", "view", IMPORT, PAGE, until=IMPORTING, marks=slow),
         case("view, building", "view", BUILD, PAGE, until=BUILDING, marks=slow),
         case("view, serving", "view", PENDULUM, PAGE, until=URL, code=0, marks=slow),
         case("view, stepping", "view", STEP, PAGE, "--play", until=STEPPING, code=0),
-        case(
-            "view, problem",
-            "view",
-            PENDULUM,
-            PAGE,
-            "--problem",
-            "tests.cli.lasting:problem",
-            until=BUILDING,
-            marks=slow,
-        ),
         case("view, loop", "view", PENDULUM, PAGE, "--url", "{hub}", until=URL, code=0, marks=slow),
         case("view, log", "view", SERVO, PAGE, "--log", "{log}", until=URL, code=0, marks=slow),
-        case("open, serving", "open", "{snapshot}", PAGE, "--scenario", PENDULUM, until=URL, code=0, marks=slow),
         case("study open", "study", "open", "{study}", PAGE, *TRUST, until=URL, code=0, marks=slow),
         # Logs.
-        case("replay, importing", "replay", "{log}", "--scenario", IMPORT, until=IMPORTING, marks=slow),
         case("doctor, compiling", "doctor", until=COMPILING, marks=slow),
         # A loop and its machine.
         case("hub", "hub", "--port", 0, until="tcpq", code=0),
         case("machine, importing", "machine", IMPORT, "--url", "{hub}", until=IMPORTING, marks=slow),
         case("machine, running", "machine", MACHINE, "--url", "{hub}", until="ready", code=0, marks=slow),
-        case("run, importing", "run", IMPORT, "--url", "{hub}", until=IMPORTING, marks=slow),
         case("run, waiting", "run", MACHINE, "--url", "{hub}", "--priority", 0, until="switch interval", code=0),
         case("watch, waiting", "watch", "--url", "{hub}", "a", "--timeout", 600, until=CONNECTED, code=0),
         case("get, waiting", "get", "--url", "{hub}", "a", "--timeout", 600, until=CONNECTED, marks=slow),
-        case("reset, waiting", "reset", "--url", "{hub}", "--timeout", 600, until=CONNECTED, marks=slow),
     ],
 )
 def test_one_ctrl_c_ends_a_command(arguments: tuple[object, ...], until: str, code: int, places: Places) -> None:

@@ -77,7 +77,7 @@ def survives(make, expected, *modules, lines=False, every=1, warm=(False, True),
     return interrupted
 
 
-@pytest.mark.parametrize("every", [8, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [8, pytest.param(3, marks=pytest.mark.slow)])
 def test_ctrl_c_in_many_lines_of_a_serial_executor(expected, every):
     assert survives(SerialExecutor, expected, executor, testbeds, runner, lines=True, every=every) > 80 / every
 
@@ -90,36 +90,36 @@ def test_ctrl_c_in_many_lines_while_rollouts_begin_elsewhere():
     context.SetTime(0.5)
     begins = Start.of(testbed, context)
     expected = dict(SerialExecutor().run(TASK, POINTS, start=begins))
-    assert survives(SerialExecutor, expected, testbeds, runner, start, lines=True, every=2, begins=begins) > 40
+    assert survives(SerialExecutor, expected, testbeds, runner, start, lines=True, every=5, begins=begins) > 15
 
 
 @pytest.mark.slow
 def test_ctrl_c_anywhere_in_threads(expected):
     before = threading.active_count()
-    assert survives(lambda: ThreadExecutor(2), expected, executor, testbeds, runner) > 40
+    assert survives(lambda: ThreadExecutor(2), expected, executor, testbeds, runner, every=3) > 15
     assert threading.active_count() == before
 
 
 @pytest.mark.slow
 def test_ctrl_c_anywhere_in_a_pool(expected):
     with ThreadPoolExecutor(2) as pool:
-        assert survives(lambda: FuturesExecutor(pool), expected, futures, pickled_task, executor) > 40
+        assert survives(lambda: FuturesExecutor(pool), expected, futures, pickled_task, executor, every=3) > 15
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
 def test_ctrl_c_in_many_lines_of_processes(expected):
-    """Each costs a worker, which takes a second: so every fourth line is interrupted."""
+    """Each costs a worker, which takes a second: so every ninth line is interrupted."""
     before = child_pids()
     modules = worker_processes, child_process, pickled_task
-    options = {"lines": True, "every": 4, "warm": (True,)}
-    assert survives(lambda: ProcessExecutor(1), expected, *modules, **options) > 10
+    options = {"lines": True, "every": 9, "warm": (True,)}
+    assert survives(lambda: ProcessExecutor(1), expected, *modules, **options) > 4
     gc.collect()
     assert child_pids() == before
 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_ctrl_c_in_any_line_of_dask(cluster, expected):
-    options = {"lines": True, "warm": (True,)}
-    assert survives(lambda: dask.DaskExecutor(cluster.client), expected, dask, futures, **options) > 20
+def test_ctrl_c_in_many_lines_of_dask(cluster, expected):
+    options = {"lines": True, "every": 3, "warm": (True,)}
+    assert survives(lambda: dask.DaskExecutor(cluster.client), expected, dask, futures, **options) > 6
