@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("CFLAGS", "-O0")
 
 # How long an example takes depends on what else the computer does.
-settings.register_profile("patient", deadline=None)
+settings.register_profile("patient", deadline=None, max_examples=50)
 settings.register_profile("patient and quick", deadline=None, max_examples=25)
 settings.load_profile("patient")
 

@@ -57,10 +57,17 @@ def motion() -> Excitation:
     return excitation(SCENARIO, PARAMETERS, spline=SCENARIO.spline, noise=NOISE, starts=1, iterations=25)
 
 
+@pytest.fixture(scope="module")
+def designed(motion: Excitation) -> tuple[Log, dict[str, np.ndarray]]:
+    return driven(motion.knots)
+
+
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_limits_hold_between_the_knots_of_the_simulated_arm(motion: Excitation) -> None:
-    arm, (_, true) = Arm(), driven(motion.knots)
+def test_limits_hold_between_the_knots_of_the_simulated_arm(
+    motion: Excitation, designed: tuple[Log, dict[str, np.ndarray]]
+) -> None:
+    arm, (_, true) = Arm(), designed
     q, v = true["x"][:, :JOINTS], true["x"][:, JOINTS:]
     assert (q > arm.lower).all() and (q < arm.upper).all()
     assert (abs(v) < arm.speeds).all() and (abs(true["u"]) < np.array(arm.torques)).all()
@@ -74,15 +81,15 @@ def test_limits_hold_between_the_knots_of_the_simulated_arm(motion: Excitation) 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_calibration_with_the_designed_motion_leaves_less_than_with_a_naive_one(motion: Excitation) -> None:
+def test_calibration_with_the_designed_motion_leaves_less_than_with_a_naive_one(
+    motion: Excitation, designed: tuple[Log, dict[str, np.ndarray]]
+) -> None:
     # The arm's own swing and back, as a plan.
     naive = np.tile(Arm().home, (11, 1))
     naive[3:-3] += np.array([0.6, 0.3, -0.4, 0.4, 0.5, -0.3, 0.6]) * np.array([[0.5], [1.0], [1.0], [1.0], [0.5]])
     deviations = []
-    for knots in (motion.knots, naive):
-        result = calibrate(
-            SCENARIO, driven(knots)[0], PARAMETERS, position="joint_position", torque="joint_torque", noise=NOISE
-        )
+    for log, _ in (designed, driven(naive)):
+        result = calibrate(SCENARIO, log, PARAMETERS, position="joint_position", torque="joint_torque", noise=NOISE)
         deviations.append([result.parameters[parameter.address].deviation for parameter in PARAMETERS])
     ratios = np.array(deviations[1]) / np.array(deviations[0])
     # D-optimal: the product counts. A single number may be told as well by another motion.

@@ -31,16 +31,20 @@ def start(p: Array, v: Array) -> dict[str, Array]:
     return {POSITION: np.concatenate([FLAT, p]), VELOCITY: np.concatenate([np.zeros(3), v])}
 
 
-def sliding(mu: float, *, starts: int = 1, seed: int = 0) -> list[Window]:
-    """Return slides of a block until it rests, x = v t - mu g t^2 / 2, at several speeds, measured to 0.3 mm."""
+def sliding(mu: float, *, starts: int = 1, seed: int = 0, samples: int = 33) -> list[Window]:
+    """Return slides of a block, x = v t - mu g t^2 / 2 until it rests, at several speeds, measured to 0.3 mm.
+
+    All of them rest within 33 samples.
+    """
     rng = np.random.default_rng(seed)
-    times = PERIOD * np.arange(33)
+    times = PERIOD * np.arange(samples)
     windows = []
     for k, speed in enumerate(np.linspace(0.3, 0.8, 10)):
         stopping = np.minimum(times, speed / (mu * GRAVITY))
         x = speed * stopping - 0.5 * mu * GRAVITY * stopping**2
-        position = np.column_stack([np.tile(FLAT, (33, 1)), x, np.zeros(33), np.full(33, REST)])
-        position[:, 4] += 3e-4 * rng.normal(size=33)
+        y, z = np.zeros(samples), np.full(samples, REST)
+        position = np.column_stack([np.tile(FLAT, (samples, 1)), x, y, z])
+        position[:, 4] += 3e-4 * rng.normal(size=samples)
         values = [start(np.array([0.0, 0.0, REST]), np.array([speed, 0.0, 0.0]))]
         for _ in range(starts - 1):
             values.append(start(np.array([0.0, 0.0, REST]), np.array([speed + 0.01 * rng.normal(), 0.0, 0.0])))
@@ -77,7 +81,7 @@ def test_friction_of_a_sliding_block_is_that_of_the_closed_form() -> None:
 @pytest.mark.one_python
 def test_parameter_that_changes_nothing_is_not_identifiable() -> None:
     # SAP has no dissipation of Hunt and Crossley.
-    result = calibrated(sliding(0.25), FRICTION, Parameter("scenario.dissipation", 0.1, 10.0, log=True))
+    result = calibrated(sliding(0.25, samples=17), FRICTION, Parameter("scenario.dissipation", 0.1, 10.0, log=True))
     assert result.parameters["scenario.dissipation"].verdict == Verdict.NOT_IDENTIFIABLE
     assert result.parameters["scenario.friction"].value == pytest.approx(0.25, abs=0.01)
     assert len(result.combinations) == 1 and "scenario.dissipation" in result.combinations[0]
@@ -87,7 +91,7 @@ def test_parameter_that_changes_nothing_is_not_identifiable() -> None:
 @pytest.mark.slow
 @pytest.mark.one_python
 def test_range_without_the_truth_ends_at_its_bound() -> None:
-    result = calibrated(sliding(0.25), Parameter("scenario.friction", 0.05, 0.2))
+    result = calibrated(sliding(0.25, samples=17), Parameter("scenario.friction", 0.05, 0.2))
     assert result.parameters["scenario.friction"].verdict == Verdict.AT_BOUND
     assert result.parameters["scenario.friction"].value == pytest.approx(0.2, abs=1e-3)
 

@@ -66,6 +66,6 @@ def test_begins_at_any_time(t0: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.one_python
-def test_forty_others_are_the_diagram() -> None:
-    differences = {seed: difference(seed, t0=float(seed % 3) * 0.05) for seed in range(1000, 1040)}
+def test_twenty_others_are_the_diagram() -> None:
+    differences = {seed: difference(seed, t0=float(seed % 3) * 0.05) for seed in range(1000, 1020)}
     assert max(differences.values()) <= 1e-11

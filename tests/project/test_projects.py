@@ -34,7 +34,6 @@ ROBOTS = {
     "finger": MODELS / "finger.urdf",
     "fourbar": MODELS / "fourbar.sdf",
     "acrobot": EXAMPLES / "acrobot" / "Acrobot.urdf",
-    "acrobot_sdf": EXAMPLES / "acrobot" / "Acrobot.sdf",
     "acrobot_no_collision": EXAMPLES / "acrobot" / "Acrobot_no_collision.urdf",
     "pendulum": EXAMPLES / "pendulum" / "Pendulum.urdf",
     "cart_pole": EXAMPLES / "multibody" / "cart_pole" / "cart_pole.sdf",
@@ -47,9 +46,9 @@ LEGGED = {"quadruped": MODELS / "quadruped.urdf", "biped": MODELS / "biped.xml"}
 FLYING = {"x2": MODELS / "x2.xml"}
 
 STATIONS = {"torque_station": "Torque", "position_station": "Position", "mixed_station": "PositionAndTorque"}
-# A robot whose joints are all driven, one with joints that no motor drives, and a station pass all of their tests, as a
-# user runs them. How rollouts, forks and the fallback work depends on the code, which is the same for all.
-CHECKED = ("small_arm", "fourbar", "torque_station")
+# A robot whose joints are all driven, and a station pass all of their tests, as a user runs them. How rollouts, forks
+# and the fallback work depends on the code, which is the same for all.
+CHECKED = ("small_arm", "torque_station")
 # What depends on the robot, for all others, in this process.
 OF_ROBOTS = ("test_robot_holds_its_posture", "test_robot_moves_to_a_posture", "test_measurements_are_believed")
 OF_STATIONS = ("test_arms_hold_their_postures", "test_arms_move_to_postures", "test_measurements_are_believed")
@@ -108,7 +107,7 @@ def check_tests_pass(project: Path, *options: str) -> None:
 @pytest.mark.parametrize(
     "names",
     [
-        (*CHECKED, "acrobot", "biped", "x2"),
+        (*CHECKED, "fourbar", "acrobot", "biped", "x2"),
         pytest.param((*ROBOTS, *LEGGED, *FLYING, *STATIONS), marks=pytest.mark.slow),
     ],
 )
@@ -199,9 +198,15 @@ def test_a_drone_hovers(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 @pytest.mark.one_python
-@pytest.mark.parametrize("name", [*LEGGED, *FLYING])
+@pytest.mark.parametrize("name", ["biped", "x2"])
 def test_projects_of_robots_with_a_free_base_pass_their_tests(projects: Projects, name: str) -> None:
     check_tests_pass(projects[name])
+
+
+@pytest.mark.slow
+@pytest.mark.one_python
+def test_robot_on_four_feet_shifts_its_weight_and_drives_a_machine(projects: Projects) -> None:
+    check_tests_pass(projects["quadruped"], "-k", "weight or check_loop_commands_its_machine")
 
 
 @pytest.mark.slow
