@@ -13,8 +13,9 @@ from tests.cli.program import PENDULUM, error_of, run
 from tests.recording.servo import Servo
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
+from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.recording.log_format import CYCLE, LOG, LogError, event
-from vtbdrake.recording.log_reader import LogEvents, read_log
+from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 

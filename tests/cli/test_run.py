@@ -28,8 +28,9 @@ from vtbdrake.control.statistics import LoopStatistics
 from vtbdrake.deployment import Deployment
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine import MachineProcess
+from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.recording.log_format import CYCLE
-from vtbdrake.recording.log_reader import LogEvents, read_log
+from vtbdrake.recording.log_reader import read_log
 from vtbdrake.state import Snapshot
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 

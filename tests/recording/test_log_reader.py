@@ -24,8 +24,9 @@ from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.log_codec import find_events
+from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, encode_changes, event
-from vtbdrake.recording.log_reader import ControlLog, LogEvents, read_log
+from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import IDENTICAL, replay
 

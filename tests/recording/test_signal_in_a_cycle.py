@@ -17,8 +17,9 @@ from tests.control.servo_machine import COMMAND, ServoMachineScenario
 from tests.control.test_loop import Ear
 from vtbdrake.lcm.hub import Hub
 from vtbdrake.machine.machine_process import MachineProcess
+from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.recording.log_format import CYCLE
-from vtbdrake.recording.log_reader import LogEvents, read_log
+from vtbdrake.recording.log_reader import read_log
 
 # Where the signal comes: before a command is sent, between sending and recording it, in the recorder, behind it.
 POINTS = [

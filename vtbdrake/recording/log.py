@@ -9,11 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.recording.log_format import LogError
 
 # Times are sums with rounding errors: they are the same within this time in s.
 _ROUNDING = 1e-9
+
+GAP = 5.0
+"""Number of median periods from which on the time between two samples is called a gap."""
 
 
 class Uniformity(NamedTuple):
@@ -176,3 +180,50 @@ class Log:
             return {name: series.between(start, end) for name, series in signals.items()}
 
         return Log(self.source, cut(self.sense), cut(self.act), self.remarks)
+
+
+def checked_series(label: str, times: Array, values: Array, remarks: list[str]) -> Series:
+    """Return the samples that somebody else has recorded, without those that are none.
+
+    Args:
+        label: The file and the signal, for messages.
+        times: Times in s, shape (n,).
+        values: One row per time, shape (n, m); a row that is not finite is no sample.
+        remarks: Gets what was left out, gaps, and entries that never change.
+
+    Raises:
+        LogError: A time is not finite or runs backwards, or there is no sample.
+    """
+    if len(times) != len(values):
+        raise LogError(f"{label} has {len(values)} rows, its times {len(times)}")
+    if not np.isfinite(times).all():
+        row = int(np.flatnonzero(~np.isfinite(times))[0])
+        raise LogError(f"{label}: the time of row {row} is {times[row]}")
+    if (backwards := np.flatnonzero(np.diff(times) < 0.0)).size:
+        row = backwards[0]
+        raise LogError(
+            f"{label}: time runs backwards, first from row {row} ({times[row]:.9g} s) to row {row + 1} "
+            f"({times[row + 1]:.9g} s), {backwards.size} times in all: split the recording there, or sort it if only "
+            "the order of its rows is wrong"
+        )
+    whole = np.asarray(np.isfinite(values).all(axis=1))
+    if not whole.any():
+        raise LogError(f"{label} has no row that is whole")
+    if not whole.all():
+        remarks.append(f"{label}: {int((~whole).sum())} of {len(whole)} rows are not whole")
+        times, values = times[whole], values[whole]
+    series = Series.with_last_of_equal_times(times, values)
+    if len(series) < len(times):
+        remarks.append(f"{label}: {len(times) - len(series)} of {len(times)} times are repeated; the last row counts")
+    period = series.uniformity.period
+    gaps = np.flatnonzero(np.diff(series.times) > GAP * period)
+    if gaps.size:
+        first = gaps[0]
+        remarks.append(
+            f"{label}: {counted(gaps.size, 'gap')} of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first "
+            f"from {series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
+        )
+    still: list[int] = np.flatnonzero((series.values == series.values[0]).all(axis=0)).tolist()
+    if still and len(series) > 1:
+        remarks.append(f"{label}: entries that never change: {', '.join(map(str, still))}")
+    return series

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import mmap
 import os
 import struct
 import zlib
@@ -12,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -27,7 +26,8 @@ from vtbdrake.recording.lcm_types.lcmt_vtb_fault import lcmt_vtb_fault
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
 from vtbdrake.recording.log import Log, Series
-from vtbdrake.recording.log_codec import find_events, whole_cycles
+from vtbdrake.recording.log_codec import whole_cycles
+from vtbdrake.recording.log_events import Damage, LogEvents, Message
 from vtbdrake.recording.log_format import (
     CHANGE,
     COMMANDED,
@@ -36,7 +36,6 @@ from vtbdrake.recording.log_format import (
     END,
     FAULT,
     LOG,
-    OWN_PREFIX,
     SENT,
     STATE,
     CycleLayout,
@@ -46,6 +45,7 @@ from vtbdrake.recording.log_format import (
     change_value,
     decode_changes,
 )
+from vtbdrake.recording.protocol_reader import read_by_protocol
 from vtbdrake.state import Snapshot
 from vtbdrake.testbed import Scenario
 
@@ -57,22 +57,6 @@ CLOCK_JUMP = 0.1
 # Cycles that are read together.
 RECORDS_TOGETHER = 4096
 _NOT_CLOSED = "the recorder was not closed: later cycles may be missing"
-_NO_EVENTS = np.empty((0, 4), np.int64)
-
-
-class Damage(NamedTuple):
-    """Unreadable bytes of a file: their offset and the kind of damage.
-
-    Attributes:
-        offset: The offset of the first byte in the file.
-        description: The kind of the damage.
-    """
-
-    offset: int
-    description: str
-
-    def __str__(self) -> str:
-        return f"at byte {self.offset}: {self.description}"
 
 
 class Gap(NamedTuple):
@@ -88,78 +72,6 @@ class Gap(NamedTuple):
 
     def __str__(self) -> str:
         return f"cycles {self.first} to {self.last}"
-
-
-class Message(NamedTuple):
-    """A message that came or went: number of its event, time in microseconds since 1970, channel and bytes.
-
-    Attributes:
-        event: The number of its event.
-        utime: The time in microseconds since 1970.
-        channel: The LCM channel.
-        data: The bytes.
-    """
-
-    event: int
-    utime: int
-    channel: str
-    data: bytes
-
-
-class LogEvents:
-    """The events of an LCM log, damaged or not.
-
-    Attributes:
-        damages: Offset and kind of all bytes that are not events.
-        content: Bytes of the file.
-
-    Raises:
-        OSError: The file cannot be read.
-        LogError: The path is not a regular file, or the file has too many channels for a log.
-    """
-
-    def __init__(self, path: Path) -> None:
-        if path.exists() and not path.is_file():
-            raise LogError(f"{path} is not a log: it is a folder, a device or a pipe, not a file")
-        with path.open("rb") as file:
-            empty = file.seek(0, 2) == 0  # An empty file cannot be mapped.
-            self.content: mmap.mmap | bytes = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        places_by_channel, self.damages = find_events(self.content)
-        self.release()
-        self._places: dict[str, np.ndarray] = {}
-        for channel, places in places_by_channel.items():
-            name = channel.decode(errors="replace")
-            self._places[name] = np.concatenate([self.places(name), places])
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Return the channels of the messages, without the recorder's own."""
-        return tuple(sorted(name for name in self._places if not name.startswith(OWN_PREFIX)))
-
-    def places(self, channel: str) -> np.ndarray:
-        """Return the events of a channel as integers of shape (n, 4).
-
-        The columns are event number, time in microseconds, and begin and end of the data in the file.
-        """
-        return self._places.get(channel, _NO_EVENTS)
-
-    def on(self, channel: str) -> Sequence[tuple[int, int, int, int]]:
-        """Return the rows of `places` as tuples."""
-        return [(number, utime, begin, end) for number, utime, begin, end in self.places(channel).tolist()]
-
-    def data(self, begin: int, end: int) -> bytes:
-        """Return a range of bytes of the file.
-
-        Args:
-            begin: Offset of the first byte.
-            end: Offset behind the last byte.
-        """
-        return bytes(self.content[begin:end])
-
-    def release(self) -> None:
-        """Give back the memory into which parts of the file were read; what is needed again is read again."""
-        if isinstance(self.content, mmap.mmap):
-            self.content.madvise(mmap.MADV_DONTNEED)
 
 
 class Cycles:
@@ -466,22 +378,40 @@ def _shortened(lines: list[str], limit: int = 20) -> list[str]:
     return lines if len(lines) <= limit else [*lines[:limit], f"... and {len(lines) - limit} more like it"]
 
 
-def read_log(path: str | os.PathLike[str]) -> ControlLog:
-    """Return the log in a file that a `Recorder` has written.
+@overload
+def read_log(path: str | os.PathLike[str]) -> ControlLog: ...
+@overload
+def read_log(path: str | os.PathLike[str], scenario: Scenario) -> Log: ...
+def read_log(path: str | os.PathLike[str], scenario: Scenario | None = None) -> ControlLog | Log:
+    """Return the log in a file that a `Recorder` has written, or the signals in any LCM log.
 
     A file that is cut off or damaged is read, too: `ControlLog.damages` and `ControlLog.gaps` list what is missing, and
     a warning is logged. A cycle counts only if the checksum over all its events is right.
 
+    With a scenario, the `Log` of its vector signals is returned. What a `Recorder` has written is in
+    `ControlLog.signals`; a log of another program, such as lcm-logger, is read through the `Protocol` of the scenario,
+    by the rules of `LcmBridge`. Its times are those of the events, in s since the first one: when the logger received a
+    message. It has no switches and no state of the DPS. `Log.remarks` say what else is missing: signals without
+    messages, damaged events, messages that were rejected.
+
     Args:
         path: Path of the file.
+        scenario: The scenario of the machine that was recorded.
 
     Raises:
         OSError: The file cannot be read.
         LogError: The file is not a log of a control loop, is one of another version, or is damaged in its first two
-            events.
+            events; with a scenario, no message of the file has a sample of its signals.
+        ProtocolError: The scenario has no protocol for its machine.
     """
     path = Path(path)
     events = LogEvents(path)
+    if scenario is not None:
+        return _control_log(path, events).signals if events.of_loop else read_by_protocol(events, str(path), scenario)
+    return _control_log(path, events)
+
+
+def _control_log(path: Path, events: LogEvents) -> ControlLog:
     header, start = _read_start(path, events)
     cycles = Cycles(events, CycleLayout(header.sense, header.act))
     damages = [Damage(*damage) for damage in (*events.damages, *cycles.damages)]
@@ -516,9 +446,12 @@ def read_log(path: str | os.PathLike[str]) -> ControlLog:
 
 
 def _read_start(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
-    if not events.on(LOG):
+    if not events.of_loop:
         where = f"; {events.damages[0][1]} at byte {events.damages[0][0]}" if events.damages else ""
-        raise LogError(f"{path} is not a log of a control loop: it has no event on {LOG}{where}")
+        raise LogError(
+            f"{path} is not a log of a control loop: it has no event on {LOG}{where}; an LCM log of another program is "
+            "read through the protocol of its machine: read_log(path, scenario)"
+        )
     try:
         first = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
         if zlib.crc32(first.header.encode()) != first.crc & 0xFFFFFFFF:

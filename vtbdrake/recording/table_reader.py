@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vtbdrake.common.argument_checks import counted, suggestion
+from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
 from vtbdrake.common.extras import extra_module
-from vtbdrake.recording.log import Log, Series
+from vtbdrake.recording.log import Log, Series, checked_series
 from vtbdrake.recording.log_format import LogError
 
 Table = Mapping[str, Any]
@@ -29,9 +29,6 @@ UNITS: Mapping[str, float] = {
     "mN m": 1e-3, "kN": 1e3, "gauss": 1e-4,
 }  # fmt: skip
 """Factor to SI units, of units that are no SI units; "g" is standard gravity."""
-
-GAP = 5.0
-"""Number of median periods from which on the time between two samples is called a gap."""
 
 
 def read_table(
@@ -90,7 +87,7 @@ def read_table(
                 at = _column(table, _time_column(table, stamps, each[0]), name)[:, 0] * _factor(units.get(stamps))
             else:
                 at = stamps * np.arange(len(entries), dtype=float)
-            series[signal] = _series(f"{name}: {signal}", at, entries * _factor(units.get(signal)), remarks)
+            series[signal] = checked_series(f"{name}: {signal}", at, entries * _factor(units.get(signal)), remarks)
         return series
 
     return Log(name, read(sense), read(act), remarks)
@@ -136,42 +133,6 @@ def _time_column(table: Table, name: str, column: str) -> str:
     """Return the name of a column of times; in an .mcap, of the topic that ``column`` is of."""
     of_topic = f"{column.rpartition('.')[0]}.{name}"
     return of_topic if name not in table and of_topic in table else name
-
-
-def _series(label: str, times: Array, values: Array, remarks: list[str]) -> Series:
-    if len(times) != len(values):
-        raise LogError(f"{label} has {len(values)} rows, its times {len(times)}")
-    if not np.isfinite(times).all():
-        row = int(np.flatnonzero(~np.isfinite(times))[0])
-        raise LogError(f"{label}: the time of row {row} is {times[row]}")
-    if (backwards := np.flatnonzero(np.diff(times) < 0.0)).size:
-        row = backwards[0]
-        raise LogError(
-            f"{label}: time runs backwards, first from row {row} ({times[row]:.9g} s) to row {row + 1} "
-            f"({times[row + 1]:.9g} s), {backwards.size} times in all: split the recording there, or sort it if only "
-            "the order of its rows is wrong"
-        )
-    whole = np.asarray(np.isfinite(values).all(axis=1))
-    if not whole.any():
-        raise LogError(f"{label} has no row that is whole")
-    if not whole.all():
-        remarks.append(f"{label}: {int((~whole).sum())} of {len(whole)} rows are not whole")
-        times, values = times[whole], values[whole]
-    series = Series.with_last_of_equal_times(times, values)
-    if len(series) < len(times):
-        remarks.append(f"{label}: {len(times) - len(series)} of {len(times)} times are repeated; the last row counts")
-    period = series.uniformity.period
-    gaps = np.flatnonzero(np.diff(series.times) > GAP * period)
-    if gaps.size:
-        first = gaps[0]
-        remarks.append(
-            f"{label}: {counted(gaps.size, 'gap')} of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first "
-            f"from {series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
-        )
-    still: list[int] = np.flatnonzero((series.values == series.values[0]).all(axis=0)).tolist()
-    if still and len(series) > 1:
-        remarks.append(f"{label}: entries that never change: {', '.join(map(str, still))}")
-    return series
 
 
 # -- formats
