@@ -21,8 +21,7 @@ from vtbdrake.calibration.posterior import sandwich_covariance
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
 from vtbdrake.optimization import Parameter
-from vtbdrake.recording.log import Log
-from vtbdrake.recording.table_reader import GAP
+from vtbdrake.recording.log import GAP, Log
 from vtbdrake.state import VariableError
 from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.inertia import INERTIA_SIZE, PHYSICAL, body_function

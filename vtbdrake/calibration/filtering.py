@@ -30,8 +30,7 @@ from vtbdrake.calibration.joint_model import CalibrationError, JointModel
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.casadi_system.compiler import compiled_if_possible
-from vtbdrake.recording.log import Log, Series
-from vtbdrake.recording.table_reader import GAP
+from vtbdrake.recording.log import GAP, Log, Series
 
 # How far the period of a recording may differ from a multiple of the plant's step, as a share of that step.
 _ON_GRID = 0.05

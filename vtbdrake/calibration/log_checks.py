@@ -18,8 +18,7 @@ from vtbdrake.calibration.inverse_dynamics import InverseDynamics, TorqueFit
 from vtbdrake.calibration.joint_model import CalibrationError, JointModel
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
-from vtbdrake.recording.log import Log, Series
-from vtbdrake.recording.table_reader import GAP
+from vtbdrake.recording.log import GAP, Log, Series
 from vtbdrake.testbed import Interface
 
 # Share of missing time in a recording that is reported.

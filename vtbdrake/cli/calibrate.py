@@ -94,8 +94,8 @@ def calibrate(
 ) -> None:
     """Fit numbers of a testbed to recordings, with verdicts.
 
-    LOGS are logs of control loops (.lcm), or tables (.csv, .npz, .parquet, .mcap) whose columns the options name. The
-    exit code is 1 unless every number is accepted.
+    LOGS are logs of control loops or of lcm-logger, or tables (.csv, .npz, .parquet, .mcap) whose columns the options
+    name. The exit code is 1 unless every number is accepted.
 
     With --self-test, machines with random numbers in the ranges are simulated in processes of their own, commanded by
     the scenario's DPS over LCM, and calibrated: it shows, before any hardware is touched, what a log will tell.
@@ -131,7 +131,7 @@ def calibrate(
         tested = test(scenario, parameters, machine=machine, **trial, **model)
         show(tested, _tested(tested))
         return
-    result = fit(scenario, [_read(path, position, torque, **table) for path in logs], parameters, **model)
+    result = fit(scenario, [_read(path, scenario, position, torque, **table) for path in logs], parameters, **model)
     names = ("fit", "holdout", "correlation", "reasons", "combinations", "remarks")
     numbers = {"parameters": [*result.parameters.values()]}
     show(result, numbers | {name: getattr(result, name) for name in names})
@@ -144,6 +144,7 @@ def calibrate(
 
 def _read(
     path: Path,
+    scenario: Scenario,
     position: str,
     torque: str,
     *,
@@ -152,14 +153,13 @@ def _read(
     time: str,
     units: Sequence[tuple[str, str]],
 ) -> Log:
-    if path.suffix == ".lcm":
-        from vtbdrake.recording import read_log
+    from vtbdrake.recording import read_log, read_table
+    from vtbdrake.recording.table_reader import READERS
 
-        return read_log(path).signals
+    if path.suffix.lower() not in READERS:
+        return read_log(path, scenario)
     if not (position_columns and torque_columns):
         raise click.UsageError(f"{path} is a table: name its columns by --position-columns and --torque-columns")
-    from vtbdrake.recording import read_table
-
     return read_table(
         path,
         sense={position: position_columns.split(",")},

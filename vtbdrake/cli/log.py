@@ -9,16 +9,26 @@ import click
 
 from vtbdrake.cli import FailedError
 from vtbdrake.cli.completion import complete_file, complete_scenario
-from vtbdrake.cli.options import Setting, converted, import_option, option, output, set_option, settings
+from vtbdrake.cli.options import (
+    Setting,
+    converted,
+    import_option,
+    option,
+    output,
+    parse_scenario,
+    set_option,
+    settings,
+)
 from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
 from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
-    from vtbdrake.recording import ControlLog
+    from vtbdrake.recording import ControlLog, Log
+    from vtbdrake.testbed import Scenario
 
 
-def opened_log(log: Path, scenario: str | None) -> ControlLog:
-    """Return a log whose scenario the user has named, since importing it runs its code.
+def loop_log(log: Path, scenario: str | None) -> ControlLog:
+    """Return the log of a loop, whose scenario the user has named, since importing it runs its code.
 
     Args:
         log: The file of the log.
@@ -28,7 +38,7 @@ def opened_log(log: Path, scenario: str | None) -> ControlLog:
         click.UsageError: The scenario is another one, or was not named.
         LogError: The file is no log, or of a script or a notebook.
     """
-    from vtbdrake.recording.log_reader import read_log
+    from vtbdrake.recording import read_log
     from vtbdrake.testbed.scenario import class_name
     from vtbdrake.testbed.scenario_file import scenario_class
 
@@ -44,6 +54,24 @@ def opened_log(log: Path, scenario: str | None) -> ControlLog:
     if scenario is not None and (requested := class_name(scenario_class(scenario))) != recorded:
         raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
     return opened
+
+
+def opened_log(log: Path, scenario: Scenario) -> ControlLog | Log:
+    """Return the log of a loop, which has to be of this scenario, or the signals in a log of another program.
+
+    Args:
+        log: The file of the log.
+        scenario: The scenario that the user has named.
+
+    Raises:
+        click.UsageError: The log of a loop is of another scenario.
+        LogError: The file is no log, has no signal of the scenario, or is of a script or a notebook.
+        ProtocolError: The scenario has no protocol, by which the log of another program could be read.
+    """
+    from vtbdrake.recording import read_log
+    from vtbdrake.recording.log_events import LogEvents
+
+    return loop_log(log, scenario.name()) if LogEvents(log).of_loop else read_log(log, scenario)
 
 
 _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
@@ -88,7 +116,7 @@ def replay(
 
     if bool(record) != bool(out):
         raise click.UsageError("--record ADDRESS and --out FILE belong together: give both or neither")
-    opened = opened_log(log, scenario)
+    opened = loop_log(log, scenario)
     target = None if on == "recorded" else DpsAlone(opened.scenario) if on == "dps" else opened.scenario.build()
     report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:
@@ -112,20 +140,29 @@ def _parse_export(text: str) -> Path:
 @click.command()
 @_log
 @click.argument("out", callback=converted(_parse_export), shell_complete=complete_file)
+@option(
+    "--scenario SCENARIO",
+    "The scenario of the machine, through whose protocol a log of another program is read: a name or MODULE:CLASS.",
+    parse=parse_scenario,
+)
 @json_option
-def export(log: Path, out: Path) -> None:
+def export(log: Path, out: Path, scenario: Scenario | None) -> None:
     """Write a LOG as MCAP (for Foxglove), CSV or Parquet.
 
-    The suffix of OUT says which.
+    The suffix of OUT says which. A log of lcm-logger needs the scenario of its machine.
 
     \b
     Example:
       vtbdrake export run.lcm run.mcap
+      vtbdrake export lcmlog-2026-11-29.00 run.csv --scenario cart_pole
     """
+    from vtbdrake.recording import Log, read_log
     from vtbdrake.recording.export import export as export_log
-    from vtbdrake.recording.log_reader import read_log
 
-    opened = read_log(log)
+    opened = read_log(log) if scenario is None else opened_log(log, scenario)
     export_log(opened, out)
+    if isinstance(opened, Log):
+        show(opened, {"file": out, "sense": [*opened.sense], "act": [*opened.act], "remarks": opened.remarks})
+        return
     described = {"cycles": len(opened), "period": opened.header.period, "incomplete": opened.incomplete}
     show(opened, {"file": out, "scenario": opened.header.scenario_name, **described})

@@ -23,7 +23,7 @@ from vtbdrake.cli.options import (
     start_option,
     trust_option,
 )
-from vtbdrake.cli.output import json_option
+from vtbdrake.cli.output import json_option, say
 from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.cli.problem import parse_problem
 
@@ -105,7 +105,11 @@ def _is_problem(text: str) -> bool:
     "The study in which the page stores drives, marked as driven. Without --problem, the page has the study's problem.",
     type=click.Path(dir_okay=False, path_type=Path),
 )
-@option("--log FILE", "Replay this log of the scenario; what is changed goes on in simulation.", type=_FILE)
+@option(
+    "--log FILE",
+    "Replay this log of the scenario, or run its DPS on one of lcm-logger; what is changed goes on in simulation.",
+    type=_FILE,
+)
 @option(
     "--save-in FOLDER",
     "The folder of the tests that the page saves.",
@@ -163,6 +167,7 @@ def view(
       vtbdrake view cart_pole --url tcpq://127.0.0.1:7700
       vtbdrake view manipulator --log arm.lcm
     """
+    from vtbdrake.recording import Log
     from vtbdrake.testbed import Scenario
     from vtbdrake.web import view as open_view
     from vtbdrake.web import view_loop
@@ -191,9 +196,12 @@ def view(
     if log is not None:
         if values or start is not None or vr:
             raise click.UsageError("--log replays what was recorded: leave out --set, --start and --vr")
-        page |= {"log": opened_log(log, scenario.name())}
-        # The log describes its scenario; fields that were set have to be the recorded ones.
-        viewed = None if scenario.record() == type(scenario)().record() else scenario
+        opened = opened_log(log, scenario)
+        page |= {"log": opened}
+        if isinstance(opened, Log):
+            say(str(opened))
+        elif scenario.record() == type(scenario)().record():
+            viewed = None  # The log describes its scenario; fields that were set have to be the recorded ones.
     page |= {"problem": problem, "study": study, "trusted": trusted, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
         serve(running, browser=browser, ready=running.session.play if play else None)

@@ -7,5 +7,6 @@ from .log_reader import ControlLog as ControlLog
 from .log_reader import read_log as read_log
 from .playback import DrivenScenario as DrivenScenario
 from .playback import LogBridge as LogBridge
+from .playback import feed as feed
 from .recorder import Recorder as Recorder
 from .table_reader import read_table as read_table

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,12 @@ import numpy as np
 from vtbdrake.common.extras import extra_module
 from vtbdrake.common.json_data import plain
 from vtbdrake.control.stepping import Change, ChangeKind
+from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_reader import ControlLog
 from vtbdrake.state.archive import PRIVATE, whole_file
 
 
-def export(log: ControlLog, path: str | os.PathLike[str], *, mode: int = PRIVATE) -> None:
+def export(log: ControlLog | Log, path: str | os.PathLike[str], *, mode: int = PRIVATE) -> None:
     """Write a log in the format that the file's suffix names: .csv, .mcap or .parquet.
 
     CSV and Parquet get the table of `columns`. MCAP gets JSON messages with their schemas, for Foxglove, under the
@@ -45,24 +48,48 @@ def export(log: ControlLog, path: str | os.PathLike[str], *, mode: int = PRIVATE
         EXPORTS[suffix](log, partial)
 
 
-def columns(log: ControlLog) -> dict[str, np.ndarray]:
+def columns(log: ControlLog | Log) -> dict[str, np.ndarray]:
     """Return a log as a table of n rows, one per cycle.
 
     The columns are ``cycle``, ``time`` (of the DPS, s), ``now`` (on the loop's clock, s), ``utime`` (us since 1970),
     ``ok``, and the entries of all vector signals: ``sense.<signal>`` is the newest value, ``command.<signal>`` the
     actuator command of the DPS and ``sent.<signal>`` the one sent after the guards. A signal of several entries has a
     column ``sense.<signal>[i]`` for each. Missing values are NaN.
+
+    A `Log` has a row for each time of any signal, and the columns ``time``, ``sense.<signal>`` and ``sent.<signal>``; a
+    signal without a sample at that time is NaN, so that `read_table` gives the same samples.
     """
+    if isinstance(log, Log):
+        times = np.unique(np.concatenate([series.times for series in (*log.sense.values(), *log.act.values())]))
+        return {"time": times, **_entry_columns((name, _placed(series, times)) for name, series in _sides(log))}
+    sides = (("sense", log.fed), ("command", log.actuation), ("sent", log.sent))
     table = {"cycle": log.numbers, "time": log.times, "now": log.now, "utime": log.utimes, "ok": log.ok}
-    for kind, signals in (("sense", log.fed), ("command", log.actuation), ("sent", log.sent)):
-        for signal, values in signals.items():
-            size = values.shape[1]
-            for i in range(size):
-                table[f"{kind}.{signal}[{i}]" if size > 1 else f"{kind}.{signal}"] = values[:, i]
+    return table | _entry_columns((f"{kind}.{name}", values) for kind, each in sides for name, values in each.items())
+
+
+def _entry_columns(signals: Iterable[tuple[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return a column for each entry of signals with values of shape (n, size)."""
+    table = {}
+    for name, values in signals:
+        size = values.shape[1]
+        for i in range(size):
+            table[f"{name}[{i}]" if size > 1 else name] = values[:, i]
     return table
 
 
-def _write_csv(log: ControlLog, path: Path) -> None:
+def _sides(log: Log) -> Iterator[tuple[str, Series]]:
+    yield from ((f"sense.{name}", series) for name, series in log.sense.items())
+    yield from ((f"sent.{name}", series) for name, series in log.act.items())
+
+
+def _placed(series: Series, times: np.ndarray) -> np.ndarray:
+    """Return the samples at their times among others, NaN at the latter."""
+    values = np.full((len(times), series.values.shape[1]), np.nan)
+    values[np.searchsorted(times, series.times)] = series.values
+    return values
+
+
+def _write_csv(log: ControlLog | Log, path: Path) -> None:
     """Write a CSV file whose numbers read back to the last bit."""
     table = columns(log)
     with path.open("w", newline="") as file:
@@ -71,7 +98,7 @@ def _write_csv(log: ControlLog, path: Path) -> None:
         writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
 
 
-def _write_parquet(log: ControlLog, path: Path) -> None:
+def _write_parquet(log: ControlLog | Log, path: Path) -> None:
     pyarrow, parquet = (
         extra_module(name, purpose="Parquet", extra="recording") for name in ("pyarrow", "pyarrow.parquet")
     )
@@ -116,8 +143,9 @@ _SCHEMAS: Mapping[str, Mapping[str, Any]] = {
 _Entry = tuple[int, str, str, Mapping[str, Any]]  # time in nanoseconds, topic, schema, message
 
 
-def _write_mcap(log: ControlLog, path: Path) -> None:
+def _write_mcap(log: ControlLog | Log, path: Path) -> None:
     mcap = extra_module("mcap.writer", purpose="MCAP", extra="recording")
+    entries = _samples(log) if isinstance(log, Log) else _entries(log)
     with path.open("wb") as file:
         writer = mcap.Writer(file)
         writer.start(library="vtbdrake")
@@ -131,10 +159,22 @@ def _write_mcap(log: ControlLog, path: Path) -> None:
         def channel(topic: str, name: str) -> int:
             return int(writer.register_channel(topic, "json", schema(name)))
 
-        for sequence, (time, topic, name, message) in enumerate(_entries(log)):
+        for sequence, (time, topic, name, message) in enumerate(entries):
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel(topic, name), time, data, time, sequence)
         writer.finish()
+
+
+def _samples(log: Log) -> Iterator[_Entry]:
+    """Yield all samples in the order of time."""
+    origin = min(log.start, 0.0)  # MCAP has no negative times.
+
+    def entries(name: str, series: Series) -> Iterator[_Entry]:
+        topic = f"/{name.replace('.', '/', 1)}"
+        for time, value in zip(series.times.tolist(), series.values.tolist(), strict=True):
+            yield round(1e9 * (time - origin)), topic, "vtbdrake.Value", {"time": time, "value": value}
+
+    yield from merge(*(entries(name, series) for name, series in _sides(log)), key=itemgetter(0))
 
 
 def _entries(log: ControlLog) -> Iterator[_Entry]:
@@ -219,7 +259,7 @@ def _faults(log: ControlLog, times_ns: list[int]) -> Iterator[tuple[int, str, st
         }  # fmt: skip
 
 
-EXPORTS: Mapping[str, Callable[[ControlLog, Path], None]] = {
+EXPORTS: Mapping[str, Callable[[ControlLog | Log, Path], None]] = {
     ".csv": _write_csv,
     ".mcap": _write_mcap,
     ".parquet": _write_parquet,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,9 +17,13 @@ from vtbdrake.common.settings import setting
 from vtbdrake.control.bridge import Bridge, BridgeError
 from vtbdrake.control.clock import Clock, SimulatedClock
 from vtbdrake.control.received_signal import ReceivedSignal
+from vtbdrake.control.runtime import Runtime
+from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
-from vtbdrake.testbed import Interface, Scenario, ScenarioError, Signal
+from vtbdrake.recording.log_reader import ControlLog, read_log
+from vtbdrake.recording.recorder import Recorder
+from vtbdrake.testbed import DpsAlone, Interface, Scenario, ScenarioError, Signal
 from vtbdrake.testbed.builder import VirtualTestbedBuilder
 
 # Times are sums with rounding errors: what is due within this time is there, in s.
@@ -30,7 +35,8 @@ _EARLY = 1e-3
 class LogBridge(Bridge):
     """A machine that repeats the samples of a log at their own times, and listens to no command.
 
-    With a `ScaledClock` the loop runs at any multiple of real time; with a `SimulatedClock` as fast as it computes::
+    With a `ScaledClock` the loop runs at any multiple of real time; with a `SimulatedClock` as fast as it computes, as
+    in `feed`::
 
         clock = SimulatedClock()
         bridge = LogBridge(log, dps.interface, clock)
@@ -116,6 +122,44 @@ class LogBridge(Bridge):
         self._origin = None
 
 
+def feed(
+    log: Log,
+    scenario: Scenario,
+    path: str | os.PathLike[str],
+    *,
+    period: float | None = None,
+    overwrite: bool = False,
+) -> ControlLog:
+    """Let the DPS of a scenario run on the sensor samples of a log, and record what it does.
+
+    Its state and its commands are new: they are what this DPS computes, not what has acted on the machine. It takes
+    over when all its sensor signals have come. So a log that lacks the state of a DPS can be replayed and viewed.
+
+    Args:
+        log: The log, whose vector signals are those of the DPS.
+        scenario: The scenario of the DPS, which is stepped alone, as fast as it computes.
+        path: Path of the file that is written.
+        period: The period of the loop, in s; None: that of the scenario's deployment.
+        overwrite: Whether to replace an existing file.
+
+    Raises:
+        LogError: The log lacks sensor signals of the DPS, or has some of another size.
+        ValueError: The DPS cannot be recorded: it has an abstract sensor signal, for example, which no `Log` has.
+        OSError: The file cannot be written, or exists.
+    """
+    dps, clock = DpsAlone(scenario), SimulatedClock()
+    bridge = LogBridge(log, dps.interface, clock)
+    bridge.open()
+    period = scenario.deployment().period if period is None else period
+    with Runtime(dps, bridge, period=period, clock=clock) as runtime, Recorder(runtime, path, overwrite=overwrite):
+        try:
+            runtime.take_over(timeout=log.end - log.start)
+        except SwitchRefusedError as error:
+            raise LogError(f"{log.source} does not feed the DPS of {scenario.name()}: {error}") from error
+        runtime.run(until=lambda: bridge.finished)
+    return read_log(path)
+
+
 def _fitting(log: Log, series: Series, signal: Signal) -> Series:
     """Return the series; a LogError if it is none of the signal."""
     size = series.values.shape[1]
@@ -170,7 +214,7 @@ class DrivenScenario(Scenario):
     @property
     def _recorded(self) -> Log:
         if not isinstance(self.log, Log):
-            raise ScenarioError(f"DrivenScenario.log is a Log, see read_table and ControlLog.signals, not {self.log!r}")
+            raise ScenarioError(f"DrivenScenario.log is a Log, see read_table and read_log, not {self.log!r}")
         return self.log
 
     def record(self) -> dict[str, Any]:

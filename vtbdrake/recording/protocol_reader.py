@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,30 +48,29 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
     remarks = [f"{source}: recorded by another program: no switches, and no state of the DPS"]
     ordered = _OrderedEvents(events)
     remarks += [f"{source}: {remark}" for remark in ordered.remarks]
-    sides = ((protocol.sense, interface.sense, reports.signals), (protocol.act, interface.act, ()))
-    recorded: list[dict[str, Series]] = []
     trouble: list[str] = []
-    for maps, signals, unrecorded in sides:
-        received: dict[str, ReceivedSignal] = {s.name: _Samples() if s.is_vector else ReceivedSignal() for s in signals}
-        received |= {signal.name: ReceivedSignal() for signal in unrecorded}
+
+    def read(maps: Sequence[LcmMap], signals: Sequence[Signal], reported: Sequence[Signal] = ()) -> dict[str, Series]:
+        kept = {signal.name: _Samples() for signal in signals if signal.is_vector}
+        others = {signal.name: ReceivedSignal() for signal in (*signals, *reported) if signal.name not in kept}
         for map in maps:
-            trouble += _read_channel(ordered, map, [*signals, *unrecorded], received)
-        samples = {name: each for name, each in received.items() if isinstance(each, _Samples) and each.values}
-        recorded.append(
-            {
-                name: checked_series(f"{source}: {name}", np.array(each.times), np.array(each.values), remarks)
-                for name, each in samples.items()
-            }
-        )
+            trouble.extend(_read_channel(ordered, map, [*signals, *reported], kept | others))
+        return {
+            name: checked_series(f"{source}: {name}", np.array(samples.times), np.array(samples.values), remarks)
+            for name, samples in kept.items()
+            if samples.values
+        }
+
+    sense, act = read(protocol.sense, interface.sense, reports.signals), read(protocol.act, interface.act)
     channels = [map.channel for map in (*protocol.sense, *protocol.act, *protocol.commands)]
-    if not any(recorded):
+    if not (sense or act):
         raise LogError(
             f"{source} has no sample of a vector signal of {scenario.name()}, whose machine speaks on "
             f"{', '.join(channels)}: {'; '.join(trouble)}; the log has {', '.join(events.channels) or 'no channel'}"
         )
     if unmapped := sorted({*events.channels}.difference(channels)):
         trouble.append(f"channels without a map: {', '.join(unmapped)}")
-    return Log(source, *recorded, remarks + [f"{source}: {remark}" for remark in trouble])
+    return Log(source, sense, act, remarks + [f"{source}: {remark}" for remark in trouble])
 
 
 class _Samples(ReceivedSignal):
@@ -139,7 +138,7 @@ def _in_order(places: np.ndarray) -> np.ndarray:
 
 
 def _read_channel(
-    events: _OrderedEvents, map: LcmMap, signals: Sequence[Signal], received: dict[str, ReceivedSignal]
+    events: _OrderedEvents, map: LcmMap, signals: Sequence[Signal], received: Mapping[str, ReceivedSignal]
 ) -> Iterator[str]:
     """Receive the messages of a channel by the rules of a bridge, and yield what is missing."""
     by_name = {signal.name: signal for signal in signals}

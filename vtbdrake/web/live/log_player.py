@@ -50,13 +50,22 @@ class LogPlayer(Player):
         scenario: Its scenario.
         config: How it runs.
         problem: The problem whose quality judges what is driven by hand, or None.
+        notice: What a frame of the log says where the log has nothing to say.
     """
 
     file_mode = PRIVATE
     plays_log = True
 
-    def __init__(self, log: ControlLog, scenario: Scenario, config: SessionConfig, problem: Problem | None) -> None:
-        self._log = log
+    def __init__(
+        self,
+        log: ControlLog,
+        scenario: Scenario,
+        config: SessionConfig,
+        problem: Problem | None,
+        *,
+        notice: str = "",
+    ) -> None:
+        self._log, self._notice = log, notice
         self._recorded: RecordedCourse | None = None
         self._way: _Way | None = None
         # Whether every way in the log is short.
@@ -108,7 +117,7 @@ class LogPlayer(Player):
         return {
             "recorded": self._left is None,
             "left": self._left,
-            "notice": self.recorded.notice if self._left is None else "",
+            "notice": self.recorded.notice or self._notice if self._left is None else "",
             "seeking": None if self._way is None else self._way.end,
             "progress": None if self._way is None else self._progress(self._way),
             "prepared": self.recorded.prepared,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from vtbdrake.common.argument_checks import as_number
-from vtbdrake.recording.log_reader import ControlLog, read_log
+from vtbdrake.recording import ControlLog, Log, feed, read_log
+from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.web.live.log_player import LogPlayer
 from vtbdrake.web.live.session import SessionError
 from vtbdrake.web.live.simulation_session import PlayedSession
@@ -15,6 +18,8 @@ if TYPE_CHECKING:
     from vtbdrake.optimization import Problem
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.live.player import SessionConfig
+
+_FED = "the DPS was not recorded: it runs again on the recorded sensor signals, and its commands went nowhere"
 
 _LOOK_PERIOD = 0.5  # s between two looks at whether the session lives
 
@@ -27,9 +32,13 @@ class LogSession(PlayedSession[LogPlayer]):
     switches on sim and the world that the DPS believed in, and the recorded course goes on beside it as a ghost.
     Going back to a time before that returns to the log.
 
+    A log of another program has no state of the DPS: the scenario's DPS runs on its sensor samples first (see `feed`),
+    into a temporary file, and that run is replayed. Its frames say so.
+
     Args:
         log: The log, or the path of its file.
-        scenario: The scenario of the log; None: as the log describes it, if its module is imported already.
+        scenario: The scenario of the log; None: as the log describes it, if its module is imported already. A log of
+            another program needs it.
         config: How it runs.
         problem: The problem whose quality judges what is driven by hand; it is one of the scenario.
 
@@ -38,25 +47,39 @@ class LogSession(PlayedSession[LogPlayer]):
 
     Raises:
         OSError: The file cannot be read.
-        LogError: The file is not a log, is damaged at its beginning, or its scenario cannot be found or has changed.
+        LogError: The file is not a log, is damaged at its beginning, or its scenario cannot be found or has changed; or
+            a log of another program does not feed the DPS.
     """
 
     def __init__(
         self,
-        log: ControlLog | str | os.PathLike[str],
+        log: ControlLog | Log | str | os.PathLike[str],
         *,
         scenario: Scenario | None = None,
         config: SessionConfig | None = None,
         problem: Problem | None = None,
     ) -> None:
-        self._log = log if isinstance(log, ControlLog) else read_log(log)
+        if isinstance(log, str | os.PathLike):
+            log = read_log(log) if scenario is None or LogEvents(Path(log)).of_loop else read_log(log, scenario)
+        self.log_path, self._notice = (log.source, _FED) if isinstance(log, Log) else (str(log.path), "")
+        self._folder: TemporaryDirectory[str] | None = None
+        if isinstance(log, Log):
+            if scenario is None:
+                raise SessionError(f"{log.source} does not name its scenario, whose DPS runs on it: give scenario=")
+            self._folder = TemporaryDirectory(prefix="vtbdrake-log-")
+            log = feed(log, scenario, Path(self._folder.name) / "fed.lcm")
+        self._log = log
         if scenario is not None:
             self._log.header.check_scenario(scenario)
-        self.log_path = str(self._log.path)
         super().__init__(scenario or self._log.scenario, config=config, problem=problem)
 
     def _make_stage(self) -> LogPlayer:
-        return LogPlayer(self._log, self.scenario, self.config, self.problem)
+        return LogPlayer(self._log, self.scenario, self.config, self.problem, notice=self._notice)
+
+    def close(self) -> None:
+        super().close()
+        if self._folder is not None:
+            self._folder.cleanup()
 
     def seek(self, when: float, *, wait: bool = True) -> bool:
         """Pause, and go to the last cycle of the log that ended at or before a time; see `PlayedSession.seek`.

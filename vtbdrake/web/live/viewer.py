@@ -16,7 +16,7 @@ from vtbdrake.web.serving.web_page import WebPage
 
 if TYPE_CHECKING:
     from vtbdrake.optimization import Problem
-    from vtbdrake.recording import ControlLog
+    from vtbdrake.recording import ControlLog, Log
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.web.live.loop_session import LoopSession
@@ -98,7 +98,7 @@ def view_loop(
 def view(
     scenario: Scenario | None = None,
     *,
-    log: ControlLog | str | os.PathLike[str] | None = None,
+    log: ControlLog | Log | str | os.PathLike[str] | None = None,
     start: Snapshot | None = None,
     values: Mapping[str, Any] | None = None,
     config: SessionConfig | None = None,
@@ -115,7 +115,8 @@ def view(
 
     Args:
         scenario: The scenario; of a problem or a log, it may be left out.
-        log: A log (of a real or a simulated machine) that is replayed, or the path of its file; see `LogSession`.
+        log: A log (of a real or a simulated machine) that is replayed, or the path of its file; see `LogSession`. A log
+            of another program needs the scenario.
         start: A snapshot to start from; s0 if left out.
         values: Variables that are set first, by address.
         config: How it runs.
