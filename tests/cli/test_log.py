@@ -10,6 +10,7 @@ import pandas
 import pytest
 
 from tests.cli.program import PENDULUM, error_of, run
+from tests.recording.lcm_logger import PERIOD, write_log
 from tests.recording.servo import Servo
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
@@ -18,6 +19,7 @@ from vtbdrake.recording.log_format import CYCLE, LOG, LogError, event
 from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
+from vtbdrake.recording.table_reader import read_table
 
 SCENARIO = ("--scenario", "tests.control.scripted:ServoScenario")
 
@@ -112,6 +114,22 @@ def test_export_writes_every_format(path: Path, tmp_path: Path) -> None:
         assert out.stat().st_size > 1000
 
 
+def test_log_of_lcm_logger_is_exported_by_the_protocol_of_its_machine(tmp_path: Path) -> None:
+    times = PERIOD * np.arange(5)
+    columns = {"time": times, "q": np.sin(times), "u": np.cos(times)}
+    log = read_table(columns, sense={"position": "q"}, act={"torque": "u"})
+    foreign = write_log(tmp_path / "lcmlog-2026-11-29.00", log)
+    pendulum = ("--scenario", "tests.recording.lcm_logger:LcmPendulum")
+    program = run("export", foreign, tmp_path / "run.csv", *pendulum)
+    assert program.exit_code == 0 and "no state of the DPS" in program.stdout, program.stderr
+    assert pandas.read_csv(tmp_path / "run.csv")["sent.torque"].tolist() == columns["u"].tolist()
+    assert "read through the protocol of its machine" in error_of("export", foreign, tmp_path / "run.csv")
+    assert "read through the protocol of its machine" in error_of("replay", foreign, *pendulum)
+    assert "no message on CART_POLE_STATE" in error_of("view", "cart_pole", "--log", foreign)
+    vary = ("--position", "position", "--torque", "torque", "--vary", "sim.sys.pendulum.link.mass=0.3:3")
+    assert "no message on CART_POLE_STATE" in error_of("calibrate", "cart_pole", foreign, *vary)
+
+
 def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
     (tmp_path / "no.lcm").write_text("no")
     for arguments, expected in [
@@ -138,7 +156,7 @@ def test_log_that_cannot_be_viewed_is_told(path: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.lcm").write_bytes(path.read_bytes()[:600])
     assert "cut.lcm" in error_of("view", servo, "--log", tmp_path / "cut.lcm")
     (tmp_path / "text.lcm").write_text("a text")
-    assert "is not a log of a control loop" in error_of("view", servo, "--log", tmp_path / "text.lcm")
+    assert "is not an LCM log" in error_of("view", servo, "--log", tmp_path / "text.lcm")
     assert "leave out --set, --start and --vr" in error_of("view", servo, "--log", path, "--set", "dps.gain=2")
 
 

@@ -40,9 +40,11 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
         scenario: The scenario of the machine that was recorded.
 
     Raises:
-        LogError: No message of the file has a sample of a vector signal.
+        LogError: The file has no event, or no message of it has a sample of a vector signal.
         ProtocolError: The scenario has no protocol.
     """
+    if not events.channels:
+        raise LogError(f"{source} is not an LCM log: it has no whole event")
     protocol, interface = protocol_of(scenario), scenario.interface()
     reports = Reports(interface, protocol.reported, protocol.robot_mode)
     remarks = [f"{source}: recorded by another program: no switches, and no state of the DPS"]
@@ -51,7 +53,7 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
     trouble: list[str] = []
 
     def read(maps: Sequence[LcmMap], signals: Sequence[Signal], reported: Sequence[Signal] = ()) -> dict[str, Series]:
-        kept = {signal.name: _Samples() for signal in signals if signal.is_vector}
+        kept = {signal.name: _KeptSamples() for signal in signals if signal.is_vector}
         others = {signal.name: ReceivedSignal() for signal in (*signals, *reported) if signal.name not in kept}
         for map in maps:
             trouble.extend(_read_channel(ordered, map, [*signals, *reported], kept | others))
@@ -65,15 +67,15 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
     channels = [map.channel for map in (*protocol.sense, *protocol.act, *protocol.commands)]
     if not (sense or act):
         raise LogError(
-            f"{source} has no sample of a vector signal of {scenario.name()}, whose machine speaks on "
-            f"{', '.join(channels)}: {'; '.join(trouble)}; the log has {', '.join(events.channels) or 'no channel'}"
+            f"{source} has no sample of a vector signal of {scenario.name()}: {'; '.join(trouble)}; it has messages on "
+            f"{', '.join(events.channels)}"
         )
     if unmapped := sorted({*events.channels}.difference(channels)):
         trouble.append(f"channels without a map: {', '.join(unmapped)}")
     return Log(source, sense, act, remarks + [f"{source}: {remark}" for remark in trouble])
 
 
-class _Samples(ReceivedSignal):
+class _KeptSamples(ReceivedSignal):
     """A received signal that keeps all samples that it accepts, and the times of their arrival in s."""
 
     def __init__(self) -> None:
@@ -146,14 +148,14 @@ def _read_channel(
     try:
         reader = ChannelReader(map, carried, received, _REORDER_WINDOW, clock=lambda: events.now)
     except ValueError as error:  # A map of commands need not decode.
-        yield f"{', '.join(map.signals)} is missing: {error}"
+        yield f"{', '.join(map.signals)}: {error}"
         return
     count = 0
     for data in events.on(map.channel):
         reader.receive(map.channel, data)
         count += 1
     if not count:
-        yield f"{', '.join(map.signals)} is missing: no message on {map.channel}"
+        yield f"no message on {map.channel}, which carries {', '.join(map.signals)}"
         return
     for signal in carried:
         for reason, number in received[signal.name].rejected.items():

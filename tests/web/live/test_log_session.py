@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -89,6 +90,19 @@ def test_log_ends_with_a_message(session: LogSession) -> None:
     session.advance(1)
     session.reset()
     assert frame(session, lambda shown: shown.log["recorded"]).time <= 0.001
+
+
+def test_dps_runs_on_a_log_of_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    log = read_log(record(tmp_path / "run.lcm", cycles=100)).signals
+    with LogSession(log, scenario=ServoScenario(rate=0.0), config=CONFIG) as session:
+        session.seek(0.05)
+        assert read(session, SEEN).tolist() in log.sense["position"].between(0.046, 0.054).values.tolist()
+        assert "the DPS was not recorded" in frame(session, lambda shown: not shown.playing).log["notice"]
+        assert [*tmp_path.glob("vtbdrake-log-*")]
+    assert not [*tmp_path.glob("vtbdrake-log-*")]
+    with pytest.raises(SessionError, match="does not name its scenario, whose DPS runs on it: give scenario="):
+        LogSession(log)
 
 
 def test_changed_gain_goes_on_from_the_recorded_state(session: LogSession, log: Path) -> None:
