@@ -245,7 +245,7 @@ study.view()
         assert pixels(data).shape[1] == 800  # the history
         show(empty_page, front_end, data["text/html"])
         frame = empty_page.frame_locator("iframe")
-        frame.locator("body[data-page=open][data-trials]").wait_for(state="attached")
+        frame.locator("body[data-session=open][data-trials]").wait_for(state="attached")
         frame.locator("body").evaluate(
             """(body) => {
                 const timer = setInterval(() => {

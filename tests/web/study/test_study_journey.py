@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.one_python, needs_chromium]
 
 
 def page_of(browser: Browser, view: StudyView) -> AbstractContextManager[Page]:
-    return opened_page(browser, view.url, ready="body[data-page=open][data-trials]", size=(1000, 700))
+    return opened_page(browser, view.url, ready="body[data-session=open][data-trials]", size=(1000, 700))
 
 
 def scene(page: Page, shows: Callable[[np.ndarray], bool]) -> np.ndarray:

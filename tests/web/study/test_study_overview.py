@@ -22,7 +22,7 @@ from vtbdrake.web import StudyView, view_study
 
 __all__ = ["axe"]
 
-READY = "body[data-page=open][data-trials]"
+READY = "body[data-session=open][data-trials]"
 PARAMETERS = (
     Parameter(ANGLE, 0.5, 3.0),
     Parameter(RATE, -3.0, 3.0),

@@ -12,6 +12,7 @@ from vtbdrake.common.argument_checks import as_array, suggestion
 from vtbdrake.common.json_data import plain
 from vtbdrake.rollout.course import Course, DrivenRollout
 from vtbdrake.testbed.switch import COMMAND, T_ACT, Position
+from vtbdrake.web.live.written_course import add_writes
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import Context
@@ -227,7 +228,10 @@ class Driver:
         """
         for address, value in values.items():
             self._testbed.variables()[address].check(value)
-        self._pending |= values
+        for address in values:  # A handle moves as a whole.
+            if (handle := address.partition("[")[0]) in self._handles:
+                self._pending.setdefault(handle, self._shaped(handle, self._now(handle)))
+        add_writes(self._pending, values)
 
     def advance(self) -> None:
         """Move the handles, and simulate one step."""

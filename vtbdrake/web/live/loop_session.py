@@ -74,7 +74,7 @@ class LoopSession(Session["_LoopStage"]):
             SessionError: The loop rejects it, does not answer, or one of them is not set by a page.
         """
         for address in values:
-            if not self.variables.get(address, {}).get("settable"):
+            if not self.variables.get(address.partition("[")[0], {}).get("settable"):
                 raise SessionError(f"there is no variable {address!r} of the DPS, or it cannot be set")
         self._ask(lambda client: client.set(values))
 

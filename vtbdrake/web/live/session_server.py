@@ -6,6 +6,7 @@ import asyncio
 import base64
 import io
 import re
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -161,6 +162,9 @@ class Page:
         self._session, self.folder, self.study = session, folder, study
         self._browser = browser
         self._watched: tuple[str, ...] = ()
+        # Commands that have been carried out, each with the number of the last frame that may be older.
+        self._carried_out: deque[tuple[int, int]] = deque()
+        self._reflected = 0
         self.drives = False
         self._commands: dict[str, Callable[[Mapping[str, Any]], Any]] = {
             "write": lambda message: session.write(message["values"], **_comparison(session, message)),
@@ -233,12 +237,21 @@ class Page:
             if frame is None:
                 continue
             number = frame.number
+            while self._carried_out and self._carried_out[0][1] < number:
+                self._reflected, _ = self._carried_out.popleft()
             values = {address: frame.values[address] for address in self._watched if address in frame.values}
-            shown = {**asdict(frame), "values": values, "speed": _finite(frame.speed)}
+            shown = {**asdict(frame), "values": values, "speed": _finite(frame.speed), "reflects": self._reflected}
             await send(self._browser, {"type": "frame", "steers": server.steers(self), **shown})
             await asyncio.sleep(_FRAME_PERIOD)
 
     async def _carry_out(self, message: Mapping[str, Any], server: Server) -> Any:
+        try:
+            return await self._done(message, server)
+        finally:
+            if isinstance(number := message.get("id"), int) and (latest := self._session.latest) is not None:
+                self._carried_out.append((number, latest.number))
+
+    async def _done(self, message: Mapping[str, Any], server: Server) -> Any:
         if (name := message.get("do")) == "take over":
             return await server.take_over(self)
         if isinstance(name, str) and name in _PLAYED and name not in self._commands:

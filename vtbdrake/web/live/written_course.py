@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vtbdrake.rollout.course import Course
 
 if TYPE_CHECKING:
@@ -19,6 +21,26 @@ class _WrittenValues:
 
     start: Snapshot
     writes: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+
+def add_writes(writes: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Add values that are set after others of the same instant: a variable is set whole, or by its entries.
+
+    Args:
+        writes: Values by address, such as ``dps.goal`` or its entry ``dps.goal[1]``; they are changed.
+        values: The later ones.
+    """
+    for address, value in values.items():
+        whole, bracket, index = address.partition("[")
+        if bracket and whole in writes:
+            array = np.array(writes[whole], dtype=float)
+            array.flat[int(index.removesuffix("]"))] = value
+            writes[whole] = array.tolist()
+            continue
+        if not bracket:
+            for entry in [entry for entry in writes if entry.startswith(f"{address}[")]:
+                del writes[entry]
+        writes[address] = value
 
 
 class WrittenCourse:
@@ -60,7 +82,7 @@ class WrittenCourse:
             values: Values by address; they replace earlier ones of the same time.
         """
         part = self._parts[-1]
-        part.writes.setdefault(self._steps(part.start, time), {}).update(values)
+        add_writes(part.writes.setdefault(self._steps(part.start, time), {}), values)
 
     def course(self, now: float) -> Course | None:
         """Return the course until now; None if nothing was set or driven."""

@@ -30,6 +30,7 @@ export class Drive {
     this.sentAt = -Infinity;
     this.polledAt = -Infinity;
     this.driving = false;
+    this.asked = 0; // the last command that began or ended a drive
     this.handles = element("div", {});
     this.status = element("output", { id: "vtb-drive-status" });
     this.begin = button("vtb-drive-begin", "take over", "drive by hand from now on, in a fork", () => this.#begin());
@@ -107,7 +108,10 @@ export class Drive {
     this.begin.blur();
     this.sent = "";
     this.pressed.clear();
-    const begun = await this.page.ask("drive", { addresses: driven.map(({ address }) => address), returning, compare });
+    const addresses = driven.map(({ address }) => address);
+    const asked = this.page.ask("drive", { addresses, returning, compare });
+    this.asked = this.page.session.asked;
+    const begun = await asked;
     if (!begun) return;
     this.#follow();
     await this.page.ask("play");
@@ -116,7 +120,9 @@ export class Drive {
   /** @param {boolean} keep */
   async #end(keep) {
     /** @type {HTMLElement | null} */ (document.activeElement)?.blur();
-    const driven = await this.page.ask("end_drive", { keep });
+    const asked = this.page.ask("end_drive", { keep });
+    this.asked = this.page.session.asked;
+    const driven = await asked;
     if (!driven) return;
     const value =
       driven.value === null ? "" : `, ${this.quality} ${number(driven.value)} at t* = ${number(driven.t_star)} s`;
@@ -169,6 +175,7 @@ export class Drive {
 
   /** @param {{ drive: any, steers: boolean }} frame */
   frame({ drive, steers }) {
+    if (!this.page.reflects(this.asked)) return;
     if (!drive || !steers) this.driving = false;
     else this.#follow();
     this.#show(drive);

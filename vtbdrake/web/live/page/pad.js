@@ -59,7 +59,7 @@ class Draggable {
 
   /** @param {PointerEvent} event */
   #press(event) {
-    if (event.button !== 0) return;
+    if (event.button !== 0 || !this.watched.values.length) return; // Its place is not known yet.
     event.preventDefault();
     /** @type {HTMLElement | null} */ (document.activeElement)?.blur(); // Esc is for the drag.
     this.root.setPointerCapture(event.pointerId);

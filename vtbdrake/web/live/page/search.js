@@ -36,6 +36,12 @@ export class Search {
     this.root = element("div", {}, this.input, this.matches, this.more);
   }
 
+  /** @param {Record<string, { unit: string }>} variables among which it finds; somebody may be typing already */
+  hello(variables) {
+    this.variables = variables;
+    if (this.input.value) this.#find();
+  }
+
   /** @param {boolean} all whether to list all addresses for an empty field */
   #find(all = false) {
     const words = this.input.value.toLowerCase().split(/\s+/).filter(Boolean);

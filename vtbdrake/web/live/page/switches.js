@@ -1,6 +1,6 @@
 // The switches T_sense and T_act of all signals, and the mode that they make.
 
-import { element } from "./common.js";
+import { choice, element, isHeld } from "./common.js";
 
 // Positions of T_sense and T_act -> mode.
 /** @type {Record<string, string>} */
@@ -10,6 +10,7 @@ export class Switches {
   /** @param {any} page */
   constructor(page) {
     this.page = page;
+    this.asked = 0; // the last command that threw one
     this.list = element("div", { id: "vtb-switches" });
     this.mode = element("output", { id: "vtb-mode", title: "mode of the switches" });
     this.root = element("div", {}, element("h2", {}, "Switches"), this.list);
@@ -44,7 +45,7 @@ export class Switches {
    */
   #show(id, side, signal, positions) {
     const chosen = /** @type {HTMLSelectElement | null} */ (document.getElementById(id)) ?? this.#add(id, side, signal);
-    if (document.activeElement === chosen) return;
+    if (isHeld(chosen) || !this.page.reflects(this.asked)) return;
     const position = new Set(positions).size > 1 ? "mixed" : positions[0];
     let option = [...chosen.options].find(({ value }) => value === position);
     if (!option) chosen.append((option = element("option", { hidden: true }, position)));
@@ -62,9 +63,9 @@ export class Switches {
   #add(id, side, signal) {
     const places = side === "sense" ? ["sim", "real"] : ["sim", "real", "twin"];
     const reason = element("small", { className: "bad" });
-    const chosen = element(
-      "select",
-      { id, onchange: () => this.#throw(chosen, reason, side, signal) },
+    const chosen = choice(
+      { id },
+      (position) => this.#throw(position, reason, side, signal),
       ...places.map((place) => element("option", {}, place)),
     );
     const label = element("label", { htmlFor: id }, signal ? `T_${side}.${signal}` : `T_${side}, all signals`);
@@ -73,16 +74,16 @@ export class Switches {
   }
 
   /**
-   * @param {HTMLSelectElement} chosen
+   * @param {string} position
    * @param {HTMLElement} reason where a refusal is told
    * @param {string} side
    * @param {string | null} signal
    */
-  #throw(chosen, reason, side, signal) {
-    this.page.session.ask("switch", { [side]: signal ? { [signal]: chosen.value } : chosen.value }).then(
+  #throw(position, reason, side, signal) {
+    this.page.session.ask("switch", { [side]: signal ? { [signal]: position } : position }).then(
       () => (reason.textContent = ""),
       (/** @type {Error} */ error) => (reason.textContent = error.message),
     );
-    chosen.blur();
+    this.asked = this.page.session.asked;
   }
 }

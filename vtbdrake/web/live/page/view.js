@@ -1,7 +1,7 @@
 // The controls of a session, beside Meshcat's viewer, whose page loads this module.
 
 import { Camera } from "./camera.js";
-import { Connection, Telling, button, element, load, reloadWhenBack } from "./common.js";
+import { Connection, Telling, button, choice, element, isHeld, load } from "./common.js";
 import { Drive } from "./drive.js";
 import { GhostLegend, otherCourse } from "./ghost_legend.js";
 import { Keep } from "./keep.js";
@@ -56,7 +56,16 @@ class Page extends Telling {
   playing = false;
   loop = "";
   layoutKey = ""; // empty until the layout is the one that was remembered
-  scrubbing = -Infinity;
+  reflected = 0; // the last command that has been carried out before the frame that is shown
+  // The last commands that let time run, change its speed, and go back.
+  asked = { play: 0, speed: 0, seek: 0 };
+  scrubbing = false;
+  speedChosen = 1;
+  speed = choice(
+    { id: "vtb-speed", title: "speed (+ and -)", "aria-label": "speed" },
+    (value) => this.#setSpeed(Number(value)),
+    ...SPEEDS.map((speed) => element("option", { value: speed }, speed < 1 ? `1/${1 / speed} ×` : `${speed} ×`)),
+  );
   /** @type {ReturnType<typeof setTimeout> | null} */
   timer = null;
   /** @type {ReturnType<typeof setTimeout> | null} */
@@ -83,7 +92,7 @@ class Page extends Telling {
     this.session = new Connection({
       hello: (/** @type {any} */ message) => this.#hello(message),
       frame: (/** @type {any} */ frame) => this.#frame(frame),
-      closed: () => this.#lose(),
+      closed: () => this.lose(this.panel, this.bar, this.camera.toolbar),
     });
     document.addEventListener("keydown", (event) => this.#key(event));
   }
@@ -115,21 +124,11 @@ class Page extends Telling {
     this.bar = this.#makeBar();
     document.body.append(this.panel, this.bar);
     document.documentElement.lang = "en";
-    this.speed.value = 1;
+    this.speed.value = "1";
     this.fold(NARROW.matches);
   }
 
   #makeBar() {
-    this.speed = element(
-      "select",
-      {
-        id: "vtb-speed",
-        title: "speed (+ and -)",
-        "aria-label": "speed",
-        onchange: () => this.ask("speed", { speed: Number(this.speed.value) }),
-      },
-      ...SPEEDS.map((speed) => element("option", { value: speed }, speed < 1 ? `1/${1 / speed} ×` : `${speed} ×`)),
-    );
     this.clock = element("output", { id: "vtb-time", title: "simulated time" });
     this.rate = element("output", { id: "vtb-rate", title: "simulated seconds per second" });
     this.history = element("input", {
@@ -139,6 +138,8 @@ class Page extends Telling {
       title: "go back",
       "aria-label": "time, to go back",
       oninput: () => this.#scrub(),
+      onchange: () => (this.scrubbing = false),
+      onpointerup: () => (this.scrubbing = false),
     });
     this.foldButton.setAttribute("aria-controls", "vtb-panel");
     return element(
@@ -161,7 +162,8 @@ class Page extends Telling {
   /** @param {any} message */
   #hello(message) {
     const { scenario, variables, bodies } = message;
-    this.variables = this.search.variables = variables;
+    this.variables = variables;
+    this.search.hello(variables);
     this.commands = new Set(message.commands);
     this.loop = message.loop;
     for (const part of this.parts) part.hello(message);
@@ -173,16 +175,6 @@ class Page extends Telling {
     this.#restoreLayout(scenario, message.opening);
     if (Object.keys(message.vr).length) this.fold(false); // A headset, narrow or not, enters by the panel.
     document.body.dataset.session = "open";
-  }
-
-  // The controls do nothing until the server is there again; then the page begins anew, with the same layout.
-  #lose() {
-    document.body.dataset.session = "lost";
-    for (const controls of [this.panel, this.bar, this.camera.toolbar]) controls.inert = true;
-    this.say("the connection is lost, or the session has ended: looking for the server", "bad", "closed");
-    reloadWhenBack(() =>
-      this.say("the server has ended, and begun anew: open the address that it has printed", "bad", "closed"),
-    );
   }
 
   // Whether the session carries out a command.
@@ -291,17 +283,6 @@ class Page extends Telling {
   }
 
   /**
-   * @param {number[]} values
-   * @param {number[]} shape
-   * @returns {any[]} the values as nested arrays
-   */
-  shaped(values, [first, ...rest]) {
-    if (!rest.length) return values;
-    const size = rest.reduce((product, n) => product * n, 1);
-    return Array.from({ length: first }, (_, i) => this.shaped(values.slice(i * size, (i + 1) * size), rest));
-  }
-
-  /**
    * @param {Watched} watched
    * @param {Record<string, any>} values
    */
@@ -335,6 +316,12 @@ class Page extends Telling {
     if (answer !== undefined) this.say(`${Object.keys(before).join(", ")} as before the change`, "draft");
   }
 
+  // What was dragged is where it was before: there is nothing to commit.
+  dropDraft() {
+    this.draft = null;
+    if (this.can("cancel_preview")) this.ask("cancel_preview");
+  }
+
   cancel() {
     this.draft?.watched.close("cancelled");
     this.draft = null;
@@ -344,21 +331,38 @@ class Page extends Telling {
 
   // -- time
 
+  // What is pressed again before a frame has come means the opposite.
   toggle() {
-    return this.ask(this.playing ? "pause" : "play");
+    this.playing = !this.playing;
+    this.#showPlaying();
+    this.ask(this.playing ? "play" : "pause");
+    this.asked.play = this.session.asked;
+  }
+
+  #showPlaying() {
+    this.playButton.textContent = this.playing ? "pause" : "play";
   }
 
   /** @param {number} by */
   #changeSpeed(by) {
-    const index = SPEEDS.indexOf(Number(this.speed.value)) + by;
-    if (SPEEDS[index]) this.ask("speed", { speed: SPEEDS[index] });
+    const speed = SPEEDS[SPEEDS.indexOf(this.speedChosen) + by];
+    if (speed) this.#setSpeed(speed);
+  }
+
+  /** @param {number} speed */
+  #setSpeed(speed) {
+    this.speedChosen = speed;
+    this.speed.value = String(speed);
+    this.ask("speed", { speed });
+    this.asked.speed = this.session.asked;
   }
 
   #scrub() {
-    this.scrubbing = performance.now();
+    this.scrubbing = true;
     this.seekTimer ??= setTimeout(() => {
       this.seekTimer = null;
       this.ask("seek", { time: Number(this.history.value) });
+      this.asked.seek = this.session.asked;
     }, PREVIEW_PERIOD);
   }
 
@@ -410,15 +414,29 @@ class Page extends Telling {
 
   // -- what comes from the session
 
+  /**
+   * Whether the frame that is shown was made after a command: an older one must not take back what a person sees.
+   *
+   * @param {number} command its number
+   */
+  reflects(command) {
+    return this.reflected >= command;
+  }
+
   /** @param {any} frame */
   #frame(frame) {
-    this.playing = frame.playing;
-    this.playButton.textContent = frame.playing ? "pause" : "play";
+    this.reflected = frame.reflects;
+    if (this.reflects(this.asked.play)) this.playing = frame.playing;
+    this.#showPlaying();
     this.clock.textContent = `${frame.time.toFixed(3)} s`;
     this.rate.textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : this.loop ? "no values" : "paused";
-    if (document.activeElement !== this.speed) this.speed.value = frame.speed;
+    if (this.reflects(this.asked.speed) && !isHeld(this.speed)) {
+      this.speedChosen = frame.speed;
+      this.speed.value = frame.speed;
+    }
     [this.history.min, this.history.max] = frame.history;
-    if (!(performance.now() - this.scrubbing < 500)) this.history.value = frame.log?.seeking ?? frame.time;
+    if (!this.scrubbing && !this.seekTimer && this.reflects(this.asked.seek))
+      this.history.value = frame.log?.seeking ?? frame.time;
     for (const [address, value] of Object.entries(frame.values)) this.watched.get(address)?.show(frame.time, value);
     this.#showState(frame);
     for (const part of this.parts) part.frame(frame);

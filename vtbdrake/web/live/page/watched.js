@@ -1,6 +1,6 @@
 // A watched variable: its entries with names, units and ranges, to be read, set and plotted.
 
-import { element, number } from "./common.js";
+import { choice, element, isHeld, number } from "./common.js";
 import { draggables } from "./pad.js";
 import { Plot } from "./plot.js";
 import { shownUnit } from "./search.js";
@@ -52,6 +52,7 @@ export class Watched {
   values = [];
   draft = "none"; // "open" while a slider is dragged, "cancelled" until it is released
   typing = false;
+  asked = 0; // the last command that set it
   /** @type {Plot | null} */
   plot = null;
 
@@ -164,6 +165,7 @@ export class Watched {
       "aria-label": unit ? `${name} in ${unit}` : name,
       onchange: () => {
         this.typing = false; // What was refused gives way to the present value.
+        this.close("none"); // A drag that was cancelled before is over.
         this.commit({ [index]: text.value.trim() ? Number(text.value) : NaN });
       },
       onfocus: () => (this.typing = true),
@@ -175,24 +177,24 @@ export class Watched {
     const row = (/** @type {any[]} */ ...controls) =>
       element("div", { className: "vtb-entry" }, ...caption, ...controls);
     if (choices.length) {
-      const choice = element(
-        "select",
-        {
-          "aria-label": name,
-          disabled: !settable,
-          onchange: () => this.commit({ [index]: Number(choice.value) }),
-        },
+      const made = choice(
+        { "aria-label": name, disabled: !settable },
+        (value) => this.commit({ [index]: Number(value) }),
         ...choices.map((option) => element("option", { value: String(option.value) }, option.name)),
       );
-      return { ...entry, choice, row: row(choice) };
+      return { ...entry, choice: made, row: row(made) };
     }
     if (!settable) return { ...entry, row: row(text, ...after) };
+    const begin = () => (this.draft = "none");
     const slider = element("input", {
       type: "range",
       step: "any",
       title,
       "aria-label": name,
-      onpointerdown: () => (this.draft = "none"),
+      disabled: true, // until its range is known, with the first value
+      onpointerdown: begin,
+      onkeydown: begin,
+      onpointerup: () => setTimeout(() => this.#drop()), // behind the change that it makes
       oninput: () => this.preview({ [index]: Number(slider.value) }),
       onchange: () => this.commit({ [index]: Number(slider.value) }),
     });
@@ -200,16 +202,19 @@ export class Watched {
   }
 
   /**
+   * Only what is changed is sent: the other entries may have changed since, or may not be known yet.
+   *
    * @param {Record<number, number>} changes entries by index
-   * @returns {any} the value of the variable with them
+   * @returns {Record<string, number>} the same by address
    */
-  #with(changes) {
-    return this.#shaped(this.#changed(changes));
-  }
-
-  /** @param {any[]} values */
-  #shaped(values) {
-    return this.variable.shape.length ? this.page.shaped(values, this.variable.shape) : values[0];
+  #addressed(changes) {
+    const { shape } = this.variable;
+    return Object.fromEntries(
+      Object.entries(changes).map(([index, value]) => [
+        shape.length ? `${this.address}[${index}]` : this.address,
+        value,
+      ]),
+    );
   }
 
   /** @param {Record<number, number>} changes */
@@ -232,7 +237,7 @@ export class Watched {
       entry.slider.value = value;
     }
     for (const part of this.draggables) part.show(this.#changed(changes));
-    this.page.preview(this, { [this.address]: this.#with(changes) });
+    this.page.preview(this, this.#addressed(changes));
   }
 
   /**
@@ -245,8 +250,17 @@ export class Watched {
     this.close("none");
     if (cancelled) return;
     if (!Object.values(changes).every(Number.isFinite)) return this.page.say(`${this.address} takes a number`, "bad");
-    const before = this.values.every(Number.isFinite) ? { [this.address]: this.#shaped(this.values) } : null;
-    this.page.commit({ [this.address]: this.#with(changes) }, before);
+    const before = Object.fromEntries(Object.keys(changes).map((index) => [index, this.values[Number(index)]]));
+    const isKnown = Object.values(before).every(Number.isFinite);
+    this.page.commit(this.#addressed(changes), isKnown ? this.#addressed(before) : null);
+    this.asked = this.page.session.asked;
+  }
+
+  // A slider that is back where the drag began has no change.
+  #drop() {
+    if (this.draft !== "open") return;
+    this.close("none");
+    this.page.dropDraft();
   }
 
   /** @param {string} draft */
@@ -266,8 +280,9 @@ export class Watched {
     this.root.classList.toggle("vtb-stale", !isKnown);
     this.root.title = isKnown ? "" : "this state has no such value: the last one is shown";
     if (isKnown || !this.values.length) this.values = Array.isArray(value) ? value : [value];
-    for (const [index, entry] of this.entries.entries()) this.#showEntry(entry, this.values[index]);
-    if (this.draft !== "open") for (const part of this.draggables) part.show(this.values);
+    const isNew = this.draft !== "open" && this.page.reflects(this.asked);
+    if (isNew) for (const [index, entry] of this.entries.entries()) this.#showEntry(entry, this.values[index]);
+    if (isNew) for (const part of this.draggables) part.show(this.values);
     if (isKnown) this.plot?.extend(time, this.values);
   }
 
@@ -276,15 +291,16 @@ export class Watched {
    * @param {any} now
    */
   #showEntry(entry, now) {
-    if (this.draft === "open" || this.typing) return;
+    if (this.typing) return;
     entry.text.value = typeof now === "string" ? now : number(now);
-    if (entry.choice && document.activeElement !== entry.choice) entry.choice.value = String(now);
+    if (entry.choice && !isHeld(entry.choice)) entry.choice.value = String(now);
     const { slider } = entry;
     if (!slider) return;
     if (!entry.ranged || now < Number(slider.min) || now > Number(slider.max)) {
       const reach = Math.max(2 * Math.abs(now), 1);
       slider.min = entry.lower ?? now - reach;
       slider.max = entry.upper ?? now + reach;
+      slider.disabled = false;
       entry.ranged = true;
     }
     slider.value = now;

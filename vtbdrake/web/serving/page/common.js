@@ -53,6 +53,56 @@ export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s
  */
 export const button = (id, label, title, onclick) => element("button", { ...(id && { id }), title, onclick }, label);
 
+/**
+ * A choice among options. While a person makes it, what the server says does not change it, see `isHeld`.
+ *
+ * @param {Record<string, any>} properties
+ * @param {(value: string) => unknown} chosen is called with the value of the option that was chosen
+ * @param {HTMLOptionElement[]} options
+ * @returns {HTMLSelectElement}
+ */
+export function choice(properties, chosen, ...options) {
+  const hold = () => (made.dataset.held = "");
+  const leave = () => delete made.dataset.held;
+  const change = () => {
+    leave();
+    chosen(made.value);
+  };
+  const listeners = { onpointerdown: hold, onkeydown: hold, onblur: leave, onchange: change };
+  /** @type {HTMLSelectElement} */
+  const made = element("select", { ...properties, ...listeners }, ...options);
+  return made;
+}
+
+/** @param {HTMLSelectElement} made a choice that may just be made */
+export const isHeld = (made) => "held" in made.dataset;
+
+/** @type {Node | null} */
+let pressed = null; // what a pointer is pressed on
+/** @type {Map<HTMLElement, any[]>} */
+const postponed = new Map(); // what elements are to contain after the click
+
+/**
+ * Replaces what an element contains; while a pointer is pressed in it, only after the click, which would be lost if
+ * the button or the row under it were taken away.
+ *
+ * @param {HTMLElement} parent
+ * @param {any[]} children
+ */
+export function replaceContent(parent, ...children) {
+  if (parent.contains(pressed)) postponed.set(parent, children);
+  else parent.replaceChildren(...children);
+}
+
+function release() {
+  pressed = null;
+  for (const [parent, children] of postponed) parent.replaceChildren(...children);
+  postponed.clear();
+}
+
+document.addEventListener("pointerdown", ({ target }) => (pressed = /** @type {Node} */ (target)), true);
+for (const name of ["pointerup", "pointercancel"]) document.addEventListener(name, () => setTimeout(release), true);
+
 // -- messages
 
 // What a page tells a person.
@@ -130,6 +180,20 @@ export class Telling {
   takeBack(kind) {
     this.told(kind)?.remove();
   }
+
+  /**
+   * The connection to the server is lost: controls do nothing until it is there again. Then the page begins anew.
+   *
+   * @param {HTMLElement[]} controls
+   */
+  lose(...controls) {
+    document.body.dataset.session = "lost";
+    for (const control of controls) control.inert = true;
+    this.say("the connection is lost, or the server has ended: looking for it", "bad", "closed");
+    reloadWhenBack(() =>
+      this.say("the server has ended, and begun anew: open the address that it has printed", "bad", "closed"),
+    );
+  }
 }
 
 // -- the connection
@@ -141,7 +205,7 @@ const RETRY = 1000; // ms between two looks for a server that is lost
  *
  * @param {() => void} refused is called where it answers, and knows this page's session no more
  */
-export async function reloadWhenBack(refused) {
+async function reloadWhenBack(refused) {
   for (;;) {
     await new Promise((resolve) => setTimeout(resolve, RETRY));
     const answer = await fetch(location.href, { cache: "no-store" }).catch(() => null);
@@ -174,8 +238,13 @@ export class Connection {
     };
   }
 
+  /** The number of the last command. */
+  get asked() {
+    return this.#number;
+  }
+
   /**
-   * Sends a command.
+   * Sends a command, as soon as the connection is there.
    *
    * @param {string} command
    * @param {Record<string, any>} fields
@@ -183,11 +252,14 @@ export class Connection {
    */
   ask(command, fields = {}) {
     const id = ++this.#number;
-    if (this.#socket.readyState !== WebSocket.OPEN)
+    const socket = this.#socket;
+    const send = () => socket.send(JSON.stringify({ id, do: command, ...fields }));
+    if (socket.readyState > WebSocket.OPEN)
       return Promise.reject(new Error("the page has no connection to its server"));
     return new Promise((resolve, reject) => {
       this.#waiting.set(id, { resolve, reject });
-      this.#socket.send(JSON.stringify({ id, do: command, ...fields }));
+      if (socket.readyState === WebSocket.OPEN) send();
+      else socket.addEventListener("open", send, { once: true });
     });
   }
 }

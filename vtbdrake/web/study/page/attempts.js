@@ -74,12 +74,12 @@ export class Attempts {
       "aria-label": address,
       onchange: () => {
         if (text.value.trim() !== "" && Number.isFinite(Number(text.value))) replaced(Number(text.value));
-        else show();
+        show();
       },
     });
     const update = () => {
       slider.value = options ? this.draft[k] / last : scale.unit(this.draft[k]);
-      show();
+      if (document.activeElement !== text) show(); // A better trial does not take away what is being typed.
     };
     const label = `${this.page.parameterLabel(k)} ${unit === "1" || !unit ? "" : `[${unit}]`}`;
     const row = element("div", { className: "vtb-entry" }, element("label", { title: address }, label), slider, text);

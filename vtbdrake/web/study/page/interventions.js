@@ -1,6 +1,6 @@
 // What a person changes in a study: its controls, its search, and the list of changes.
 
-import { button, element, number } from "./common.js";
+import { button, choice, element, isHeld, number, replaceContent } from "./common.js";
 
 const CONTROLS = ["pause", "resume", "stop"]; // the points do not depend on these
 
@@ -9,6 +9,8 @@ export class Interventions {
   status = null;
   /** @type {number | undefined} */
   listed;
+  #asked = 0; // changes that are on their way to the server
+  #latest = 0; // number of the last one that it has taken, as long as no status has told it
 
   /** @param {any} page of the study */
   constructor(page) {
@@ -25,10 +27,12 @@ export class Interventions {
       this.run(),
     );
     this.controls = element("span", { id: "vtb-controls" }, this.runButton, this.pauseButton, this.stopButton);
+    for (const control of [this.runButton, this.pauseButton, this.stopButton])
+      page.allow(control, "where the study stands is not known yet");
     this.rows = parameters.map((parameter) => this.#row(parameter));
-    this.solver = element(
-      "select",
-      { id: "vtb-solver", onchange: () => this.intervene("solver", { solver: this.solver.value }) },
+    this.solver = choice(
+      { id: "vtb-solver" },
+      (solver) => this.intervene("solver", { solver }),
       ...page.hello.solvers.map((/** @type {string} */ name) => element("option", {}, name)),
     );
     this.budget = element("input", {
@@ -138,9 +142,27 @@ export class Interventions {
     return this.forbidding.checked && !this.search.hidden;
   }
 
-  /** @param {string} kind */
-  intervene(kind, payload = {}) {
-    return this.page.do("intervene", { kind, payload });
+  /**
+   * Asks for a change; the controls show what the study does about it from then on.
+   *
+   * @param {string} kind
+   */
+  async intervene(kind, payload = {}) {
+    this.#asked += 1;
+    const place = await this.page.do("intervene", { kind, payload });
+    this.#asked -= 1;
+    if (place === undefined) this.#showControls();
+    else this.#latest = place;
+  }
+
+  /** @param {number} place of the change that is taken back */
+  async #remove(place) {
+    if ((await this.page.do("remove", { number: place })) !== undefined) this.#latest = 0;
+  }
+
+  // A status from before a change would take back what a person has set meanwhile.
+  get #isBehind() {
+    return !this.status || this.#asked > 0 || this.#latest > 0;
   }
 
   // Lets a process of its own go on with the study.
@@ -205,7 +227,7 @@ export class Interventions {
       this.page.say(`the ${name} end of ${address} is a number`, "bad");
     else this.intervene("range", { address, [name]: value });
     field.blur();
-    this.show(this.status);
+    this.#showControls();
   }
 
   /**
@@ -214,7 +236,7 @@ export class Interventions {
    */
   #choose({ address, options }, boxes) {
     const chosen = options.filter((/** @type {any} */ _, /** @type {number} */ k) => boxes[k].checked);
-    this.intervene("range", { address, options: chosen }).then(() => this.show(this.status));
+    this.intervene("range", { address, options: chosen });
   }
 
   /**
@@ -225,10 +247,8 @@ export class Interventions {
     const k = this.addresses.indexOf(address),
       value = this.page.attempts.draft[k],
       { options } = this.page.parameters[k];
-    const done = frozen
-      ? this.intervene("freeze", { address, value: options ? options[value] : value })
-      : this.intervene("unfreeze", { address });
-    done.then(() => this.show(this.status));
+    if (frozen) this.intervene("freeze", { address, value: options ? options[value] : value });
+    else this.intervene("unfreeze", { address });
   }
 
   #setBudget() {
@@ -238,7 +258,7 @@ export class Interventions {
     if (rollouts !== null && !Number.isInteger(rollouts))
       this.page.say("a budget is a whole number of rollouts", "bad");
     else this.intervene("budget", { rollouts });
-    this.show(this.status);
+    this.#showControls();
   }
 
   /**
@@ -294,6 +314,7 @@ export class Interventions {
   show(status) {
     const before = JSON.stringify(this.status?.forbidden ?? []);
     this.status = status;
+    if (status.interventions.at(-1)?.number >= this.#latest) this.#latest = 0;
     const running = status.state === "running";
     this.pauseButton.textContent = status.paused ? "resume" : "pause";
     this.runButton.hidden = running || !this.page.hello.command;
@@ -304,21 +325,9 @@ export class Interventions {
     const idle = "no process runs the study: go on first";
     this.page.allow(this.pauseButton, running || status.paused ? "" : idle);
     this.page.allow(this.stopButton, running ? "" : idle);
-    this.rows.forEach(({ ends, boxes, frozen, text, options }, k) => {
-      const range = status.ranges[k],
-        address = this.addresses[k];
-      ends.forEach((field, i) => {
-        if (document.activeElement !== field) field.value = number(i ? range.upper : range.lower);
-      });
-      boxes.forEach((box, i) => (box.checked = range.options.includes(options[i])));
-      frozen.checked = address in status.frozen;
-      text.textContent = frozen.checked
-        ? `at ${options ? status.frozen[address] : number(status.frozen[address])}`
-        : "";
-    });
-    if (document.activeElement !== this.solver) this.solver.value = status.solver;
-    if (document.activeElement !== this.budget) this.budget.value = status.budget ?? "";
-    this.forbidden.replaceChildren(
+    this.#showControls();
+    replaceContent(
+      this.forbidden,
       ...status.forbidden.map((/** @type {[number, Record<string, any[]>]} */ [place, region]) =>
         element(
           "li",
@@ -334,6 +343,26 @@ export class Interventions {
     document.body.dataset.effective = effective.length;
     if (JSON.stringify(status.forbidden) !== before || status.interventions.length !== this.listed) this.page.draw();
     this.listed = status.interventions.length;
+  }
+
+  // Shows how the search is set, but for what is just being set.
+  #showControls() {
+    const { status } = this;
+    if (this.#isBehind) return;
+    this.rows.forEach(({ ends, boxes, frozen, text, options }, k) => {
+      const range = status.ranges[k],
+        address = this.addresses[k];
+      ends.forEach((field, i) => {
+        if (document.activeElement !== field) field.value = number(i ? range.upper : range.lower);
+      });
+      boxes.forEach((box, i) => (box.checked = range.options.includes(options[i])));
+      frozen.checked = address in status.frozen;
+      text.textContent = frozen.checked
+        ? `at ${options ? status.frozen[address] : number(status.frozen[address])}`
+        : "";
+    });
+    if (!isHeld(this.solver)) this.solver.value = status.solver;
+    if (document.activeElement !== this.budget) this.budget.value = status.budget ?? "";
   }
 
   /** @param {any[]} interventions */
@@ -355,18 +384,15 @@ export class Interventions {
           ),
         ),
       );
-    this.changes.replaceChildren(
+    replaceContent(
+      this.changes,
       ...(rows.length ? rows : [element("tr", {}, element("td", {}, "nothing has been changed"))]),
     );
   }
 
   /** @param {number} place */
   #takeBack(place) {
-    return element(
-      "button",
-      { title: "it has had no effect yet", onclick: () => this.page.do("remove", { number: place }) },
-      "take back",
-    );
+    return element("button", { title: "it has had no effect yet", onclick: () => this.#remove(place) }, "take back");
   }
 
   /**

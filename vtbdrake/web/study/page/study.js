@@ -1,7 +1,7 @@
 // The page of a study, beside Meshcat's viewer, whose page loads this module.
 
 import { Attempts } from "./attempts.js";
-import { Connection, Telling, button, counted, element, load, number } from "./common.js";
+import { Connection, Telling, button, counted, element, load, number, replaceContent } from "./common.js";
 import { Interventions } from "./interventions.js";
 import { Playback } from "./playback.js";
 import { Rollouts } from "./rollouts.js";
@@ -66,10 +66,7 @@ class Page extends Telling {
       trials: (message) => this.#take(message),
       status: (message) => this.#showStatus(message),
       picture: ({ notice }) => this.say(notice, "bad", "picture"),
-      closed: () => {
-        document.body.dataset.page = "ended";
-        this.say("the page has lost its server: begin it again (vtbdrake study open)", "bad", "closed");
-      },
+      closed: () => this.lose(...(this.playback ? [this.head, this.main, this.playback.bar] : [])),
     });
     document.addEventListener("keydown", (event) => this.#key(event));
   }
@@ -106,7 +103,7 @@ class Page extends Telling {
     this.trials = new Trials(this.qualities.map(({ minimize }) => (minimize ? -1 : 1)));
     document.title = `${hello.name}: study`;
     this.#build();
-    document.body.dataset.page = "open";
+    document.body.dataset.session = "open";
     if (!hello.simulates) this.note(`no rollouts are shown: ${hello.obstacle}`, "obstacle");
     if (hello.changes.length) this.note(`the code has changed since: ${hello.changes.join("; ")}`, "changes");
   }
@@ -138,24 +135,22 @@ class Page extends Telling {
     this.fold = button("vtb-fold", "panel", "show or hide the panel", () => this.#fold());
     this.fold.setAttribute("aria-expanded", "true");
     const { controls } = this.interventions;
-    document.body.append(
-      element("header", { id: "vtb-head" }, this.fold, title, this.facts, controls, new Theme().button),
-      element(
-        "main",
-        { id: "vtb-study" },
-        this.charts.switch,
-        this.charts.selectors,
-        ...Object.values(this.charts.views).map((view) => view.element),
-        this.charts.remark,
-        this.charts.colors.element,
-        this.charts.legend.list,
-        this.rollouts.text,
-        this.charts.history.canvas,
-        this.tabs,
-        ...Object.values(this.sections),
-      ),
-      this.playback.bar,
+    this.head = element("header", { id: "vtb-head" }, this.fold, title, this.facts, controls, new Theme().button);
+    this.main = element(
+      "main",
+      { id: "vtb-study" },
+      this.charts.switch,
+      this.charts.selectors,
+      ...Object.values(this.charts.views).map((view) => view.element),
+      this.charts.remark,
+      this.charts.colors.element,
+      this.charts.legend.list,
+      this.rollouts.text,
+      this.charts.history.canvas,
+      this.tabs,
+      ...Object.values(this.sections),
     );
+    document.body.append(this.head, this.main, this.playback.bar);
     this.charts.choose("landscape");
     this.openTab("trials");
     dispatchEvent(new Event("resize"));
@@ -288,7 +283,7 @@ class Page extends Telling {
     const counts = Object.entries(ends).map(([end, count]) => `${end} ${count}`);
     const nothing = element("tr", {}, element("td", {}, "no rollout has failed"));
     const caption = counts.length ? `rollouts ended by: ${counts.join(", ")}` : "no rollout has ended yet";
-    this.failures.replaceChildren(element("caption", {}, caption), ...(rows.length ? rows : [nothing]));
+    replaceContent(this.failures, element("caption", {}, caption), ...(rows.length ? rows : [nothing]));
     const tab = /** @type {HTMLElement} */ (this.tabs.querySelector("#vtb-tab-failures"));
     tab.textContent = rows.length ? `failures (${ends.failed})` : "failures";
   }
@@ -380,6 +375,7 @@ class Page extends Telling {
   #key(event) {
     const target = /** @type {HTMLElement} */ (event.target);
     if (event.key !== " " || target.matches("input, select, button, summary")) return;
+    if (!this.playback || document.body.dataset.session === "lost") return;
     event.preventDefault();
     this.playback.play(!this.playback.playing);
   }

@@ -1,6 +1,6 @@
 // The table of all trials: sorted by a column, filtered by conditions, some tens at a time.
 
-import { button, element, number } from "./common.js";
+import { button, element, number, replaceContent } from "./common.js";
 import { numberFilter, textFilter } from "./filters.js";
 import { Thrift } from "./thrift.js";
 
@@ -229,7 +229,7 @@ export class TrialTable {
     });
     // The focus stays on the trial where it was.
     const focused = this.body.contains(document.activeElement) ? document.activeElement?.textContent : null;
-    this.body.replaceChildren(...rows.map((k) => this.#row(k)));
+    replaceContent(this.body, ...rows.map((k) => this.#row(k)));
     if (focused) this.body.querySelector(`[data-trial="${focused}"] button`)?.focus();
     const { count } = this.page.trials;
     const places = rows.length ? `${this.#first + 1} to ${this.#first + rows.length} of ` : "";
