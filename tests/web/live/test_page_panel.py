@@ -309,9 +309,7 @@ def test_lost_connection_comes_back_and_a_server_that_is_gone_is_told(browser: B
             page.evaluate(CUT)
             page.wait_for_selector("body[data-session=lost]", state="attached")
             assert page.evaluate("vtb.panel.inert && vtb.bar.inert")  # Nothing can be set meanwhile.
-            page.wait_for_function(
-                "vtb.messages.textContent.includes('or the session has ended: looking for the server')"
-            )
+            page.wait_for_function("vtb.messages.textContent.includes('or the server has ended: looking for it')")
             page.evaluate("window.isOld = true")
             page.unroute("**/")
             page.wait_for_function("!window.isOld && window.vtb?.watched.get('u.angle')?.plot")

@@ -19,19 +19,28 @@ class Newest:
     """A queue of Meshcat's messages, in which a pose, an object or a property replaces an older one that still waits.
 
     What is replaced keeps its place in the queue. Poses and properties never overtake another object, nor anything a
-    message of another kind: it may delete what they are of.
+    message of another kind: it may delete what they are of. A pose that is the same as the last one of its path is left
+    out: the viewer draws anew for every message, and most of the time nothing moves.
     """
 
     def __init__(self) -> None:
         self._messages: deque[list[bytes]] = deque()
         # Those that wait and may be replaced, by path (and name of the property).
         self._waiting: dict[str, dict[str, list[bytes]]] = {_TRANSFORM: {}, _OBJECT: {}, _PROPERTY: {}}
+        # The last pose of each path, waiting or sent.
+        self._poses: dict[str, bytes] = {}
         self._arrived = asyncio.Event()
         self.replaced = 0  # number of messages that were never sent
 
     def put(self, data: bytes) -> None:
         """Add a message."""
         kind, place = _kind_and_place(data)
+        if kind == _TRANSFORM:
+            if self._poses.get(place) == data:
+                return
+            self._poses[place] = data
+        elif kind != _OBJECT:  # It may move something, or delete it.
+            self._poses.clear()
         if (waiting := self._waiting.get(kind, {}).get(place)) is not None:
             waiting[0] = data
             self.replaced += 1

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 
 _PERIOD = 0.2  # s between two messages to a page
 _PATIENCE = 1.0  # s, for a change
+# Commands that change the study: their order counts.
+_CHANGES = ("give", "intervene", "remove", "run")
 
 
 class StudyView(WebPage):
@@ -216,10 +219,13 @@ class _StudyPage:
                     await send(self._browser, message)
                 await asyncio.sleep(_PERIOD)
 
+        changes = asyncio.Lock()  # It lets them in one after another, as they came.
+
         async def carry_out(message: Mapping[str, Any]) -> Any:
             action = action_of(message, self._commands)
             fields = {key: value for key, value in message.items() if key not in ("id", "do")}
-            return await run_in_threadpool(action, **fields)
+            async with changes if message["do"] in _CHANGES else nullcontext():
+                return await run_in_threadpool(action, **fields)
 
         await first_of(tell(), answer_commands(self._browser, carry_out, together=True))
 
