@@ -37,6 +37,7 @@ class Newest:
         kind, place = _kind_and_place(data)
         if kind == _TRANSFORM:
             if self._poses.get(place) == data:
+                self.replaced += 1
                 return
             self._poses[place] = data
         elif kind != _OBJECT:  # It may move something, or delete it.
