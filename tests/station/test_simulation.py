@@ -173,3 +173,14 @@ def test_command_that_is_not_finite_ends_the_simulation(signal: str, value: floa
     testbed = vtb.Station(f"{FILE}#Torque", dps=make_dps).build()
     with pytest.raises(ValueError, match=f"the DPS commands {signal} = .* not finite"):
         testbed.simulator().AdvanceTo(0.06)
+
+
+def test_entries_are_named_after_the_joints_of_their_arm() -> None:
+    joints = tuple(f"iiwa_joint_{k}" for k in range(1, 8))
+    commands = {"iiwa_goal": vtb.StationCommand(default=list(HOME)), "opening": vtb.StationCommand(default=[0.05])}
+    station = vtb.Station(f"{FILE}#Position", dps=commander("Position", 0.05, 40.0), commands=commands)
+    interface = station.interface()
+    names = {signal.name: signal.entry_names for signal in (*interface.sense, *interface.act, *interface.commands)}
+    for signal in ("iiwa_position_measured", "iiwa_position", "iiwa_goal"):
+        assert names[signal] == joints
+    assert names["wsg_position"] == names["opening"] == ()

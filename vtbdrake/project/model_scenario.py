@@ -60,7 +60,17 @@ class ModelFileScenario(Scenario):
         plant = _plant(self.file, tuple(self.packages.items()))
         return Interface(
             sense=[],
-            act=[Signal("positions", plant.num_positions(), unit="m, rad", lower=-np.inf, upper=np.inf, idle=0.0)],
+            act=[
+                Signal(
+                    "positions",
+                    plant.num_positions(),
+                    unit="m, rad",
+                    lower=-np.inf,
+                    upper=np.inf,
+                    idle=0.0,
+                    entry_names=plant.GetPositionNames(),
+                )
+            ],
             commands=[
                 Signal(name, 1, unit=_unit(joint), lower=lower, upper=upper, default=default)
                 for name, (joint, lower, upper, default) in _sliders(plant).items()

@@ -157,7 +157,7 @@ class Arm(StationDriver):
         positions = {"unit": "rad", "lower": limits.lower - _MARGIN, "upper": limits.upper + _MARGIN}
 
         def sensor(name: str, **options: Any) -> Signal:
-            return Signal(f"{self.name}_{name}", size=self._size, max_age=age, **options)
+            return Signal(f"{self.name}_{name}", size=self._size, max_age=age, entry_names=self.joints, **options)
 
         def torque(name: str, factor: float) -> Signal:
             return sensor(name, unit="N m", lower=-factor * limits.effort, upper=factor * limits.effort)
@@ -190,6 +190,7 @@ class Arm(StationDriver):
                     rate=limits.speed,
                     acceleration=acceleration,
                     idle=home,
+                    entry_names=self.joints,
                 )
             )
         if self._has_torque:
@@ -204,6 +205,7 @@ class Arm(StationDriver):
                     upper=limits.effort,
                     rate=rate,
                     idle=0.0,
+                    entry_names=self.joints,
                 )
             )
         return commands

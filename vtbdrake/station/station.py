@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -42,11 +42,24 @@ class StationCommand:
     unit: str = setting("1", "The unit of the values.")
     lower: float | None = setting(None, "The least value of each entry.")
     upper: float | None = setting(None, "The largest value of each entry.")
+    # Short names of the entries; empty: the joints of the arm that the command's name begins with, if there is one, and
+    # an entry for each of them.
+    entry_names: list[str] = field(default_factory=list)
 
     def signal(self, name: str) -> Signal:
         """Return the command as a signal."""
         lower, upper = -inf if self.lower is None else self.lower, inf if self.upper is None else self.upper
-        return Signal(name, size=len(self.default), unit=self.unit, lower=lower, upper=upper, default=self.default)
+        names, size = self.entry_names, len(self.default)
+        return Signal(name, size, unit=self.unit, lower=lower, upper=upper, default=self.default, entry_names=names)
+
+
+def _with_joints(command: Signal, drivers: Iterable[StationDriver]) -> Signal:
+    """Return a command of a station, whose entries have the names of the joints of the arm that it begins with."""
+    for arm in drivers:
+        is_of_arm = isinstance(arm, Arm) and command.name.startswith(f"{arm.name}_")
+        if is_of_arm and not command.entry_names and command.size == len(arm.joints):
+            return replace(command, entry_names=arm.joints)
+    return command
 
 
 @dataclass
@@ -260,7 +273,7 @@ class Station(HardwareSimScenario):
         return Interface(
             sense=sensors,
             act=[signal for name, signal in actuators.items() if name in outputs],
-            commands=[command.signal(name) for name, command in self.commands.items()],
+            commands=[_with_joints(command.signal(name), contents.drivers) for name, command in self.commands.items()],
         )
 
     def add_world(self, builder: VirtualTestbedBuilder) -> None:

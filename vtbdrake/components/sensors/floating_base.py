@@ -65,6 +65,7 @@ class BasePoseSensor(StateSensor):
             stream=stream,
             errors=errors,
         )
+        self.entry_names = ("qw", "qx", "qy", "qz", "x", "y", "z")
 
 
 class BaseTwistSensor(StateSensor):
@@ -116,6 +117,7 @@ class BaseTwistSensor(StateSensor):
             stream=stream,
             errors=errors,
         )
+        self.entry_names = tuple(f"{quantity} {axis}" for quantity in ("rate", "velocity") for axis in "xyz")
 
 
 def _check_floating(base: RigidBody, sensor: SampledSensor) -> None:

@@ -58,6 +58,7 @@ class ContactSensor(SampledSensor):
         super().__init__(
             "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", stream=stream, errors=errors
         )
+        self.entry_names = tuple(body.name() for body in bodies)
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Which sum of forces a body or geometry adds to.
         self._count = len(bodies)
