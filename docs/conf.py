@@ -5,7 +5,9 @@ here and on the forge. The lists of docs/index.md become, by heading, cards and 
 """
 
 import ast
+import os
 import re
+import subprocess
 import sys
 from dataclasses import is_dataclass
 from importlib import import_module
@@ -96,6 +98,11 @@ CLASSES = ("vtbdrake.testbed.VirtualTestbedBuilder",)
 # The building blocks that are no components.
 BLOCKS = ("vtbdrake.testbed.slow_part", "vtbdrake.reasoning.onboard")
 BLOCKS_PAGE = "docs/building_blocks"
+# The page of the example testbeds, and the folder of their recordings beside it.
+GALLERY_PAGE = "docs/gallery"
+RECORDINGS = "recordings_in_3d"
+# The labels of blocks of which a reader needs only one.
+WAYS = ("In Python", "On the command line")
 BLOCKS_PLACE = "<!-- building blocks: on the site, the ports of each follow here -->"
 
 
@@ -213,6 +220,47 @@ def cards(text: str) -> str:
         shown += [f":::{{grid-item-card}} {title}", f":link: {page}", ":link-type: doc", "", rest, ":::", ""]
     grid = ["::::{grid} 1 2 3 3", ":gutter: 2", "", *shown, "::::"] if shown else []
     return "\n".join(["", *grid, "", *others, ""])
+
+
+def show_gallery(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make cards of the table of testbeds; those with a recording lead to it."""
+    if page != GALLERY_PAGE:
+        return
+    rows = re.findall(r"^\| !\[(.*?)\]\((.*?)\) \| \*\*(.*?)\*\*: (.*?) \| (.*?) \| (.*?) \|$", source[0], re.MULTILINE)
+    shown = []
+    for alt, picture, title, text, module, more in rows:
+        name = Path(picture).stem
+        recording = f"{RECORDINGS}/{name}.html" if Path(app.srcdir, f"docs/gallery/{name}.npz").exists() else ""
+        play = ["+++", f"```{{button-link}} {recording}", ":color: primary", "", "play in 3D", "```"]
+        target = [f":target: {recording}"]
+        shown += [f":::{{grid-item-card}} {title}", f"```{{image}} {picture}", f":alt: {alt}"]
+        shown += [*(target if recording else []), "```", f"{text[0].upper()}{text[1:]}", "", more, "", module]
+        shown += [*(play if recording else []), ":::", ""]
+    table = re.search(r"^\| picture(?:.*\n?)*", source[0], re.MULTILINE)
+    assert table is not None and rows
+    source[0] = "\n".join([source[0][: table.start()], "::::{grid} 1 2 2 3", ":gutter: 3", "", *shown, "::::", ""])
+
+
+def show_tabs(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make tabs of blocks that follow each other, each below one of the labels in `WAYS`: they do the same thing."""
+    way = rf"\*\*({'|'.join(WAYS)})\*\*\n\n((?:```\w*\n(?:.*\n)*?```\n\n?)+)"
+
+    def tabs(match: re.Match[str]) -> str:
+        items = [
+            f":::{{tab-item}} {label}\n:sync: {label}\n\n{blocks.strip()}\n:::\n"
+            for label, blocks in re.findall(way, match[0])
+        ]
+        return "\n".join(["::::{tab-set}", ":sync-group: way", "", *items, "::::", "", ""])
+
+    source[0] = re.sub(rf"^(?:{way}){{2,}}", tabs, source[0], flags=re.MULTILINE)
+
+
+def write_recordings(app: Sphinx, error: Exception | None) -> None:
+    """Write the pages of the gallery's recordings, each complete in itself."""
+    if error is None and app.builder.format == "html":
+        folder = Path(app.outdir, "docs", RECORDINGS)
+        command = [sys.executable, str(Path(app.srcdir, "tools/recordings.py")), "--pages", str(folder)]
+        subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": str(app.srcdir)})
 
 
 def write_llms_txt(app: Sphinx, error: Exception | None) -> None:
@@ -335,7 +383,10 @@ def setup(app: Sphinx) -> None:
     app.connect("env-get-outdated", lambda *_: [root_doc])  # its navigation depends on the reference
     app.connect("source-read", add_navigation)
     app.connect("source-read", add_building_blocks)
+    app.connect("source-read", show_gallery)
+    app.connect("source-read", show_tabs)
     app.connect("build-finished", write_llms_txt)
+    app.connect("build-finished", write_recordings)
     app.connect("autodoc-process-docstring", mend_docstring, priority=600)  # after napoleon
     app.connect("autodoc-process-signature", mend_signature)
     app.connect("autodoc-skip-member", is_field_of_named_tuple)

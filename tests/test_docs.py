@@ -13,6 +13,8 @@ import click
 import pytest
 
 import vtbdrake
+from tests.visualization.meshcat_page import messages
+from tools.recordings import RECORDINGS
 from vtbdrake.cli import main
 
 pytestmark = pytest.mark.one_python
@@ -114,6 +116,31 @@ def test_index_lists_every_page() -> None:
     found = re.findall(r"\]\(([^)#:]+\.(?:md|ipynb))\)", index.read_text("utf-8"))
     links = {(index.parent / link).resolve() for link in found}
     assert links == {*PAGES, *(ROOT / "notebooks").glob("*.ipynb")} - {index, ROOT / "README.md"}
+
+
+def test_recordings_of_the_gallery_move() -> None:
+    kept = {path.stem for path in (ROOT / "docs" / "gallery").glob("*.npz")}
+    gallery = (ROOT / "docs" / "gallery.md").read_text("utf-8")
+    assert kept == set(RECORDINGS) and all(f"(gallery/{name}.png)" in gallery for name in kept)
+    page = RECORDINGS["cart_pole"].page(ROOT / "docs" / "gallery" / "cart_pole.npz")
+    (animation,) = [message for message in messages(page) if message["type"] == "set_animation"]
+    places = [
+        {tuple(key["value"]) for key in track["keys"]}
+        for moved in animation["animations"]
+        for track in moved["clip"]["tracks"]
+        if track["name"] == ".position"
+    ]
+    assert max(map(len, places)) > 50
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_blocks_of_one_thing_stand_together(page: Path) -> None:
+    """What the site shows as tabs: a label in Python and one on the command line, each right above its block."""
+    text = page.read_text("utf-8")
+    labels = re.findall(r"^\*\*(In Python|On the command line)\*\*\n\n```(\w+)$", text, re.MULTILINE)
+    assert len(labels) == len(re.findall(r"^\*\*(?:In Python|On the command line)\*\*", text, re.MULTILINE))
+    pairs = [sorted(labels[k : k + 2]) for k in range(0, len(labels), 2)]
+    assert all(pair == [("In Python", "python"), ("On the command line", "sh")] for pair in pairs)
 
 
 def lines_outside_code(page: Path) -> list[tuple[int, str]]:
