@@ -231,7 +231,7 @@ def show_gallery(app: Sphinx, page: str, source: list[str]) -> None:
     for alt, picture, title, text, module, more in rows:
         name = Path(picture).stem
         recording = f"{RECORDINGS}/{name}.html" if Path(app.srcdir, f"docs/gallery/{name}.npz").exists() else ""
-        play = ["+++", f"```{{button-link}} {recording}", ":color: primary", "", "play in 3D", "```"]
+        play = [f"```{{button-link}} {recording}", ":color: primary", "", "play in 3D", "```"]
         target = [f":target: {recording}"]
         shown += [f":::{{grid-item-card}} {title}", f"```{{image}} {picture}", f":alt: {alt}"]
         shown += [*(target if recording else []), "```", f"{text[0].upper()}{text[1:]}", "", more, "", module]
