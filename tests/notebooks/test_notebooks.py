@@ -11,21 +11,23 @@ LARGEST = 1_000_000  # bytes
 
 # Pieces of the code of each notebook, and what replaces them, so that the same cells take less time.
 SHORTER: dict[str, Mapping[str, str]] = {
-    # Two recordings are fitted, and one is predicted; tests/calibration/test_calibration.py takes more.
-    "calibration": {"logs[0::2]": "logs[0:4:2]", "for log in held_out])": "for log in held_out[:1]])"},
+    # One recording is fitted, and one is predicted; tests/calibration/test_calibration.py takes more.
+    "calibration": {"logs[0::2]": "logs[0:1]", "for log in held_out])": "for log in held_out[:1]])"},
     "camera": {
         "np.geomspace(0.1, 100.0, 13)": "np.geomspace(0.1, 10.0, 3)",
         "horizon=24.0": "horizon=4.0",
         "problem.sweep(5, ": "problem.sweep(2, ",
         "tried = lights": 'tried = {"beside, 70 deg": lights["beside, 70 deg"]}',
-        "assert worst[1] < worst[0]": "assert worst[1] < worst[0] + 1.0",
+        # Until the bar is gripped, tests/diagrams/satellite/test_lighting.py waits.
+        "horizon=36.0": "horizon=3.0",
+        "worst[1] < worst[0] < FAILURE": "(worst == FAILURE).all()",
     },
     "capture": {
         "[0.5, 7.0, 12.0]": "[0.5, 1.0, 1.5]",
         "horizon=16.0": "horizon=8.5",
         "[0.5, 1.0, 2.0, 4.0, 16.0]": "[2.0]",
     },
-    "cart_pole": {},
+    "cart_pole": {"seconds=4.5": "seconds=3.4"},  # The pole is upright from 3.0 s on.
     "controller": {},
     "crater": {
         "heading_reasoner(scenario)": "heading_reasoner(scenario, candidates=3, executor='serial')",
@@ -46,9 +48,9 @@ SHORTER: dict[str, Mapping[str, str]] = {
         "horizon=15.0": "horizon=10.0",
     },
     "steering": {
-        "study.run(rollouts=60": "study.run(rollouts=30",
-        '"budget", rollouts=120': '"budget", rollouts=60',
-        "study.run(rollouts=120": "study.run(rollouts=60",
+        "study.run(rollouts=60": "study.run(rollouts=20",
+        '"budget", rollouts=120': '"budget", rollouts=40',
+        "study.run(rollouts=120": "study.run(rollouts=40",
         'solver="bayesian", seed=1).run(rollouts=120': 'solver="bayesian", seed=1).run(rollouts=20',
     },
 }
