@@ -366,6 +366,39 @@ def switch_is_for_vectors_only() -> bool:
     return False
 
 
+# Renders in a thread, and ends the renderer in another one.
+RENDERS = """
+import threading
+from pydrake.geometry import (ClippingRange, ColorRenderCamera, GeometryInstance, MakeRenderEngineVtk,
+                              PerceptionProperties, RenderCameraCore, RenderEngineVtkParams, SceneGraph, Sphere)
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraInfo
+from vtbdrake.drake_workarounds.renderer_threads import release_renderers
+scene_graph = SceneGraph()
+scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams(backend="EGL")))
+ball = GeometryInstance(RigidTransform([0.0, 0.0, 1.0]), Sphere(0.1), "ball")
+ball.set_perception_properties(PerceptionProperties())
+scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("world"), ball)
+core = RenderCameraCore("vtk", CameraInfo(16, 16, 1.0), ClippingRange(0.1, 10.0), RigidTransform())
+contexts = [scene_graph.CreateDefaultContext()]
+def render():
+    query = scene_graph.get_query_output_port().Eval(contexts[0])
+    query.RenderColorImage(ColorRenderCamera(core, False), scene_graph.world_frame_id(), RigidTransform())
+    del query
+    {last}
+thread = threading.Thread(target=render)
+thread.start()
+thread.join()
+contexts.clear()
+del scene_graph
+"""
+
+
+@reproduces("drake_workarounds.renderer_threads")
+def renderer_is_not_ended_by_another_thread() -> bool:
+    return "Unable to eglMakeCurrent" in run(RENDERS.format(last="pass")).stderr
+
+
 CASES = [
     pytest.param(workaround, function, id=function.__name__)
     for workaround, functions in REPRODUCTIONS.items()
@@ -393,3 +426,8 @@ def test_each_workaround_is_in_the_list_of_the_folder() -> None:
     text = vtbdrake.drake_workarounds.__doc__ or ""
     names = [name.removeprefix("drake_workarounds.") for name in REPRODUCTIONS]
     assert [name for name in names if name not in text and name.split(".")[-1] not in text] == []
+
+
+def test_renderer_is_ended_by_another_thread_once_it_is_released() -> None:
+    ended = run(RENDERS.format(last="release_renderers()"))
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -8,6 +8,7 @@
 | `event_times` | rounding skips periodic events that have an offset | no event is skipped |
 | `cenic` | a step of length zero ends the process; fixed steps leave old poses | Drake 1.58 is the oldest supported |
 | `kept_meshcats` | a Meshcat ends the process in another thread; its server dies | it may end in any thread |
+| `renderer_threads` | a thread that has ended keeps its renderer from being ended elsewhere | threads let go of it |
 | `schunk_wsg`, `schunk_kernel` | the gripper's controller keeps its motion outside the Context | the motion is state |
 
 Faults whose remedy is part of something larger, and where that is:

@@ -20,6 +20,7 @@ from vtbdrake.common.argument_checks import as_whole
 from vtbdrake.common.closing import Closing
 from vtbdrake.common.interrupt import interrupt_taken
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
+from vtbdrake.drake_workarounds.renderer_threads import release_renderers
 from vtbdrake.rollout.pruning import Cutoff
 from vtbdrake.rollout.runner import CancelledError
 from vtbdrake.rollout.start import Start, Starts, start_of_each
@@ -221,6 +222,7 @@ def _work(jobs: queue.SimpleQueue[_Job | None], runners: Runners) -> None:
         # Keep nothing of the last job while waiting for the next one.
         del job
     jobs.put(None)  # For the other threads.
+    release_renderers()
 
 
 def checked_workers(workers: int | None) -> int:

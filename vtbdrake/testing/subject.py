@@ -11,6 +11,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from vtbdrake.common.failures import FAILURES, error_text
+from vtbdrake.drake_workarounds.renderer_threads import release_renderers
 from vtbdrake.rollout.repeatability import Sample, Trace, trace, within
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.task import RolloutTask
@@ -182,9 +183,9 @@ class Subject:
                     yield samples[-1]
         finally:
             for thread, traces in self._beside.items():
-                # In this order: a renderer cannot be ended while it is the present one of another thread.
+                thread.submit(traces.clear).result()
+                thread.submit(release_renderers).result()  # What is left is ended in this thread.
                 thread.shutdown()
-                traces.clear()
 
     def runner(self, number: int) -> RolloutRunner:
         """Return a runner of rollouts on the shared testbed, one of three that were made before anything was simulated.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from vtbdrake.common.closing import Closing
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.drake_workarounds.kept_meshcats import DEATH, abandon_if_dead
+from vtbdrake.drake_workarounds.renderer_threads import release_renderers
 from vtbdrake.web.serving.requests import Requests
 
 if TYPE_CHECKING:
@@ -324,6 +325,7 @@ class Session(Closing, ABC, Generic[_Stage]):
         del stage
         gc.collect()
         abandon_if_dead(meshcat)
+        release_renderers()
 
 
 def _failure(error: BaseException) -> Exception:
