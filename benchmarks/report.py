@@ -30,6 +30,7 @@ BENCHMARKS: Registry = {
     "parallel_efficiency_python": "benchmarks.parallel:parallel_efficiency_python",
     "cluster_projection": "benchmarks.cluster:cluster_projection",
     "casadi_system": "benchmarks.casadi_system:casadi_system",
+    "policy_cycle": "benchmarks.policy:policy_cycle",
     "image_switch": "benchmarks.image_switch:image_switch",
     "decision_overhead": "benchmarks.decision:decision_overhead",
     "decision_overhead_compiled": "benchmarks.decision:decision_overhead_compiled",

@@ -30,6 +30,7 @@ SHORTER = {
     "campaigns": {"horizon: 4.0": "horizon: 1.0"},
     "crater": {"horizon=6.0": "horizon=2.0, candidates=3, executor='serial'"},
     "machine": {"seconds=2.0": "seconds=0.5"},
+    "policies": {"runtime.run(seconds=2.0)": "runtime.run(seconds=0.5)"},
     "studies": {"run(rollouts=40)": "run(rollouts=16)", "rollouts=60": "rollouts=24", "horizon=5.0": "horizon=2.0"},
     "tutorial": {"horizon=3.0, threshold": "horizon=1.0, threshold"},
 }

@@ -28,23 +28,50 @@ def make_dps(plan: Spline, *, period: float, force_limit: float, planner: System
         force_limit: The largest force in N.
         planner: The system that decides the plan, with the output port ``decision``; None: the plan is a command.
     """
-    builder = DiagramBuilder()
-    sense = builder.AddNamedSystem("sense", Multiplexer([JOINTS, JOINTS]))
-    env = builder.AddNamedSystem("env", ZeroOrderHold(period, 2 * JOINTS))
     # Without a plan there is no force.
-    impl = builder.AddNamedSystem("impl", SplineCommand(plan, period=period, after=0.0, unit="N"))
-    limit = np.array([force_limit])
-    act = builder.AddNamedSystem("act", Saturation(-limit, limit))
-    builder.ExportInput(sense.get_input_port(0), "joint_position")
-    builder.ExportInput(sense.get_input_port(1), "joint_velocity")
-    builder.Connect(sense.get_output_port(), env.get_input_port())
+    impl = SplineCommand(plan, period=period, after=0.0, unit="N")
+    builder, _ = _begin(impl, period=period, force_limit=force_limit, output="value")
     if planner is None:
         builder.ExportInput(impl.GetInputPort("plan"), "plan")
     else:
         builder.AddNamedSystem("planner", planner)
         builder.Connect(planner.GetOutputPort("decision"), impl.GetInputPort("plan"))
-    builder.Connect(impl.GetOutputPort("value"), act.get_input_port())
+    return _built(builder)
+
+
+def make_policy_dps(policy: System, *, period: float, force_limit: float) -> Diagram:
+    """Return the DPS: ``env`` perceives, ``impl`` is a policy, and ``act`` limits its force.
+
+    Input and output ports: those of `make_dps`, without a plan.
+
+    Args:
+        policy: The system whose output port ``force`` (1, N) follows from its input port ``state`` (4), which is
+            [x, theta, x', theta'].
+        period: Sample period of ``env`` in seconds.
+        force_limit: The largest force in N.
+    """
+    builder, sense = _begin(policy, period=period, force_limit=force_limit, output="force")
+    builder.Connect(sense.get_output_port(), policy.GetInputPort("state"))
+    return _built(builder)
+
+
+def _begin(impl: System, *, period: float, force_limit: float, output: str) -> tuple[DiagramBuilder, System]:
+    """Return the builder of a DPS without the inputs of ``impl``, and ``sense``."""
+    builder = DiagramBuilder()
+    sense = builder.AddNamedSystem("sense", Multiplexer([JOINTS, JOINTS]))
+    env = builder.AddNamedSystem("env", ZeroOrderHold(period, 2 * JOINTS))
+    builder.AddNamedSystem("impl", impl)
+    limit = np.array([force_limit])
+    act = builder.AddNamedSystem("act", Saturation(-limit, limit))
+    builder.ExportInput(sense.get_input_port(0), "joint_position")
+    builder.ExportInput(sense.get_input_port(1), "joint_velocity")
+    builder.Connect(sense.get_output_port(), env.get_input_port())
+    builder.Connect(impl.GetOutputPort(output), act.get_input_port())
     builder.ExportOutput(act.get_output_port(), "force")
+    return builder, sense
+
+
+def _built(builder: DiagramBuilder) -> Diagram:
     dps = builder.Build()
     dps.set_name("dps")
     return dps

@@ -93,14 +93,16 @@ class CartPoleScenario(Scenario):
                 Signal("joint_velocity", size=JOINTS, unit="m/s, rad/s", lower=-100.0, upper=100.0, max_age=age),
             ],
             act=[Signal("force", size=1, unit="N", lower=-self.force_limit, upper=self.force_limit, idle=0.0)],
-            commands=[] if self.onboard else [self._plan_command()],
+            commands=self._commands(),
         )
 
-    def _plan_command(self) -> Signal:
+    def _commands(self) -> list[Signal]:
+        if self.onboard:
+            return []
         # A plan begins at a time of the DPS, which runs for thirty years at most.
         limit = np.append(1e9, np.full(self.knots, self.force_limit))
         names = ["start", *(f"force {knot}" for knot in range(1, self.knots + 1))]
-        return Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit, entry_names=names)
+        return [Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit, entry_names=names)]
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.
@@ -118,7 +120,7 @@ class CartPoleScenario(Scenario):
                     vector_map("CART_POLE_STATE", lcmt_acrobot_x, joints, stamp="timestamp"),
                 ],
                 act=[vector_map("CART_POLE_FORCE", lcmt_acrobot_u, {"force": "tau"}, stamp="timestamp")],
-                commands=[] if self.onboard else [vector_map("CART_POLE_PLAN", lcmt_scope, {"plan": "value"})],
+                commands=[vector_map("CART_POLE_PLAN", lcmt_scope, {u.name: "value"}) for u in self._commands()],
                 reported={"force": "force_acting"},
                 robot_mode=RobotMode(carrier="cart_pole_mode"),
             ),
@@ -183,6 +185,11 @@ class CartPoleScenario(Scenario):
     def _has_exact_sensors(self) -> bool:
         return all(replace(errors, seed=0) == ErrorModel() for errors in (self.position_errors, self.velocity_errors))
 
+    @property
+    def force_address(self) -> str:
+        """Return the address of the force that the DPS commands, in N."""
+        return FORCE
+
     def add_beliefs(self, builder: VirtualTestbedBuilder) -> None:
         """Declare that the perceived state sets the joints of the simulated world.
 
@@ -193,7 +200,7 @@ class CartPoleScenario(Scenario):
         for i, (value, errors) in enumerate((("position", self.position_errors), ("velocity", self.velocity_errors))):
             builder.believe(
                 [f"sim.sys.cart_pole.{name}.{value}" for name in JOINT_NAMES],
-                of=[PERCEIVED, FORCE],
+                of=[PERCEIVED, self.force_address],
                 by=partial(_present, model, entries=slice(JOINTS * i, JOINTS * (i + 1))),
                 age=(1 + errors.latency) * T,
                 period=T,
