@@ -12,6 +12,7 @@ from vtbdrake.cli.completion import complete_file, complete_scenario
 from vtbdrake.cli.options import (
     Setting,
     converted,
+    film_option,
     import_option,
     option,
     output,
@@ -94,9 +95,16 @@ _log = click.argument("log", type=click.Path(dir_okay=False, path_type=Path))
 @set_option
 @option("--record ADDRESS", "Read ADDRESS after every cycle. May be repeated.", multiple=True)
 @option("--out FILE", "Write these values: .csv or .npz.", parse=output(*RECORDINGS))
+@film_option
 @json_option
 def replay(
-    log: Path, scenario: str | None, on: str, values: tuple[Setting, ...], record: tuple[str, ...], out: Path | None
+    log: Path,
+    scenario: str | None,
+    on: str,
+    values: tuple[Setting, ...],
+    record: tuple[str, ...],
+    out: Path | None,
+    film: Path | None,
 ) -> None:
     """Compute a LOG again and compare, to the last bit.
 
@@ -104,6 +112,8 @@ def replay(
     damaged, or of a loop whose recorder was not closed.
 
     With --set, a variable has another value throughout, and nothing is compared.
+
+    With --film, the film shows the simulated world; of a DPS alone, the world as it believed it to be.
 
     \b
     Example:
@@ -121,6 +131,10 @@ def replay(
     report = replay_log(opened, target, values=settings(values), record=record)
     if out is not None:
         save_recording(out, report.times, report.record, mode=PRIVATE)
+    if film is not None:
+        from vtbdrake.visualization import log_motion, make_meshcat, show_motion
+
+        show_motion(make_meshcat(), log_motion(opened)).film(film)
     described: dict[str, Any] = {name: getattr(report, name) for name in ("outcome", "cycles", "digests", "ended")}
     described |= {"first_difference": report.first_difference, "max_difference": report.max_difference}
     described |= {"errors": report.errors, "versions": report.versions}

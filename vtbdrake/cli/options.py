@@ -367,6 +367,7 @@ import_option = option(
     is_eager=True,  # Before the scenario is read.
     expose_value=False,
 )
+film_option = option("--film FILE", "Write a film: .mp4, .gif or .webp.", parse=output(".mp4", ".gif", ".webp"))
 set_option = option(
     "--set ADDRESS=VALUE",
     "Set a variable in s0 to a number or a JSON list. May be repeated.",

@@ -13,6 +13,7 @@ from vtbdrake.cli import BadInputError, FailedError
 from vtbdrake.cli.options import (
     LazyChoice,
     Setting,
+    film_option,
     horizon_option,
     option,
     output,
@@ -172,6 +173,7 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 @option("--save FILE", "Write the recording: .csv or .npz.", parse=output(*RECORDINGS))
 @option("--snapshot FILE", "Write s(t_end), for --start.", parse=output())
 @option("--html FILE", "Write an animation for any web browser.", parse=output(".html"))
+@film_option
 @json_option
 def rollout(
     scenario: Scenario,
@@ -183,6 +185,7 @@ def rollout(
     save: Path | None,
     snapshot: Path | None,
     html: Path | None,
+    film: Path | None,
 ) -> None:
     """Simulate a testbed once.
 
@@ -199,12 +202,13 @@ def rollout(
     if save is not None and not record:
         raise click.UsageError("--save writes the addresses of --record, but nothing is recorded")
     testbed = scenario.build()
-    if html is not None and testbed.plant is None:
-        raise click.UsageError("--html shows the motion of a plant, but this testbed has none")
+    shown = [name for name, file in (("--html", html), ("--film", film)) if file is not None]
+    if shown and testbed.plant is None:
+        raise click.UsageError(f"{' and '.join(shown)} shows the motion of a plant, but this testbed has none")
     parameters = settings(values)
     for address, value in parameters.items():
         testbed.variables()[address].check(value)
-    recorded = tuple(dict.fromkeys([*record, *([PLANT_STATE] if html is not None else [])]))
+    recorded = tuple(dict.fromkeys([*record, *([PLANT_STATE] if shown else [])]))
     task = RolloutTask(scenario, horizon, sample_period=sample_period, record=recorded, start=start)
     runner = RolloutRunner(task, testbed)
     result = runner.run(parameters)
@@ -219,11 +223,15 @@ def rollout(
     emit(described)
     if save is not None:
         save_recording(save, recorded_result.times, recorded_result.record)
-    if html is not None:
+    if shown:
         from vtbdrake.optimization import Motion
         from vtbdrake.visualization import make_meshcat, show_motion
 
-        show_motion(make_meshcat(), Motion.of(scenario, result)).save(html)
+        scene = show_motion(make_meshcat(), Motion.of(scenario, result))
+        if html is not None:
+            scene.save(html)
+        if film is not None:
+            scene.film(film)
     if result.failed:
         raise FailedError(f"the rollout failed: {one_line(result.message)}")
     if snapshot is not None:

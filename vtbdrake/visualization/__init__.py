@@ -2,12 +2,14 @@
 
 from vtbdrake.visualization.decisions import plot_decision, show_decision
 from vtbdrake.visualization.diagram import svg
+from vtbdrake.visualization.log_motion import log_motion
 from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions, show_poses
 from vtbdrake.visualization.plots import plot_quality, plot_sweep
 from vtbdrake.visualization.world_model_drawing import show_world_model
 
 __all__ = [
     "Scene",
+    "log_motion",
     "make_meshcat",
     "plot_decision",
     "plot_quality",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
-from pydrake.geometry import CalcObb, FrameId, GeometryId, Meshcat, QueryObject, Rgba, Role, SceneGraphInspector
+from pydrake.geometry import CalcObb, FrameId, GeometryId, Meshcat, QueryObject, Rgba, Role, SceneGraphInspector, Shape
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
@@ -189,6 +189,23 @@ class Drawing:
                 X_PG if X_WP is None else X_WP @ X_PG,
                 Rgba(color.r(), color.g(), color.b(), color.a() * (opacity if moves else 1.0)),
             )
+
+    def moving(self) -> list[tuple[Shape, Rgba]]:
+        """Return the shapes that move, and their colours."""
+        inspector = self._scene_graph.model_inspector()
+        return [(inspector.GetShape(geometry), color) for geometry, color in self._moving()]
+
+    def poses(self, context: Context) -> list[RigidTransform]:
+        """Return the poses of `moving` in the world.
+
+        Args:
+            context: A root context of the testbed.
+        """
+        query = self._query(context)
+        return [RigidTransform(query.GetPoseInWorld(geometry)) for geometry, _ in self._moving()]
+
+    def _moving(self) -> list[tuple[GeometryId, Rgba]]:
+        return [(geometry, color) for geometry, color, moves in self._shapes if moves]
 
     def still(self, context: Context, camera: Viewpoint | None = None) -> Still:
         """Return a picture of what is drawn in the poses of a context, by default of all that moves.

@@ -31,6 +31,7 @@ from vtbdrake.drake_workarounds.kept_meshcats import keep_meshcat
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.drawing import Drawing, Parts
+from vtbdrake.visualization.film import Reel, Stage, Take
 from vtbdrake.visualization.still import Still
 from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
@@ -86,6 +87,7 @@ class Scene:
         height: The height of the notebook's cell output, in pixels.
         curves: Label -> curve, bound to the clock of the recording.
         still: What readers without a kernel see.
+        reel: What a film shows; None if nothing was recorded.
     """
 
     meshcat: Meshcat
@@ -94,6 +96,22 @@ class Scene:
     height: int = 400
     curves: Mapping[str, Curve] = field(default_factory=dict)
     still: Still | None = None
+    reel: Reel | None = None
+
+    def film(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        rate: float = 20.0,
+        speed: float = 1.0,
+        width: int = 640,
+        height: int = 480,
+        camera: Viewpoint | None = None,
+    ) -> None:
+        """Write the recording as a film, rendered by Drake; see `Reel.film`."""
+        if self.reel is None:
+            raise ValueError(f"nothing moves in this scene, for a film: write its page, by save, instead of {path}")
+        self.reel.film(path, rate=rate, speed=speed, width=width, height=height, camera=camera)
 
     def page(self) -> str:
         """Return the scene as one self-contained HTML page."""
@@ -253,8 +271,8 @@ def show_motion(
     """
     _check(motion, prefix, rate)
     meshcat.Delete(prefix)
-    still = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate, camera)
-    return Scene(meshcat, curves=_curves({"": motion}, {"": _PALETTE[0]}), still=still)
+    still, reel = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate, camera)
+    return Scene(meshcat, curves=_curves({"": motion}, {"": _PALETTE[0]}), still=still, reel=reel)
 
 
 def show_motions(
@@ -310,8 +328,8 @@ def show_motions(
             )
         )
     meshcat.Delete(prefix)
-    still = _record(meshcat, actors, rate, camera)
-    return Scene(meshcat, legend=tints, curves=_curves(motions, tints), still=still)
+    still, reel = _record(meshcat, actors, rate, camera)
+    return Scene(meshcat, legend=tints, curves=_curves(motions, tints), still=still, reel=reel)
 
 
 def show_poses(
@@ -351,7 +369,7 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    stages, still, corners = list[_Stage](), Still(), []
+    stages, still, corners = list[Stage](), Still(), []
     for name, motion in motions.items():
         count_before = len(stages)
         stage = _stage_of(motion.scenario, stages)
@@ -377,25 +395,11 @@ def show_poses(
     return Scene(meshcat, title=title, legend=tints, still=still)
 
 
-class _Stage:
-    """A testbed whose plant is put into recorded states."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.testbed = scenario.build()
-        self.context = self.testbed.default_context()
-
-    def set_state(self, state: np.ndarray) -> None:
-        """Put the plant into the state [q; v]."""
-        plant = self.testbed.plant
-        assert plant is not None
-        plant.SetPositionsAndVelocities(plant.GetMyMutableContextFromRoot(self.context), state)
-
-
-def _stage_of(scenario: Scenario, stages: list[_Stage]) -> _Stage:
+def _stage_of(scenario: Scenario, stages: list[Stage]) -> Stage:
     """Return the stage of a scenario, made if there is none yet: a terrain with many shapes takes long to build."""
     stage = next((each for each in stages if each.testbed.scenario == scenario), None)
     if stage is None:
-        stages.append(stage := _Stage(scenario))
+        stages.append(stage := Stage(scenario))
     return stage
 
 
@@ -458,20 +462,23 @@ def _set_camera(meshcat: Meshcat, still: Still, camera: Viewpoint | None, corner
         meshcat.SetCameraPose(camera.position, camera.target)
 
 
-def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Viewpoint | None) -> Still:
-    """Record the motions, and return a picture of them."""
-    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[_Stage](), Still()
+def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Viewpoint | None) -> tuple[Still, Reel]:
+    """Record the motions, and return a picture of them and what a film of them shows."""
+    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[Stage](), Still()
     corners: list[np.ndarray] = []
+    takes: list[Take] = []
     meshcat.DeleteRecording()
     meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
     try:
         for actor in actors:
-            corners += actor.play(meshcat, _stage_of(actor.motion.scenario, stages), end, rate, still)
+            shown, take = actor.play(meshcat, _stage_of(actor.motion.scenario, stages), end, rate, still)
+            corners += shown
+            takes.append(take)
     finally:
         meshcat.StopRecording()
     meshcat.PublishRecording()
     _set_camera(meshcat, still, camera, corners)
-    return still
+    return still, Reel(takes, still.camera)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -485,8 +492,10 @@ class _Actor:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     surroundings: bool = True
 
-    def play(self, meshcat: Meshcat, stage: _Stage, end: float, rate: float, still: Still) -> list[np.ndarray]:
-        """Record the motion, add instants of it to the picture, and return the corners of all that moves."""
+    def play(
+        self, meshcat: Meshcat, stage: Stage, end: float, rate: float, still: Still
+    ) -> tuple[list[np.ndarray], Take]:
+        """Record the motion, add instants of it to the picture; return the corners of what moves, and a take."""
         states = _states(self.motion, stage.testbed, self.path)
         drawing = Drawing(
             meshcat,
@@ -510,7 +519,7 @@ class _Actor:
             stage.set_state(states[keyframes[number][1]])
             drawing.add_to(still, stage.context, parts=Parts.MOVING, opacity=opacity, X_WP=X_WP)
         drawing.add_to(still, stage.context, parts=Parts.ANCHORED, X_WP=X_WP)
-        return corners
+        return corners, Take(stage, drawing, self.motion.times, states, X_WP)
 
 
 def _keyframes(times: np.ndarray, end: float, rate: float) -> list[tuple[float, int]]:

@@ -10,6 +10,7 @@ import pytest
 from onnx import numpy_helper
 
 import vtbdrake as vtb
+from vtbdrake.visualization import log_motion
 from vtbdrake_diagrams.cart_pole import policy
 from vtbdrake_diagrams.cart_pole.dps import PERCEIVED
 from vtbdrake_diagrams.cart_pole.policy import BALANCE_ONNX, STARTS, UPRIGHT, BalancedCartPole
@@ -46,6 +47,10 @@ def test_on_a_machine_it_balances_and_replays_bit_for_bit(tmp_path: Path) -> Non
     states = balance_on_machine(BalancedCartPole(lock_step=True), seconds=6.0, record=tmp_path / "balance.lcm")
     np.testing.assert_allclose(states[-1], UPRIGHT, atol=0.02)
     assert vtb.replay(tmp_path / "balance.lcm").identical
+    # A film of the log shows what the DPS believed: the pole leans, and then it stands.
+    angles = log_motion(tmp_path / "balance.lcm").states[:, 1]
+    assert angles.max() == pytest.approx(STARTS[0]["sim.sys.cart_pole.pole_pin.position"], abs=0.15)
+    assert angles[-1] == pytest.approx(np.pi, abs=0.02)
 
 
 def balance_on_machine(scenario: BalancedCartPole, *, seconds: float, record: Path) -> np.ndarray:
