@@ -29,7 +29,8 @@ UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])
 # Address of the gains that are trained, in N/m, N/rad, N s/m and N s/rad, and the largest of each.
 _GAINS = "dps.impl.gains"
 _LARGEST_GAINS = (100.0, 1000.0, 100.0, 200.0)
-_CART, _POLE = "sim.sys.cart_pole.cart_slider", "sim.sys.cart_pole.pole_pin"
+_CART = "sim.sys.cart_pole.cart_slider"
+_POLE = "sim.sys.cart_pole.pole_pin"
 STARTS = (
     {f"{_POLE}.position": np.pi + 0.2},
     {f"{_POLE}.position": np.pi - 0.1, f"{_CART}.position": 0.5, f"{_CART}.velocity": -0.3},

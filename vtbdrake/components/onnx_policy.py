@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import DiscreteValues, InputPort
+from pydrake.systems.framework import BasicVector, DiscreteValues, InputPort
 
 from vtbdrake.common.argument_checks import as_number, as_whole
 from vtbdrake.common.extras import extra_module
@@ -90,6 +90,7 @@ class OnnxPolicy(AddressedSystem):
         states = []
         for port, size in sizes_out.items():
             value = _initial(port, size, initial.get(port, 0.0))
+            value = value if size > 1 else value.item()
             group = self.declare_discrete_state(**{port: Quantity(value, units.get(port, "1"))})
             self.DeclareStateOutputPort(port, group.index)
             states.append(int(group.index))
@@ -103,7 +104,7 @@ class OnnxPolicy(AddressedSystem):
             parameters=None,
             inputs=tuple(weakly(port, InputPort.Eval) for port in ports),
             state_value=DiscreteValues.get_mutable_value,
-            vector_value=None,
+            vector_value=BasicVector.value,
             compute=network.evaluate,
             deliver=None,
         )
@@ -140,7 +141,9 @@ class _Network:
                 "inputs, or in memory the output that is its next value"
             )
         batch = {length for name in inputs for length in given[name].shape[:1] if isinstance(length, str)}
-        self.zeros = {name: np.zeros(self._shape(t, batch), self._dtype(t)) for name, t in given.items()}
+        self.zeros: dict[str, np.ndarray] = {
+            name: np.zeros(self._shape(t, batch), self._dtype(t)) for name, t in given.items()
+        }
         for name, ports in inputs.items():
             self._check_size("input", name, self.zeros[name], ports)
         self.results = self._tried(made)
@@ -158,7 +161,7 @@ class _Network:
         # Made now, since it takes longer than a cycle of a loop.
         self._by_thread.buffers = _Buffers(self)
 
-    def evaluate(self, blocks: list[Any]) -> np.ndarray:
+    def evaluate(self, blocks: Sequence[ArrayLike]) -> np.ndarray:
         """Return the entries of the next outputs and memory, for the present outputs, memory and inputs."""
         try:
             buffers = self._by_thread.buffers

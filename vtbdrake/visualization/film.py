@@ -29,7 +29,7 @@ FILMS = (".mp4", ".gif", ".webp")
 _ROUNDING = 1e-9
 
 
-class Stage:
+class PosedTestbed:
     """A testbed whose plant is put into recorded states.
 
     Args:
@@ -59,7 +59,7 @@ class Take:
         X_WP: Where the whole is displaced to.
     """
 
-    stage: Stage
+    stage: PosedTestbed
     drawing: Drawing
     times: NDArray[np.float64]
     states: NDArray[np.float64]

@@ -31,7 +31,7 @@ from vtbdrake.drake_workarounds.kept_meshcats import keep_meshcat
 from vtbdrake.state.archive import whole_file
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization.drawing import Drawing, Parts
-from vtbdrake.visualization.film import Reel, Stage, Take
+from vtbdrake.visualization.film import PosedTestbed, Reel, Take
 from vtbdrake.visualization.still import Still
 from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
@@ -369,7 +369,7 @@ def show_poses(
     for name, motion in motions.items():
         _check(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
-    stages, still, corners = list[Stage](), Still(), []
+    stages, still, corners = list[PosedTestbed](), Still(), []
     for name, motion in motions.items():
         count_before = len(stages)
         stage = _stage_of(motion.scenario, stages)
@@ -395,11 +395,11 @@ def show_poses(
     return Scene(meshcat, title=title, legend=tints, still=still)
 
 
-def _stage_of(scenario: Scenario, stages: list[Stage]) -> Stage:
+def _stage_of(scenario: Scenario, stages: list[PosedTestbed]) -> PosedTestbed:
     """Return the stage of a scenario, made if there is none yet: a terrain with many shapes takes long to build."""
     stage = next((each for each in stages if each.testbed.scenario == scenario), None)
     if stage is None:
-        stages.append(stage := Stage(scenario))
+        stages.append(stage := PosedTestbed(scenario))
     return stage
 
 
@@ -464,7 +464,7 @@ def _set_camera(meshcat: Meshcat, still: Still, camera: Viewpoint | None, corner
 
 def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Viewpoint | None) -> tuple[Still, Reel]:
     """Record the motions, and return a picture of them and what a film of them shows."""
-    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[Stage](), Still()
+    end, stages, still = max(float(actor.motion.times[-1]) for actor in actors), list[PosedTestbed](), Still()
     corners: list[np.ndarray] = []
     takes: list[Take] = []
     meshcat.DeleteRecording()
@@ -493,7 +493,7 @@ class _Actor:
     surroundings: bool = True
 
     def play(
-        self, meshcat: Meshcat, stage: Stage, end: float, rate: float, still: Still
+        self, meshcat: Meshcat, stage: PosedTestbed, end: float, rate: float, still: Still
     ) -> tuple[list[np.ndarray], Take]:
         """Record the motion, add instants of it to the picture; return the corners of what moves, and a take."""
         states = _states(self.motion, stage.testbed, self.path)
