@@ -62,7 +62,8 @@ def test_an_unknown_option_is_never_ignored():
     [
         ("SNOPT", {"space": [X, COUNT]}, "SNOPT varies continuous parameters, but count is an integer; CMA-ES"),
         ("LN_BOBYQA", {"space": [KIND]}, "LN_BOBYQA varies numbers, but kind is one of .*; TPE or grid"),
-        ("CMA-ES", {"space": [X, KIND]}, "CMA-ES varies numbers, but kind"),
+        ("CMA-ES", {"space": [KIND]}, "CMA-ES varies at least one number, and here are words alone; grid or TPE"),
+        ("CMA-ES", {"objectives": 3}, "CMA-ES takes one or two objectives, not 3; NSGA-II"),
         ("IPOPT", {"objectives": 2}, "IPOPT takes one objective, not 2; NSGA-II"),
         ("LN_BOBYQA", {"constraints": 1}, "LN_BOBYQA takes no constraints, and there are 1; CMA-ES"),
         ("QMC", {"constraints": 2}, "QMC takes no constraints"),

@@ -104,6 +104,33 @@ def test_a_mixed_problem_agrees_with_brute_force(name):
         assert best.point[1] == pytest.approx(0.1 * brute[0], abs=1e-3)
 
 
+@pytest.mark.one_python
+@pytest.mark.parametrize("numbers", [1, 2])
+def test_cma_es_finds_the_best_words_with_the_best_numbers(numbers):
+    space = (Choice("kind", ["up", "down", "left"]), Parameter("n", -7, 12, integer=True), Parameter("x", -2.0, 2.0))
+    space = space[: 1 + numbers]
+
+    def cost(p):
+        # The best word has the worst start, n = 2.
+        word = {"up": 3.0, "down": 0.1 * (p[1] - 9) ** 2, "left": 2.0}[p[0]]
+        return word + sum((x - 0.5) ** 2 for x in p[2:])
+
+    solver = make_solver("CMA-ES", space, seed=1)
+    best = max(drive(solver, cost, limit=3000), key=lambda e: e.values[0])
+    assert best.point[:2] == ("down", 9)
+    np.testing.assert_allclose(best.point[2:], 0.5, atol=1e-4)
+    assert solver.success is True
+
+
+@pytest.mark.one_python
+def test_cma_es_keeps_a_front_feasible():
+    space = SPHERE.space
+    solver = make_solver("CMA-ES", space, objectives=2, constraints=1, budget=600, seed=1)
+    log = drive(solver, _two_costs, violations=lambda p: (p[0] - p[1] - 0.2,), fails=lambda p: p[0] < -2.5)
+    assert np.mean([e.feasible for e in log[-200:]]) > np.mean([e.feasible for e in log[:200]])
+    assert sum(e.feasible for e in log[-200:]) > 100
+
+
 @pytest.mark.slow
 @pytest.mark.one_python
 def test_a_categorical_parameter_is_chosen_rightly():
@@ -205,7 +232,7 @@ def _hypervolume(log):
     return volume
 
 
-@pytest.mark.parametrize("name", ["NSGA-II", AUTO])
+@pytest.mark.parametrize("name", ["NSGA-II", "CMA-ES", AUTO])
 def test_a_pareto_front_is_covered_better_than_by_chance(name):
     space = SPHERE.space
     t = np.linspace(-1.0, 1.0, 2001) / np.sqrt(2.0)
@@ -213,7 +240,7 @@ def test_a_pareto_front_is_covered_better_than_by_chance(name):
     ideal = np.trapezoid(1.0 - second[::-1], first[::-1])
     volumes = {}
     for solver in (name, "random"):
-        made = make_solver(solver, space, objectives=2, budget=1000 if name == "NSGA-II" else 60, seed=1)
+        made = make_solver(solver, space, objectives=2, budget=1000 if name in ("NSGA-II", "CMA-ES") else 60, seed=1)
         volumes[solver] = _hypervolume(drive(made, _two_costs))
     # The hypervolume of the front cannot be exceeded (1e-3: of the trapezoids).
     assert 0.9 * ideal < volumes[name] < ideal + 1e-3
