@@ -42,7 +42,7 @@ def make_dps(plan: Spline, *, period: float, force_limit: float, planner: System
 def make_policy_dps(policy: System, *, period: float, force_limit: float) -> Diagram:
     """Return the DPS: ``env`` perceives, ``impl`` is a policy, and ``act`` limits its force.
 
-    Input and output ports: those of `make_dps`, without a plan.
+    It has the same input and output ports as `make_dps` makes, but no plan.
 
     Args:
         policy: The system whose output port ``force`` (1, N) follows from its input port ``state`` (4), which is

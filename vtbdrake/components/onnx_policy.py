@@ -131,18 +131,18 @@ class _Network:
         self._name = path.name
         self.session = _session(path)
         self.inputs, self.outputs, self.memory = inputs, outputs, memory
-        given = {tensor.name: tensor for tensor in self.session.get_inputs()}
-        self._check_names("input", "inputs", (*inputs, *memory), given)
+        tensors = {tensor.name: tensor for tensor in self.session.get_inputs()}
+        self._check_names("input", "inputs", (*inputs, *memory), tensors)
         made = [tensor.name for tensor in self.session.get_outputs()]
         self._check_names("output", "outputs", (*outputs, *memory.values()), made)
-        if unfed := given.keys() - {*inputs, *memory}:
+        if unfed := tensors.keys() - {*inputs, *memory}:
             raise ValueError(
                 f"{self._name} has the input {_listed(unfed)} beside {_listed((*inputs, *memory))}: name its ports in "
                 "inputs, or in memory the output that is its next value"
             )
-        batch = {length for name in inputs for length in given[name].shape[:1] if isinstance(length, str)}
+        batch = {length for name in inputs for length in tensors[name].shape[:1] if isinstance(length, str)}
         self.zeros: dict[str, np.ndarray] = {
-            name: np.zeros(self._shape(t, batch), self._dtype(t)) for name, t in given.items()
+            name: np.zeros(self._shape(t, batch), self._dtype(t)) for name, t in tensors.items()
         }
         for name, ports in inputs.items():
             self._check_size("input", name, self.zeros[name], ports)
@@ -234,22 +234,22 @@ class _Buffers:
     def __init__(self, network: _Network) -> None:
         onnxruntime = _onnxruntime()
         session, binding = network.session, network.session.io_binding()
-        given = {name: _aligned(network.zeros[name]) for name in (*network.memory, *network.inputs)}
+        fed = {name: _aligned(network.zeros[name]) for name in (*network.memory, *network.inputs)}
         made = {name: _aligned(network.results[name]) for name in (*network.outputs, *network.memory.values())}
         # An OrtValue of an array on the CPU shares its numbers.
-        for name, array in given.items():
+        for name, array in fed.items():
             binding.bind_ortvalue_input(name, onnxruntime.OrtValue.ortvalue_from_numpy(array))
         for name, array in made.items():
             binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(array))
         shown = sum(made[name].size for name in network.outputs)
-        self.z = np.zeros(shown + sum(array.size for array in given.values()))
+        self.z = np.zeros(shown + sum(array.size for array in fed.values()))
         self.y = np.zeros(sum(array.size for array in made.values()))
-        self._given, self._made, self._fed = list(given.values()), list(made.values()), self.z[shown:]
+        self._tensors, self._made, self._entries = list(fed.values()), list(made.values()), self.z[shown:]
         self._run, self._binding = session.run_with_iobinding, binding
 
     def evaluate(self) -> bool:
         """Compute y of z; return whether all of it is finite."""
-        scatter_tensors(self._fed, self._given)
+        scatter_tensors(self._entries, self._tensors)
         self._run(self._binding)
         return gather_tensors(self._made, self.y)
 

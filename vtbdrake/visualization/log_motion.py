@@ -17,8 +17,8 @@ from vtbdrake.testbed import VirtualTestbed
 def log_motion(log: ControlLog | str | os.PathLike[str]) -> Motion:
     """Return the motion of the world in the log of a control loop, for `show_motion`.
 
-    The log is replayed. In that of a whole testbed the world is the simulated one. In that of a DPS alone, as it runs
-    on a machine, the world is what the DPS believed of it at the end of each cycle.
+    The log is replayed. If it is the log of a whole testbed, the world is the simulated one. If it is the log of a DPS
+    alone, as it runs on a machine, the world is what the DPS believed of it at the end of each cycle.
 
     Args:
         log: The log, or the path of its file.

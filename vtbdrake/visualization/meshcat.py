@@ -108,7 +108,21 @@ class Scene:
         height: int = 480,
         camera: Viewpoint | None = None,
     ) -> None:
-        """Write the recording as a film, rendered by Drake; see `Reel.film`."""
+        """Write the recording as a film, rendered by Drake without a browser; completely or not at all.
+
+        Args:
+            path: The file: .mp4 (H.264, by the extra ``film``), .gif or .webp.
+            rate: Pictures per second of the film.
+            speed: Simulated seconds per second of the film.
+            width: Width in pixels, even.
+            height: Height in pixels, even.
+            camera: From where it is looked at; by default from where all that moves is in view.
+
+        Raises:
+            ValueError: Nothing was recorded or moves, the file has another suffix, or a number is out of range.
+            ModuleNotFoundError: An MP4 needs imageio-ffmpeg, which the extra ``film`` installs.
+            RenderingError: This machine cannot render.
+        """
         if self.reel is None:
             raise ValueError(f"nothing moves in this scene, for a film: write its page, by save, instead of {path}")
         self.reel.film(path, rate=rate, speed=speed, width=width, height=height, camera=camera)
