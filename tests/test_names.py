@@ -16,6 +16,7 @@ from tools.house import (
     packed_constant_lines,
     packed_constants,
     source_files,
+    syntax_nodes,
     syntax_trees,
 )
 
@@ -29,7 +30,7 @@ BUDGET = 20
 
 def bound_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield line and name of everything that a module binds: variables, attributes, arguments, functions, classes."""
-    for node in ast.walk(tree):
+    for node in syntax_nodes(tree):
         match node:
             case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()) | ast.arg(arg=name):
                 yield node.lineno, name
@@ -144,7 +145,7 @@ def pointing(path: Path) -> list[str]:
 
 def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield line and docstring of everything in a module that has one."""
-    for node in ast.walk(tree):
+    for node in syntax_nodes(tree):
         is_documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         if is_documented and (text := ast.get_docstring(node)):
             yield getattr(node, "lineno", 1), text
@@ -269,7 +270,7 @@ def undescribed(classes: dict[str, ast.ClassDef]) -> Iterator[tuple[str, list[st
 
 
 def classes_in(*trees: ast.Module) -> dict[str, ast.ClassDef]:
-    return {node.name: node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    return {node.name: node for tree in trees for node in syntax_nodes(tree) if isinstance(node, ast.ClassDef)}
 
 
 def test_undescribed_constructors_are_found():
@@ -384,7 +385,7 @@ def is_private(name: str) -> bool:
 
 def private_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield line and name of everything private of other objects and modules that a module uses, also by a string."""
-    for node in ast.walk(tree):
+    for node in syntax_nodes(tree):
         match node:
             case ast.Attribute(value=ast.Name(id="self" | "cls") | ast.Call(func=ast.Name(id="super"))):
                 names: list[str] = []

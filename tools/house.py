@@ -7,6 +7,7 @@ defines it, and an import counts wherever it stands: in a function, and for type
 """
 
 import ast
+import gc
 import io
 import re
 import subprocess
@@ -98,8 +99,23 @@ def source_files(*suffixes: str, folder: str = "vtbdrake") -> list[Path]:
 
 @cache
 def syntax_trees(folder: str = "vtbdrake") -> dict[Path, ast.Module]:
-    """Return the syntax tree of each Python file."""
-    return {path: ast.parse(path.read_text("utf-8")) for path in source_files(".py", folder=folder)}
+    """Return the syntax tree of each Python file.
+
+    The trees stay until the end: the garbage collector, which would look at their nodes while they are made and
+    whenever they are read, leaves them out.
+    """
+    gc.disable()
+    try:
+        return {path: ast.parse(path.read_text("utf-8")) for path in source_files(".py", folder=folder)}
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@cache
+def syntax_nodes(tree: ast.AST) -> list[ast.AST]:
+    """Return all nodes of a syntax tree; several measures read each tree."""
+    return list(ast.walk(tree))
 
 
 # ----- import circles
@@ -205,7 +221,7 @@ def repeated_basenames() -> dict[str, list[str]]:
 
 def packed_constants(tree: ast.Module) -> list[int]:
     """Return the lines outside functions that bind several constants by position."""
-    bodies = [tree.body, *(node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]
+    bodies = [tree.body, *(node.body for node in syntax_nodes(tree) if isinstance(node, ast.ClassDef))]
     return [
         node.lineno
         for body in bodies
