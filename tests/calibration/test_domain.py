@@ -67,6 +67,7 @@ def test_windows_of_new_recordings_lie_outside_as_rarely_as_the_quantile_says() 
         assert np.mean(shares) == pytest.approx(1.0 - quantile, abs=0.4 * (1.0 - quantile) + 0.01)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("change", [{"speed": 1.6}, {"load": 1.25}, {"offset": 0.8}], ids=str)
 def test_other_motions_are_noticed(change: Mapping[str, float]) -> None:
     generator = np.random.default_rng(1)

@@ -309,6 +309,7 @@ def _downhill(angle: float) -> np.ndarray:
     return np.array([np.cos(angle), 0.0, -np.sin(angle)])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("settings", ["lagged", "cenic", "sap", "similar"])
 def test_ball_rests_on_its_springs(verify: Verify, settings: str) -> None:
     """Resting ball: where the contact of two materials carries its weight, it stays.
@@ -392,6 +393,7 @@ def test_bowling_ball_slides_until_it_rolls(verify: Verify, settings: str) -> No
     verify("velocity at the end", run.velocity("ball"), final, tolerance=friction * G * STEP, unit="m/s")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("settings", ["lagged", "cenic", "sap", "similar"])
 def test_friction_is_mu_times_the_normal_force(verify: Verify, settings: str) -> None:
     """Coulomb's law in a throw of the bowling ball: its impulses after 1 s of sliding.
@@ -469,6 +471,7 @@ def test_block_slides_to_rest(verify: Verify, settings: str) -> None:
     verify("distance", 2 * distances[1] - distances[0], reference, tolerance=2e-5, unit="m")
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("settings", SLIDING_FACES)
 def test_block_creeps_on_a_slope(verify: Verify, settings: str) -> None:
     """Creeping block: on a slope of 30 deg with mu = 0.6 it sticks, which regularized friction makes a creep.
@@ -553,6 +556,7 @@ def test_bounce_by_hunt_and_crossley(verify: Verify, settings: str, dissipation:
     verify("restitution", _rebound(world), e, tolerance=1e-5 + e * 100.0 * h * pi / 2)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("relaxation", [1e-3, 5e-3, 1e-2], ids=["1 ms", "5 ms", "10 ms"])
 def test_bounce_with_sap(verify: Verify, relaxation: float) -> None:
     """Bounce with SAP: at 1 m/s on a spring beside a damper of the relaxation time tau.

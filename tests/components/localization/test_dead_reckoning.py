@@ -169,6 +169,7 @@ def test_bias_of_gyros_is_learned_at_rest():
     assert abs(with_rest) < 4e-3 < 0.03 < abs(without)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", range(4))
 def test_noisy_wheels_and_rocking_at_rest_are_no_bias(seed):
     drive, bias = Drive(still=3.0), np.array([0.001, -0.001, 0.002])

@@ -46,6 +46,7 @@ def scores(errors, *, drives, first=0, bias=0.0, **settings):
 BOUNDS = (1.92, 4.32)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_drive_ends_within_its_covariance(seed):
     one = drive(seed, ACCURATE)

@@ -121,6 +121,7 @@ def test_pose_and_intrinsics_move_the_image() -> None:
     assert left_edge(scene.render(context)) == before + 20
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("phase", [0.0, 0.2, 0.4, 0.6, 0.8])
 def test_pixels_of_many_points_count_the_area_that_is_lit(phase: float) -> None:
     scene = Scene(supersampling=4)
@@ -145,6 +146,7 @@ def test_depth_is_along_the_optical_axis() -> None:
     assert np.isinf(depth[~box]).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0, 70.0])
 def test_brightness_follows_lambert_and_is_linear(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
@@ -261,6 +263,7 @@ def test_pixels_about_full_scale_are_clipped_normal_numbers(brightness: float) -
     assert (255.0 - shown[..., :3]).mean() == pytest.approx(below, abs=1.3)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("intensity", [3.0, 8.0, 30.0, 90.0])
 def test_haze_veils_what_would_be_saturated_without_it(intensity: float) -> None:
     b, airlight = 2.2, 0.1
@@ -421,6 +424,7 @@ def test_used_scenes_are_freed() -> None:
     assert found() is None
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("angle_deg", [0.0, 10.0, 30.0, 60.0, 85.0])
 def test_lone_box_is_not_in_its_own_shadow(angle_deg: float) -> None:
     angle = np.radians(angle_deg)

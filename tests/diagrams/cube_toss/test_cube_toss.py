@@ -9,6 +9,7 @@ from tests.real import recordings
 from vtbdrake_diagrams.cube_toss import CubeTossScenario, reality
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", reality.contact_models())
 def test_cube_falls_freely_and_comes_to_rest(name: str) -> None:
     scenario, restitution = reality.contact_models()[name]

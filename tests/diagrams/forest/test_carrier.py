@@ -136,6 +136,7 @@ def test_braked_carrier_loses_energy() -> None:
     assert np.abs(energies[40:]).max() < 0.01 * energies[0]
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("curvature", [0.1, -0.25])
 def test_radius_and_slip_of_a_steady_turn(curvature: float) -> None:
     turning = world(controls=(1.0, curvature))

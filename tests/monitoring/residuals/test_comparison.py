@@ -67,6 +67,7 @@ def test_perfect_shadow_has_no_residuals(scenario: DrivenPendulum) -> None:
     assert together.line.machine.status().accepted["torque"] == 204  # by the other loop
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("horizon", [1, 3, 50])
 def test_any_horizon_is_aligned(horizon: int) -> None:
     found = twin(DrivenPendulum(sampled=True), replace(CONFIG, horizon=horizon))

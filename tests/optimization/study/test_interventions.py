@@ -584,6 +584,7 @@ class Interrupting(StatedExecutor):
             yield result
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("before", [3, 8, 14])
 def test_a_batch_that_was_interrupted_is_finished_as_it_was_begun(tmp_path, before):
     """In a race, a second point would change which rollouts the first one takes."""
