@@ -117,6 +117,7 @@ def test_arm_of_a_station_does_not_lunge_after_an_outage(key: str, outage: float
     check_station(key, outage)
 
 
+@pytest.mark.slow
 def test_stopped_machine_is_not_commanded_before_a_reset() -> None:
     """Its own stop is pressed for half a second, and released: the DPS commands after the reset only."""
     course = station("Torque")

@@ -33,6 +33,7 @@ def reset_refused(course: Course) -> str:
     return str(refused.value)
 
 
+@pytest.mark.slow
 def test_stopped_arm_is_commanded_again_after_a_reset_only() -> None:
     loop = course("free", "joint_torque", "joint_velocity")
     loop.run(0.1)

@@ -33,6 +33,8 @@ EXECUTORS = {
     "threads": lambda get: ThreadExecutor(2),
     "processes": lambda get: nullcontext(get("processes")),
 }
+# That decisions in processes begin where they should is a quick test of the reasoner.
+CASES = [pytest.param(name, marks=[pytest.mark.slow] if name == "processes" else []) for name in EXECUTORS]
 
 
 def _running(scenario, seconds, values=None):
@@ -55,7 +57,7 @@ def _future(task, testbed, simulator, address):
     return np.array(found)
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("executor", CASES)
 def test_rollouts_from_two_starts_equal_the_true_future(executor, request):
     testbed, simulator = _running(DISCRETE, 0.5)
     task = RolloutTask(DISCRETE, 0.5, record=[ELBOW])
@@ -153,7 +155,7 @@ def test_samples_of_a_start_lie_at_the_testbeds_events():
     assert runner.run({}, start=start).record["time"][-1] == 30 * 0.02
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("executor", CASES)
 def test_a_start_of_another_testbed_is_refused_by_name(executor, request):
     testbed = AcrobotScenario().build()
     start = Start.of(testbed, testbed.default_context())

@@ -158,6 +158,6 @@ def test_compiled_dps_gives_the_same_torques(law: str) -> None:
     for compiled in (False, True):
         testbed = ManipulatorScenario(law=law, compile=compiled).build()
         context = start(testbed, Motion.SWING)
-        testbed.simulator(context).AdvanceTo(0.5)
+        testbed.simulator(context).AdvanceTo(0.2)
         torques.append(testbed.read(context, "dps.joint_torque"))
     np.testing.assert_array_equal(*torques)
