@@ -236,27 +236,10 @@ HALF = {"u.switch": 0.5}
 
 
 def test_a_budget_of_time_gives_the_best_so_far(mass):
-    seconds = 0.2
-    # On a computer that is busy, it may not be enough for a rollout.
-    while not (decision := decide(make(method="random", budget=Budget(seconds=seconds)), mass, values=HALF)):
-        seconds *= 2.0
+    decision = decide(make(method="random", budget=Budget(seconds=0.2)), mass, values=HALF)
     finished = [c.quality for c in decision.candidates if c.status == "eligible"]
     assert decision.end == "time"
     assert decision.quality == min(finished)
-    assert decision.health.used >= 1.0
-
-
-class Losing(SerialExecutor):
-    """Cancels the first rollout, as a deadline does where a worker was lost."""
-
-    def run(self, *arguments, **options):
-        return (found for found in super().run(*arguments, **options) if found[0])
-
-
-def test_a_decision_without_the_plan_in_use_is_poor(mass):
-    decision = decide(make(executor=Losing(), method="random", budget=Budget(rollouts=3, seconds=1e4)), mass)
-    assert [candidate.status for candidate in decision.candidates] == ["unfinished", "eligible", "eligible"]
-    assert decision.warnings == ("the plan in use has not finished: the decision may be worse than none",)
 
 
 def test_a_late_decision_is_poor(mass):

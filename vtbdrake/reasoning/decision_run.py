@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import inf, nan
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
@@ -26,6 +26,7 @@ from vtbdrake.reasoning.decision import (
     Health,
 )
 from vtbdrake.reasoning.space import same_values
+from vtbdrake.reasoning.time_left import TimeLeft
 from vtbdrake.rollout import Cutoff, RolloutResult
 from vtbdrake.rollout.pruning import PRUNED, STALLED
 from vtbdrake.rollout.start import Start
@@ -49,6 +50,10 @@ _ROUND = 8
 
 # The decision ends after this many batches in a row with candidates only that were tried before.
 _MAX_SILENT_BATCHES = 50
+
+# The plan in use may finish up to this time after the budget of wall time, in seconds: without it there is nothing to
+# compare.
+_GRACE = 0.5
 
 # A decision is late if it took more than this many times its budget of wall time.
 _LATE = 1.5
@@ -88,7 +93,8 @@ class DecisionRun:
     ) -> None:
         self._reasoner = reasoner
         self._budget = budget
-        self._deadline = inf if budget.seconds is None else requested_at + budget.seconds
+        deadline = inf if budget.seconds is None else requested_at + budget.seconds
+        self._time_left = TimeLeft(deadline, side_by_side=reasoner.executor.side_by_side, clock=monotonic)
         self._problem = reasoner.problem
         self._sign = reasoner.problem.objectives[0].sign
         self._starts = starts
@@ -126,8 +132,10 @@ class DecisionRun:
         taken = len(first) - (self._point_in_use is not None)
         affordable = None if rollouts is None else rollouts // reasoner.samples - taken
         evaluations: list[Evaluation] = []
-        if reasoner.task.pruning is not None or (affordable is not None and affordable <= 0):
-            # Otherwise they run beside the first batch of the method, which keeps the workers busy.
+        timed = self._budget.seconds is not None
+        if timed or reasoner.task.pruning is not None or (affordable is not None and affordable <= 0):
+            # Otherwise they run beside the first batch of the method, which keeps the workers busy. In a budget of
+            # wall time, they tell how many more fit.
             evaluations, first = self._try(first)[1:], []
         if affordable is not None and affordable <= 0:
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
@@ -162,7 +170,7 @@ class DecisionRun:
         """
         silent, rollouts = 0, self._budget.rollouts
         while silent < _MAX_SILENT_BATCHES:
-            proposals = ask_within(solver, self._deadline - time.monotonic())
+            proposals = ask_within(solver, inf if solver.is_prompt else self._time_left.seconds)
             if proposals is None:
                 raise _BudgetSpentError(TIME, f"{self._time_spent()}, before {solver.name} proposed more candidates")
             points = self._problem.points(proposals)
@@ -188,23 +196,36 @@ class DecisionRun:
         return evaluations
 
     def _roll_out(self, keys: Sequence[RolloutKey]) -> None:
-        executor, rollouts = self._reasoner.executor, self._budget.rollouts
-        if time.monotonic() >= self._deadline:
-            raise _BudgetSpentError(TIME, self._time_spent())
+        rollouts = self._budget.rollouts
         new = [key for key in keys if key[0] != self._point_in_use]
-        affordable = new if rollouts is None else new[: rollouts - self._count]
-        if affordable:
-            points = self._values([point for point, _ in affordable])
-            starts = [self._starts[sample] for _, sample in affordable]
-            self._collect(executor.run(self._reasoner.task, points, start=starts, **self._cutoff()), affordable)
-        if self._point_in_use is not None:
+        allowed = waiting = new if rollouts is None else new[: rollouts - self._count]
+        while waiting:
+            fitting = waiting[: self._fitting(waiting)]
+            if fitting:
+                self._run_together(fitting)
+            if not fitting or any(key not in self._results for key in fitting):
+                raise _BudgetSpentError(TIME, self._time_spent())
+            waiting = waiting[len(fitting) :]
+        if len(keys) > len(new):
             # Setting the plan in use once more changes nothing.
             in_use = {sample: result for (point, sample), result in self._results.items() if point == KEEP}
-            self._results |= {(self._point_in_use, sample): result for sample, result in in_use.items()}
-        if any(key not in self._results for key in affordable):
-            raise _BudgetSpentError(TIME, self._time_spent())
-        if len(affordable) < len(new):
+            self._results |= {(point, sample): in_use[sample] for point, sample in keys if point == self._point_in_use}
+        if len(allowed) < len(new):
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
+
+    def _fitting(self, keys: Sequence[RolloutKey]) -> int:
+        """Return how many of the rollouts to run together: the plan in use, in any case, or what fits into the time."""
+        if keys[0][0] == KEEP and self._budget.seconds is not None:
+            return sum(point == KEEP for point, _ in keys)
+        return self._time_left.affordable(len(keys), together=min(self._reasoner.samples, len(keys)))
+
+    def _run_together(self, keys: Sequence[RolloutKey]) -> None:
+        executor, points = self._reasoner.executor, self._values([point for point, _ in keys])
+        starts = [self._starts[sample] for _, sample in keys]
+        grace = _GRACE if keys[0][0] == KEEP else 0.0
+        self._time_left.begin()
+        self._collect(executor.run(self._reasoner.task, points, start=starts, **self._cutoff(grace)), keys)
+        self._time_left.end(len(keys))
 
     def _collect(self, results: Iterator[tuple[int, RolloutResult]], keys: Sequence[RolloutKey]) -> None:
         try:
@@ -215,7 +236,7 @@ class DecisionRun:
         finally:
             results.close()  # type: ignore[attr-defined]
 
-    def _cutoff(self) -> dict[str, Cutoff]:
+    def _cutoff(self, grace: float) -> dict[str, Cutoff]:
         """Return the argument ``cutoff`` for an executor that can end rollouts early; else none."""
         if not self._reasoner.executor.cancels:
             return {}
@@ -223,7 +244,7 @@ class DecisionRun:
         # Under any other risk, a better candidate may have a worse sample.
         comparable = self._reasoner.samples == 1 or isinstance(risk, Worst)
         to_beat = nan if best is None or not comparable else self._evaluator.in_user_terms(best)[0]
-        return {"cutoff": Cutoff(deadline=self._deadline, to_beat=to_beat)}
+        return {"cutoff": Cutoff(deadline=self._time_left.deadline + grace, to_beat=to_beat)}
 
     def _time_spent(self) -> str:
         return f"the budget of {self._budget.seconds:g} s is spent"
@@ -244,7 +265,7 @@ class DecisionRun:
             improvement = sign * (best.quality - candidates[0].quality) + 0.0
         if len(ranked) > 1:
             margin = sign * (ranked[0].quality - ranked[1].quality) + 0.0
-        elapsed = time.monotonic() - self._requested_at
+        elapsed = monotonic() - self._requested_at
         results = [result for candidate in candidates for result in candidate.rollouts]
         ends = Counter(result.end for result in results)
         budget = self._budget
@@ -337,12 +358,10 @@ def _warnings(
         yield "no rollout has finished, not even of the plan in use: the budget is too small, or one is too slow"
     elif len(candidates) == 1:
         yield "nothing but the plan in use was tried: the budget is too small, or a rollout too slow"
-    elif candidates[0].status == UNFINISHED:
-        yield "the plan in use has not finished: the decision may be worse than none"
     if budget.seconds is not None and elapsed > _LATE * budget.seconds:
         yield (
-            f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a worker hangs, or the time from one "
-            "sample to the next is too long"
+            f"it took {elapsed:.3g} s, but its budget is {budget.seconds:g} s: a rollout takes too long, or the time "
+            "from one sample to the next, or a worker hangs"
         )
     if {result.end for result in results} == {TERMINATED}:
         latest = max(float(result.times[-1]) for result in results)

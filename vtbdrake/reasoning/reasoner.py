@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import inf
+from time import monotonic
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -280,7 +280,7 @@ class Reasoner:
             if budget.seconds is not None:
                 self._check_executor()
                 self._warm_up()
-            requested_at = time.monotonic()
+            requested_at = monotonic()
             if isinstance(believer, AddressedDiagram):
                 if context is None:
                     raise ValueError("a decision begins at a state: decide(testbed, context), or decide(belief)")

@@ -53,9 +53,11 @@ class Executor(Closing):
 
     Attributes:
         cancels: Whether `run` accepts a `Cutoff`.
+        side_by_side: Number of rollouts that run side by side, each about as fast as one alone.
     """
 
     cancels: bool = True
+    side_by_side: int = 1
 
     @abstractmethod
     def run(
@@ -153,7 +155,7 @@ class ThreadExecutor(Executor):
     def __init__(
         self, workers: int | None = None, *, testbed: VirtualTestbed | None = None, max_testbeds: int = MAX_TESTBEDS
     ) -> None:
-        self._count = checked_workers(workers)
+        self._count = self.side_by_side = checked_workers(workers)
         self._runners = Runners(Testbeds(testbed, max_testbeds=max_testbeds))
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []

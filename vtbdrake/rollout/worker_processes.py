@@ -77,7 +77,7 @@ class ProcessExecutor(Executor):
         max_testbeds: int = MAX_TESTBEDS,
         growth: float = 1e9,
     ) -> None:
-        self._count = checked_workers(workers)
+        self._count = self.side_by_side = checked_workers(workers)
         self.time_limit = checked_time_limit(time_limit)
         self._growth = as_number("the growth of a worker's memory", growth)
         if not self._growth > 0.0:

@@ -5,8 +5,16 @@ from __future__ import annotations
 import casadi
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, SpatialInertia
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JacobianWrtVariable,
+    MultibodyForces,
+    RevoluteJoint,
+    SpatialInertia,
+    UnitInertia,
+)
 
 from tests.components.compiled_plant.plants import (
     arm,
@@ -54,6 +62,33 @@ def test_inverse_dynamics_invert_the_accelerations(make):
         expected = plant.CalcInverseDynamics(context, a, forces) - damping * plant.GetVelocities(context)
         n = plant.num_positions()
         assert relative(tau(x[:n], x[n:], a).full(), expected) < 1e-12
+
+
+def pendulum_of(length: float) -> MultibodyPlant:
+    """A pendulum of two boxes whose lengths, mass and gravity have one scale: it moves alike, whatever that is."""
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -9.81 * length])
+    com = np.array([0.0, 0.1, -0.5]) * length
+    box = UnitInertia.SolidBox(*(np.array([0.1, 0.2, 1.0]) * length)).ShiftFromCenterOfMass(com)
+    carrier = plant.world_frame()
+    for name in ("upper", "lower"):
+        body = plant.AddRigidBody(name, SpatialInertia(length**3, com, box, skip_validity_check=True))
+        plant.AddJoint(RevoluteJoint(f"{name}_hinge", carrier, body.body_frame(), [0, 1, 0]))
+        X_BF = RigidTransform([0.0, 0.0, -length])
+        carrier = plant.AddFrame(FixedOffsetFrame(f"{name}_end", body.body_frame(), X_BF))
+    plant.Finalize()
+    return plant
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-6, 1e-16])
+def test_a_model_of_any_size_keeps_its_dimensions(length):
+    x = [0.3, -0.2, 0.5, 1.0]
+    plant = pendulum_of(1.0)
+    context = plant.CreateDefaultContext()
+    plant.SetPositionsAndVelocities(context, x)
+    small = pendulum_of(length)
+    found = plant_dynamics(small, small.CreateDefaultContext())(x, []).full()
+    assert relative(found, plant.EvalTimeDerivatives(context).CopyToVector()) < 1e-12
 
 
 def _joints_by_velocity(plant):

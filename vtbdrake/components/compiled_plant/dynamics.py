@@ -31,6 +31,7 @@ from vtbdrake.components.compiled_plant.links import (
     input_name,
     read_links,
     rotation,
+    rounding_beside,
     skew,
     symmetric,
     times,
@@ -138,8 +139,10 @@ class PlantDynamics:
         self._symbols = tree.symbols
         self._mounts = tree.mounts
         self._inertias, self._welds = tree.inertias, tree.welds
+        self._rounding = tree.rounding
         self._context = context
-        self._gravity = constant(np.concatenate([np.zeros(3), plant.gravity_field().gravity_vector()]))
+        gravity = plant.gravity_field().gravity_vector()
+        self._gravity = constant(np.concatenate([np.zeros(3), gravity]), rounding_beside(np.max(np.abs(gravity))))
         self._actuation = constant(plant.MakeActuationMatrix())
         actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         self._effort = {actuator.input_start(): actuator.effort_limit() for actuator in actuators}
@@ -520,7 +523,7 @@ class PlantDynamics:
     def _on_link(self, frame: Frame) -> tuple[int, Pose]:
         """Return the number of the link that a frame F is on (-1 is the world), and X_MF."""
         k, X_MB = self._mounts[int(frame.body().index())]
-        return k, times(X_MB, constant_pose(frame.CalcPoseInBodyFrame(self._context)))
+        return k, times(X_MB, constant_pose(frame.CalcPoseInBodyFrame(self._context), self._rounding))
 
     @staticmethod
     def _of_parent(values: list[Expression], link: Link, world: Expression) -> Expression:

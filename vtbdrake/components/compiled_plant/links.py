@@ -28,6 +28,11 @@ from vtbdrake.state.multibody import bodies, element_address
 Expression = Any  # casadi.SX
 Pose = tuple[Expression, Expression]  # R, shape (3, 3), and p, shape (3, 1)
 
+# A number of a constant below this, in SI units, is what rounding left of a zero; in small models, a number below this
+# part of the largest one of its kind.
+_ROUNDING = 1e-15
+_RELATIVE_ROUNDING = 1e-12
+
 REVOLUTE = "revolute"
 PRISMATIC = "prismatic"
 WELD = "weld"
@@ -82,6 +87,7 @@ class LinkTree:
         welds: Index of the body that carries a welded one, by its index.
         symbols: The inputs, by address.
         values: What the Context holds for them, by address, flat.
+        rounding: Length in m below which rounding has left it of a zero.
     """
 
     links: tuple[Link, ...]
@@ -90,6 +96,7 @@ class LinkTree:
     welds: dict[int, int]
     symbols: dict[str, Expression]
     values: dict[str, NDArray[np.float64]]
+    rounding: float
 
 
 def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = ()) -> LinkTree:
@@ -126,10 +133,12 @@ class _LinkReader:
         self._links: list[Link] = []
         self._inertias: dict[int, Expression] = {}
         self._welds: dict[int, int] = {}
+        self._largest = _largest_length(plant, context)
+        self._rounding = rounding_beside(self._largest)
 
     def tree(self) -> LinkTree:
         reflected = self._reflected_inertias()
-        self._mounts[int(self._plant.world_body().index())] = -1, constant_pose(RigidTransform())
+        self._mounts[int(self._plant.world_body().index())] = -1, constant_pose(RigidTransform(), self._rounding)
         waiting = [self._plant.get_joint(index) for index in self._plant.GetJointIndices()]
         while waiting:
             reached = [[int(b.index()) in self._mounts for b in (j.parent_body(), j.child_body())] for j in waiting]
@@ -141,7 +150,7 @@ class _LinkReader:
         self._check_inputs()
         symbols = {address: self._symbols[address] for address in self._inputs}
         values = {address: self._values[address] for address in self._inputs}
-        return LinkTree(tuple(self._links), self._mounts, self._inertias, self._welds, symbols, values)
+        return LinkTree(tuple(self._links), self._mounts, self._inertias, self._welds, symbols, values, self._rounding)
 
     def _mount(self, joint: Joint, reflected: dict[int, Expression], *, reverse: bool) -> None:
         """Add the body that a joint carries; its child, or its parent in ``reverse``."""
@@ -155,7 +164,7 @@ class _LinkReader:
         kind = joint.type_name()
         if kind == WELD:
             X_FM = joint.X_FM()
-            X_PB = times(times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM)), X_MB)
+            X_PB = times(times(X_PF, constant_pose(X_FM.inverse() if reverse else X_FM, self._rounding)), X_MB)
             self._mounts[int(body.index())] = parent, X_PB
             self._welds[int(body.index())] = int(inner.body().index())
             inertia = self._inertia(body, X_PB)
@@ -199,7 +208,7 @@ class _LinkReader:
         G_BBcm_B = M_BBo_B.get_unit_inertia().ShiftToCenterOfMass(p_BoBcm_B).CopyToFullMatrix3()
         I_BBcm_B = M_BBo_B.get_mass() * G_BBcm_B
         mass = self._input(f"{address}.mass", M_BBo_B.get_mass())
-        com = self._input(f"{address}.center_of_mass", p_BoBcm_B)
+        com = self._input(f"{address}.center_of_mass", p_BoBcm_B, self._rounding)
         moments = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
         rotational = self._input(f"{address}.inertia", [I_BBcm_B[i, j] for i, j in moments])
         if f"{address}.inertia" in self._inputs:
@@ -207,7 +216,7 @@ class _LinkReader:
             I_cm = casadi.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         else:
             # As in Drake, a body of another mass keeps its shape.
-            I_cm = mass * constant(G_BBcm_B)
+            I_cm = mass * constant(G_BBcm_B, rounding_beside(self._largest**2))
         R, p = X_MB
         I_cm = R @ I_cm @ R.T
         c = skew(p + R @ com)
@@ -218,17 +227,17 @@ class _LinkReader:
         """Return X_BF of a frame F on the body B."""
         X_BF = frame.CalcPoseInBodyFrame(self._context)
         if not isinstance(frame, FixedOffsetFrame):
-            return constant_pose(X_BF)
+            return constant_pose(X_BF, self._rounding)
         X_PF = frame.GetPoseInParentFrame(self._context)
         address = f"{self._address(frame)}.pose"
         if address not in self._inputs:
             self._offered.add(address)
-            return constant_pose(X_BF)
+            return constant_pose(X_BF, self._rounding)
         if address not in self._symbols:
             self._check_alone(frame, address)
         value = np.concatenate([X_PF.translation(), X_PF.rotation().ToRollPitchYaw().vector()])
         pose = self._input(address, value)
-        return times(constant_pose(X_BF @ X_PF.inverse()), (roll_pitch_yaw(pose[3:]), pose[:3]))
+        return times(constant_pose(X_BF @ X_PF.inverse(), self._rounding), (roll_pitch_yaw(pose[3:]), pose[:3]))
 
     def _check_alone(self, frame: FixedOffsetFrame, address: str) -> None:
         """Refuse a pose on which the poses of further frames depend."""
@@ -250,12 +259,12 @@ class _LinkReader:
             inertias[int(actuator.joint().index())] = actuator.gear_ratio(self._context) ** 2 * rotor
         return inertias
 
-    def _input(self, address: str, value: ArrayLike) -> Expression:
-        """Return the symbol of an input, or the value itself, shape (n, 1)."""
+    def _input(self, address: str, value: ArrayLike, rounding: float = 0.0) -> Expression:
+        """Return the symbol of an input, or the value itself, shape (n, 1); see `constant`."""
         array = np.asarray(value, dtype=float).ravel()
         self._offered.add(address)
         if address not in self._inputs:
-            return constant(array)
+            return constant(array, rounding)
         self._values[address] = array
         return self._symbols.setdefault(address, casadi.SX.sym(input_name(address), array.size))
 
@@ -340,18 +349,46 @@ def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
         yield f"{first} and {second} can collide (exclude them by a CollisionFilterDeclaration)"
 
 
+def _largest_length(plant: MultibodyPlant, context: Context) -> float:
+    """Return the largest length of a plant in m: of its bodies, and from body to joint."""
+    lengths = [0.0]
+    for body in bodies(plant):
+        M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)
+        lengths += [*np.abs(M_BBo_B.get_com()), *np.sqrt(np.abs(M_BBo_B.get_unit_inertia().get_moments()))]
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        for frame in (joint.frame_on_parent(), joint.frame_on_child()):
+            lengths += np.abs(frame.CalcPoseInBodyFrame(context).translation()).tolist()
+    return float(np.nanmax(lengths))
+
+
 # -- small algebra, which keeps structural zeros: they cost nothing later
 
 
-def constant(values: ArrayLike) -> Expression:
-    """Return numbers as an expression without structural zeros; what rounding left of a zero is zero."""
+def constant(values: ArrayLike, rounding: float = _ROUNDING) -> Expression:
+    """Return numbers as an expression without structural zeros.
+
+    Args:
+        values: The numbers.
+        rounding: What is smaller is zero.
+    """
     array = np.asarray(values, dtype=float)
-    return casadi.sparsify(casadi.SX(casadi.DM(np.where(np.abs(array) < 1e-15, 0.0, array))))
+    return casadi.sparsify(casadi.SX(casadi.DM(np.where(np.abs(array) < rounding, 0.0, array))))
 
 
-def constant_pose(X_AB: RigidTransform) -> Pose:
-    """Return a pose of numbers."""
-    return constant(X_AB.rotation().matrix()), constant(X_AB.translation())
+def rounding_beside(largest: float) -> float:
+    """Return the size below which a number beside the largest one of its kind is what rounding left of a zero."""
+    return min(_ROUNDING, _RELATIVE_ROUNDING * largest)
+
+
+def constant_pose(X_AB: RigidTransform, rounding: float) -> Pose:
+    """Return a pose of numbers.
+
+    Args:
+        X_AB: The pose.
+        rounding: A length in m; what is shorter is zero.
+    """
+    return constant(X_AB.rotation().matrix()), constant(X_AB.translation(), rounding)
 
 
 def skew(a: Expression) -> Expression:

@@ -41,6 +41,8 @@ class SamplingSolver(Solver):
         SolverError: An option is out of range, or the search has choices or several objectives.
     """
 
+    is_prompt = True
+
     def __init__(self, search: Search, *, name: str, population: int | None, sigma: float) -> None:
         search.require(name, ordered=True, one_objective=True)
         super().__init__(search, name=name)

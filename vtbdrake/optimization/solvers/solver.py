@@ -290,6 +290,7 @@ class Solver(ABC):
         wants_gradient: Whether the solver needs `Evaluation.gradient`.
         takes_start: Whether the solver starts at a point (`Search.start`).
         needs_parameters: Whether there must be a parameter to vary.
+        is_prompt: Whether `ask` always returns at once, so that nobody must watch how long it takes.
         plans_for_budget: Whether another budget takes a new solver, because this one has planned for its own.
         success: Whether the solver ended by its own criterion (converged, or its design is complete); None before.
         message: How the solver ended.
@@ -299,6 +300,7 @@ class Solver(ABC):
     takes_start: bool = True
     needs_parameters: bool = True
     plans_for_budget: bool = False
+    is_prompt: bool = False
 
     def __init__(self, search: Search, *, name: str) -> None:
         self.name = name
