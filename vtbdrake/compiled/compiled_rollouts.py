@@ -231,17 +231,20 @@ class CompiledRollouts:
         self.walker.check_fixed(z, self._z0)
         instants = self.schedule_at(t0)
         program, plan = self._planned(instants)
-        chunks = [z[k : k + program.most] for k in range(0, len(z), program.most)]
+        chunks = [slice(k, k + program.most) for k in range(0, len(z), program.most)]
+        # Every chunk writes into its rows: to put them together at the end would take the memory twice.
+        final = np.empty_like(z)
+        recorded = np.empty((len(z), len(self.times), self._record.numel_out(0)))
 
-        def run(chunk: Array) -> tuple[Array, Array]:
-            return program.run(chunk, self._noise(chunk, instants, program.count), plan)
+        def run(chunk: slice) -> None:
+            noise = self._noise(z[chunk], instants, program.count)
+            final[chunk], recorded[chunk] = program.run(z[chunk], noise, plan)
 
         if len(chunks) <= 1:
-            final, recorded = run(z)
+            run(slice(None))
         else:
             with ThreadPoolExecutor(self._workers) as pool:
-                results = list(pool.map(run, chunks))
-            final, recorded = (np.concatenate(parts) for parts in zip(*results, strict=True))
+                list(pool.map(run, chunks))
         valid: NDArray[np.bool_] = np.all(recorded[:, :, -1] <= 0.0, axis=1)
         outputs = {
             name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self._shapes[name])
