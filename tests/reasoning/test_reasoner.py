@@ -627,6 +627,10 @@ def test_a_senseless_budget_is_refused(arguments, message):
             {"method": "grid", "options": {"points": 50}},
             "budget is 29 .*: of the 30 rollouts, the plan in use takes 1 rollout$",
         ),
+        (
+            {"method": "grid", "budget": Budget(rollouts=2)},
+            "at least two values .*: of the 2 rollouts, the plan in use takes 1 rollout$",
+        ),
         ({"horizon": -1.0}, "horizon t_m must be positive"),
         ({"executor": "gpu"}, "an executor is one of"),
     ],

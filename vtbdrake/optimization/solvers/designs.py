@@ -224,6 +224,7 @@ def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
             raise SolverError(f"{parameter.address} has {len(parameter.options)} options, and a grid takes all of them")
         return list(parameter.options)
     whole = int(parameter.upper) - int(parameter.lower) + 1 if parameter.integer and count is None else None
+    too_few = BudgetTooSmallError if count is None else SolverError
     count = fair if count is None else count
     if (size := count if whole is None else whole) > MOST_VALUES:
         raise SolverError(
@@ -233,7 +234,7 @@ def _axis(parameter: Dimension, count: int | None, fair: int) -> list[object]:
     if whole is not None:
         return list(range(int(parameter.lower), int(parameter.upper) + 1))
     if count < 2:
-        raise SolverError(f"a grid has at least two values of {parameter.address}, not {count}")
+        raise too_few(f"a grid has at least two values of {parameter.address}, not {count}")
     values = (parameter.from_unit(u) for u in np.linspace(0.0, 1.0, count))
     return list(dict.fromkeys(values))
 
