@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -154,3 +155,18 @@ def test_recordings_of_real_robots_are_read_as_they_are() -> None:
     path = recordings("victoria_park/inputs.dat")[0]
     inputs = read_table(path, sense={"speed": "1", "steering": "2"}, time="0")
     assert np.array_equal(inputs.sense["speed"].values[:, 0], np.loadtxt(path)[:, 1])
+
+
+def test_episode_of_a_table_with_lists_is_read(tmp_path: Path) -> None:
+    columns = {"episode_index": [0, 0, 1, 1], "timestamp": [0.0, 0.1, 0.0, 0.1], "state": Q.tolist()}
+    pandas.DataFrame(columns).to_parquet(tmp_path / "episodes.parquet")
+    read = partial(read_table, tmp_path / "episodes.parquet", sense={"state": "state"}, time="timestamp")
+    log = read(episode=1)
+    assert log.sense["state"].times.tolist() == [0.0, 0.1] and np.array_equal(log.sense["state"].values, Q[2:])
+    with pytest.raises(LogError, match="episode_index has no episode 2, but 0 to 1"):
+        read(episode=2)
+    with pytest.raises(LogError, match="time runs backwards"):
+        read()
+    pandas.DataFrame({"a": [[1.0], [1.0, 2.0]]}).to_parquet(tmp_path / "ragged.parquet")
+    with pytest.raises(LogError, match="the lists of the column a have several lengths"):
+        read_table(tmp_path / "ragged.parquet", sense={"a": "a"}, time=0.1)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from vtbdrake.common.arrays import Array
 from vtbdrake.common.extras import extra_module
 from vtbdrake.recording.log import Log, Series, checked_series
 from vtbdrake.recording.log_format import LogError
+from vtbdrake.recording.message_reader import BagTable, McapTable, MessageTable
 
 Table = Mapping[str, Any]
 """Columns by name: arrays (n,), or (n, k) for k entries."""
@@ -39,6 +39,8 @@ def read_table(
     time: str | float = "time",
     times: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    episode: int | None = None,
+    episodes: str = "episode_index",
 ) -> Log:
     """Return the signals in a table that somebody else has recorded.
 
@@ -51,16 +53,20 @@ def read_table(
     the same time counts. What was left out is said in `Log.remarks`, gaps too.
 
     Args:
-        source: A file: text (.csv, .dat, .txt; separated by commas, semicolons, tabs or blanks), .npz, .parquet, or
-            .mcap with JSON messages, whose columns are ``topic.field`` and ``topic.log_time``. For any other format,
-            the columns themselves. Without a line of names, the columns of a text are "0", "1", ...
+        source: A file: text (.csv, .dat, .txt; separated by commas, semicolons, tabs or blanks), .npz, .parquet; or a
+            recording of messages: .mcap (JSON, protobuf or ROS 2), or a bag of ROS (the folder of a rosbag2, .db3,
+            .bag), whose columns are ``topic.field``, ``topic.field.field[2]`` and ``topic.log_time``: only the topics
+            that are asked for are decoded. For any other format, the columns themselves. Without a line of names, the
+            columns of a text are "0", "1", ...
         sense: For each sensor signal, its column, or the columns of its entries. ``name[2]`` is the third entry of a
             column that has several.
         act: The same for the actuator signals.
-        time: The column of the times, in an .mcap the time of each topic; or the period in s, if the table has no
-            times.
+        time: The column of the times, in a recording of messages a field of each topic, such as ``log_time`` or
+            ``header.stamp``; or the period in s, if the table has no times.
         times: The column of the times of the signals that have others, by signal.
         units: Units that are none of SI (`UNITS`): of a signal by its name, of times by their column.
+        episode: Read the rows of this episode alone, in a table that has several.
+        episodes: The column with the number of each row's episode.
 
     Raises:
         OSError: The file cannot be read.
@@ -76,6 +82,7 @@ def read_table(
     _check_keys(times, {*sense, *act}, "times")
     _check_keys(units, {*sense, *act, *times.values(), str(time)}, "a unit")
     remarks: list[str] = []
+    rows = None if episode is None else _rows_of(_column(table, episodes, name)[:, 0], episode, f"{name}: {episodes}")
 
     def read(signals: Mapping[str, str | Sequence[str]]) -> dict[str, Series]:
         series = {}
@@ -87,10 +94,23 @@ def read_table(
                 at = _column(table, _time_column(table, stamps, each[0]), name)[:, 0] * _factor(units.get(stamps))
             else:
                 at = stamps * np.arange(len(entries), dtype=float)
+            if rows is not None:
+                at, entries = at[rows], entries[rows]
             series[signal] = checked_series(f"{name}: {signal}", at, entries * _factor(units.get(signal)), remarks)
         return series
 
-    return Log(name, read(sense), read(act), remarks)
+    read_sense, read_act = read(sense), read(act)
+    if isinstance(table, MessageTable):
+        remarks += table.remarks
+    return Log(name, read_sense, read_act, remarks)
+
+
+def _rows_of(numbers: Array, episode: int, label: str) -> NDArray[Any]:
+    """Return the rows of an episode, by the numbers of the episodes of all rows, (n,)."""
+    rows = np.flatnonzero(numbers == episode)
+    if not rows.size:
+        raise LogError(f"{label} has no episode {episode}, but {np.min(numbers):g} to {np.max(numbers):g}")
+    return rows
 
 
 def _check_keys(mapping: Mapping[str, Any], names: set[str], noun: str) -> None:
@@ -130,23 +150,24 @@ def _column(table: Table, name: str, source: str) -> Array:
 
 
 def _time_column(table: Table, name: str, column: str) -> str:
-    """Return the name of a column of times; in an .mcap, of the topic that ``column`` is of."""
-    of_topic = f"{column.rpartition('.')[0]}.{name}"
-    return of_topic if name not in table and of_topic in table else name
+    """Return the name of a column of times; in a recording of messages, of the topic that ``column`` is of."""
+    return f"{table.topic_of(column)}.{name}" if isinstance(table, MessageTable) and name not in table else name
 
 
 # -- formats
 
 
 def _read_file(path: Path) -> Table:
+    if (path / "metadata.yaml").is_file():
+        return BagTable(path)
+    if path.is_dir():
+        raise LogError(f"{path} is a folder, not a file, and no rosbag2, which has a metadata.yaml")
     suffix = path.suffix.lower()
     if suffix not in READERS:
         raise LogError(
             f"{path}: a table ends in {', '.join(READERS)}. Read another format with its library, and give the "
             'columns: read_table({"time": t, "q": q}, ...)'
         )
-    if path.is_dir():
-        raise LogError(f"{path} is a folder, not a file")
     return READERS[suffix](path)
 
 
@@ -202,44 +223,38 @@ def _read_npz(path: Path) -> Table:
         raise LogError(f"{path} is not an .npz of arrays without pickles: {error}") from error
 
 
-def _read_parquet(path: Path) -> Table:
-    parquet = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording")
-    table = parquet.read_table(path)
-    return {name: np.array(table[name].to_pylist()) for name in table.column_names}
+class _ParquetTable(Mapping[str, Any]):
+    """The columns of a Parquet file, read when they are asked for: numbers (n,), or lists of k numbers each (n, k)."""
 
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording").ParquetFile(path)
 
-def _read_mcap(path: Path) -> Table:
-    reader = extra_module("mcap.reader", purpose="MCAP", extra="recording")
-    rows: dict[str, list[Mapping[str, Any]]] = {}
-    with path.open("rb") as file:
-        for _, channel, message in reader.make_reader(file).iter_messages():
-            if channel.message_encoding != "json":
-                raise LogError(f"{path}: the messages of {channel.topic} are {channel.message_encoding}, not JSON")
-            content = {name: value for name, value in json.loads(message.data).items() if _is_data(value)}
-            rows.setdefault(channel.topic, []).append({**content, "log_time": 1e-9 * message.log_time})
-    table: dict[str, Any] = {}
-    for topic, messages in rows.items():
-        for field in messages[0]:
-            entries = [message.get(field) for message in messages]
-            table[f"{topic}.{field}"] = np.array(_without_null(entries))
-    return table
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in [*self]:
+            raise KeyError(name)
+        column: Any = self._file.read(columns=[name])[name].combine_chunks()
+        if not hasattr(column, "flatten"):
+            return np.asarray(column.to_numpy(zero_copy_only=False))
+        compute = extra_module("pyarrow.compute", purpose="Parquet", extra="recording")
+        if len(lengths := compute.unique(compute.list_value_length(column))) > 1 or column.null_count:
+            raise LogError(f"{self._path}: the lists of the column {name} have several lengths")
+        values = column.flatten().to_numpy(zero_copy_only=False)
+        return np.reshape(values, (len(column), lengths[0].as_py() if len(lengths) else 0))
 
+    def __iter__(self) -> Iterator[str]:
+        yield from self._file.schema_arrow.names
 
-def _is_data(value: Any) -> bool:
-    return isinstance(value, int | float | list | None) and not isinstance(value, bool)
-
-
-def _without_null(value: Any) -> Any:
-    """Return JSON's numbers with NaN for null."""
-    if isinstance(value, list):
-        return [_without_null(entry) for entry in value]
-    return np.nan if value is None else value
+    def __len__(self) -> int:
+        return len(self._file.schema_arrow.names)
 
 
 READERS: Mapping[str, Callable[[Path], Table]] = {
     **dict.fromkeys((".csv", ".dat", ".txt"), _read_text),
     ".npz": _read_npz,
-    ".parquet": _read_parquet,
-    ".mcap": _read_mcap,
+    ".parquet": _ParquetTable,
+    ".mcap": McapTable,
+    ".db3": BagTable,
+    ".bag": BagTable,
 }
 """Readers by the suffix of the file."""

@@ -1,0 +1,224 @@
+"""Recordings of messages, MCAP and bags of ROS: tables whose topics are decoded when a column of them is asked for."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vtbdrake.common.extras import extra_module
+from vtbdrake.recording.log_format import LogError
+
+LOG_TIME = "log_time"
+"""The column of a topic with the times at which its messages were recorded, in s."""
+
+_SECONDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
+"""Fields of time stamps: those of ROS 2, of ROS 1 and Foxglove's JSON, and of protobuf."""
+
+_MAGIC = b"\x89MCAP0\r\n"
+"""The last bytes of an MCAP file that is whole, and the first ones of every one."""
+
+Messages = list[tuple[int, Any]]
+"""The messages of a topic: the times at which they were recorded, in ns, and what was decoded."""
+
+
+class MessageTable(ABC, Mapping[str, Any]):
+    """The columns ``topic.field`` of a recording of messages; ``topic.field.field[2].field`` reaches into a field.
+
+    A field is numbers, an array of numbers, or a time stamp, which becomes seconds. A message that lacks it gives NaN.
+
+    Args:
+        path: The file, or the folder of a rosbag2.
+
+    Attributes:
+        remarks: What was noticed while messages were read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.remarks: list[str] = []
+        self.topics = sorted(self._topics())
+        self._decoded: dict[str, Messages] = {}
+
+    @abstractmethod
+    def _topics(self) -> Iterator[str]:
+        """Yield the topics of the recording."""
+
+    @abstractmethod
+    def _messages(self, topic: str) -> Messages:
+        """Return the messages of a topic, decoded."""
+
+    def messages(self, topic: str) -> Messages:
+        """Return the messages of a topic, in the order of time."""
+        if topic not in self._decoded:
+            self._decoded[topic] = self._messages(topic)
+        return self._decoded[topic]
+
+    def topic_of(self, column: str) -> str:
+        """Return the topic of a column; empty if there is none."""
+        return max((topic for topic in self.topics if column.startswith(f"{topic}.")), key=len, default="")
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        topic = self.topic_of(column)
+        if not topic:
+            raise KeyError(column)
+        messages = self.messages(topic)
+        path = column[len(topic) + 1 :]
+        if path == LOG_TIME:
+            return 1e-9 * np.array([time for time, _ in messages], dtype=float)
+        values = [_number(_field(message, path)) for _, message in messages]
+        shape = next((np.shape(value) for value in values if value is not None), None)
+        if shape is None:
+            raise KeyError(column)
+        blank = np.full(shape, np.nan)
+        return np.array([blank if value is None else value for value in values])
+
+    def __contains__(self, column: object) -> bool:
+        with suppress(KeyError):
+            return isinstance(column, str) and self[column] is not None
+        return False
+
+    def __iter__(self) -> Iterator[str]:
+        for topic in self.topics:
+            yield f"{topic}.{LOG_TIME}"
+            for _, message in self._decoded.get(topic, [])[:1]:
+                yield from (f"{topic}.{name}" for name in _names(message))
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+def _names(message: Any) -> list[str]:
+    """Return the names of the fields of a message: JSON's, protobuf's or those of a dataclass."""
+    if isinstance(message, Mapping):
+        return [*message]
+    if hasattr(message, "DESCRIPTOR"):
+        return [field.name for field in message.DESCRIPTOR.fields]
+    return [name for name in vars(message) if not name.startswith("_")]
+
+
+def _field(message: Any, path: str) -> Any:
+    """Return a field, or None if the message lacks it."""
+    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        try:
+            if index:
+                message = message[int(index)]
+            else:
+                message = message[name] if isinstance(message, Mapping) else getattr(message, name)
+        except (LookupError, AttributeError, TypeError, ValueError):
+            return None
+    return message
+
+
+def _number(value: Any) -> Any:
+    """Return numbers with NaN for JSON's null, and a time stamp in seconds; None for what is none of them."""
+    if isinstance(value, bool | int | float | np.ndarray | np.generic):
+        return value
+    if isinstance(value, str | bytes) or value is None:
+        return None
+    for seconds, nanoseconds in _SECONDS:
+        parts = _field(value, seconds), _field(value, nanoseconds)
+        if None not in parts:
+            return parts[0] + 1e-9 * parts[1]
+    if isinstance(value, Mapping) or hasattr(value, "DESCRIPTOR") or not hasattr(value, "__iter__"):
+        return None
+    with suppress(TypeError, ValueError):
+        return np.array([np.nan if entry is None else _number(entry) for entry in value], dtype=float)
+    return None
+
+
+class McapTable(MessageTable):
+    """A recording in MCAP, whose messages are JSON, protobuf or CDR (ROS 2). One that is cut off is read to its end."""
+
+    def _topics(self) -> Iterator[str]:
+        with self.path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise LogError(f"{self.path} is no MCAP file: it does not begin as one")
+        yield from {channel.topic for _, channel, _ in self._raw(None)} if self._is_cut else self._summary_topics()
+
+    @property
+    def _is_cut(self) -> bool:
+        with self.path.open("rb") as file:
+            file.seek(max(self.path.stat().st_size - len(_MAGIC), 0))
+            return file.read() != _MAGIC
+
+    def _summary_topics(self) -> Iterator[str]:
+        with self.path.open("rb") as file:
+            summary = extra_module("mcap.reader", purpose="MCAP", extra="recording").make_reader(file).get_summary()
+        yield from {channel.topic for channel in summary.channels.values()} if summary else ()
+
+    def _raw(self, topics: list[str] | None) -> Iterator[tuple[Any, Any, Any]]:
+        reader = extra_module("mcap.reader", purpose="MCAP", extra="recording")
+        errors = extra_module("mcap.exceptions", purpose="MCAP", extra="recording")
+        with self.path.open("rb") as file:
+            if not self._is_cut:
+                yield from reader.make_reader(file).iter_messages(topics)
+                return
+            try:
+                yield from reader.NonSeekingReader(file).iter_messages(topics, log_time_order=False)
+            except (errors.McapError, ValueError, EOFError, struct.error) as error:
+                remark = f"{self.path} is cut off, and was read up to there: {error or type(error).__name__}"
+                self.remarks = [remark]
+
+    def _messages(self, topic: str) -> Messages:
+        decoders: dict[int, Callable[[bytes], Any]] = {}
+        messages: Messages = []
+        for schema, channel, message in self._raw([topic]):
+            if channel.id not in decoders:
+                decoders[channel.id] = self._decoder(schema, channel)
+            messages.append((message.log_time, decoders[channel.id](message.data)))
+        return sorted(messages, key=lambda each: each[0])
+
+    def _decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:
+        encoding = channel.message_encoding
+        if encoding == "json":
+            return json.loads
+        if encoding == "protobuf":
+            decoder = extra_module("mcap_protobuf.decoder", purpose="MCAP with protobuf", extra="recording")
+            decode: Callable[[bytes], Any] = decoder.DecoderFactory().decoder_for(encoding, schema)
+            return decode
+        if encoding == "cdr" and schema.encoding == "ros2msg":
+            return _ros_decoder(schema.name, schema.data.decode())
+        raise LogError(
+            f"{self.path}: the messages of {channel.topic} are {encoding}, with a schema of "
+            f"{schema.encoding if schema else 'no kind'}, not JSON, protobuf or CDR with definitions of ROS 2 (ros2msg)"
+        )
+
+
+def _ros_decoder(name: str, definition: str) -> Callable[[bytes], Any]:
+    """Return the decoder of messages of ROS 2 of a type, by its definition."""
+    typesys = extra_module("rosbags.typesys", purpose="messages of ROS", extra="recording")
+    types = typesys.get_typestore(typesys.Stores.EMPTY)
+    types.register(typesys.get_types_from_msg(definition, name))
+    return lambda data: types.deserialize_cdr(data, name)
+
+
+class BagTable(MessageTable):
+    """A bag of ROS: a folder of a rosbag2 (sqlite3 or mcap), its .db3, or a .bag of ROS 1, with standard messages."""
+
+    def _reader(self) -> Any:
+        purpose = {"purpose": "a bag of ROS", "extra": "recording"}
+        highlevel, typesys = (extra_module(f"rosbags.{name}", **purpose) for name in ("highlevel", "typesys"))
+        return highlevel.AnyReader([self.path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST))
+
+    def _topics(self) -> Iterator[str]:
+        try:
+            with self._reader() as reader:
+                yield from {connection.topic for connection in reader.connections}
+        except extra_module("rosbags.highlevel", purpose="a bag of ROS", extra="recording").AnyReaderError as error:
+            raise LogError(f"{self.path} is no bag of ROS that can be read: {error}") from error
+
+    def _messages(self, topic: str) -> Messages:
+        with self._reader() as reader:
+            connections = [connection for connection in reader.connections if connection.topic == topic]
+            return [
+                (time, reader.deserialize(data, connection.msgtype))
+                for connection, time, data in reader.messages(connections)
+            ]
