@@ -66,7 +66,7 @@ class Series:
             values: One row per time, shape (n, m).
         """
         last = np.append(np.diff(times) > 0.0, True)
-        return cls(times[last], values[last])
+        return cls(times, values) if last.all() else cls(times[last], values[last])
 
     def __len__(self) -> int:
         return len(self.times)

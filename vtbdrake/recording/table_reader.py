@@ -231,7 +231,7 @@ class _ParquetTable(Mapping[str, Any]):
         self._file = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording").ParquetFile(path)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        if name not in [*self]:
+        if name not in self:
             raise KeyError(name)
         column: Any = self._file.read(columns=[name])[name].combine_chunks()
         if not hasattr(column, "flatten"):
@@ -241,6 +241,9 @@ class _ParquetTable(Mapping[str, Any]):
             raise LogError(f"{self._path}: the lists of the column {name} have several lengths")
         values = column.flatten().to_numpy(zero_copy_only=False)
         return np.reshape(values, (len(column), lengths[0].as_py() if len(lengths) else 0))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._file.schema_arrow.names
 
     def __iter__(self) -> Iterator[str]:
         yield from self._file.schema_arrow.names
