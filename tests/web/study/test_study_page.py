@@ -224,9 +224,9 @@ def test_study_in_memory_is_watched_while_it_runs() -> None:
     study = cart_pole_problem().study(solver="random")
     with study.view() as view, page(view) as socket:
         reader = Reader(socket).until("new", 0)
-        run = threading.Thread(target=study.run, kwargs={"rollouts": 30, "executor": "serial", "progress": False})
+        run = threading.Thread(target=study.run, kwargs={"rollouts": 12, "executor": "serial", "progress": False})
         run.start()
-        reader.until("ended", 30)
+        reader.until("ended", 12)
         run.join()
         assert reader.trials == rows(study)
 
