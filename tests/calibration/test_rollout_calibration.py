@@ -215,7 +215,7 @@ ANGLE, RATE, DAMPING = (f"sim.sys.cart_pole.pole_pin.{name}" for name in ("posit
 @cache
 def swings(damping: float) -> list[Window]:
     """Return swings of the cart-pole's pole, as Drake simulates them, measured to 1 mrad."""
-    testbed, rng, times = CartPoleScenario().build(), np.random.default_rng(3), 0.02 * np.arange(33)
+    testbed, rng, times = CartPoleScenario().build(), np.random.default_rng(3), 0.02 * np.arange(21)
     windows = []
     for k, angle in enumerate(np.linspace(0.3, 1.0, 8)):
         context = testbed.default_context()
