@@ -9,17 +9,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
+import random
 import re
+import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
+from io import StringIO
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pydrake
+import pytest
 
 from vtbdrake.project import ProjectError, RobotFileError, read_robot, write_project
 
@@ -188,8 +194,11 @@ _MODELS = {
 
 # The tests that depend on the robot; the others test what is the same for all.
 OF_THE_ROBOT = "holds or stands or hovers or moves or shifts or believed or drives"
-# The time after which the tests of one project are ended, in s.
-_LONGEST_TESTS = 1800.0
+# The time after which a robot is given up, in s.
+_LONGEST = 1800.0
+# A server with all that has been imported, of which every robot gets a fork.
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(["vtbdrake.project", "vtbdrake.testing.checks", "vtbdrake.testing.lock_step", "pytest"])
 
 
 @dataclass(frozen=True)
@@ -234,8 +243,8 @@ class Outcome:
         built: Whether its testbed can be built.
         tests: Whether its tests pass.
         driven: Whether it drives its simulated machine.
-        failures: The tests that fail.
-        seconds: How long it took.
+        failures: The tests that fail, and what they raise.
+        seconds: Its processor time, with the processes that it starts, in s.
     """
 
     robot: str
@@ -280,35 +289,71 @@ def try_robot(robot: ForeignRobot, cache: Path, folder: Path, *, tests: str | No
         folder: Where its project is written.
         tests: Which of its tests run, as pytest's ``-k`` selects them; None for none.
     """
-    outcome, start = Outcome(str(robot)), time.monotonic()
+    receiver, sender = _FORKS.Pipe(duplex=False)
+    process = _FORKS.Process(target=_try_robot, args=(sender, robot, cache, folder, tests))
+    process.start()
+    sender.close()
+    failures = f"it takes longer than {_LONGEST:g} s"
+    try:
+        if receiver.poll(_LONGEST):
+            return Outcome(**receiver.recv())
+    except EOFError:
+        failures = "its process has died"
+    finally:
+        process.kill()
+        process.join()
+    return Outcome(str(robot), failures=failures)
+
+
+def _try_robot(sender: Connection, robot: ForeignRobot, cache: Path, folder: Path, tests: str | None) -> None:
+    outcome = Outcome(str(robot))
     try:
         model = read_robot(robot.file(cache))
         project = write_project(folder, robot.name, model)
     except (RobotFileError, ProjectError) as error:
         outcome.refused = str(error)
-        return outcome
-    outcome.written, outcome.joints = True, len(model.joints)
-    if tests is not None:
-        _run_tests(project, outcome, tests)
-    outcome.seconds = time.monotonic() - start
-    return outcome
+    else:
+        outcome.written, outcome.joints = True, len(model.joints)
+        if tests is not None:
+            _run_tests(project, outcome, tests)
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    outcome.seconds = round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2)
+    sender.send(asdict(outcome))
+
+
+class _Results:
+    """A plugin of pytest: how many tests passed, and the last line of what each other one raised."""
+
+    def __init__(self) -> None:
+        self.passed = 0
+        self.failures: dict[str, str] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Take note of a test."""
+        self.passed += report.passed and report.when == "call"
+        if report.failed:
+            self._note(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Take note of a module that cannot be imported."""
+        if report.failed:
+            self._note(report)
+
+    def _note(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        raised = [line[1:].strip() for line in report.longreprtext.splitlines() if line.startswith("E ")]
+        self.failures[report.nodeid.rpartition("::")[2]] = (raised or [report.longreprtext])[0]
 
 
 def _run_tests(project: Path, outcome: Outcome, selection: str) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=line", "-rfE", "-k", selection]
-    try:
-        done = subprocess.run(
-            command, cwd=project, env=environment, capture_output=True, text=True, timeout=_LONGEST_TESTS
-        )
-    except subprocess.TimeoutExpired:
-        outcome.failures = f"the tests take longer than {_LONGEST_TESTS:g} s"
-        return
-    outcome.tests = done.returncode == 0
-    outcome.built = "passed" in done.stdout
-    failures = re.findall(r"^(?:FAILED|ERROR) \S*?::(.*)$", done.stdout, re.M)
-    outcome.driven = "passed" in done.stdout and not any("machine" in failure for failure in failures)
-    outcome.failures = "; ".join(failures) or ("" if outcome.tests else done.stdout[-500:] + done.stderr[-500:])
+    results = _Results()
+    os.chdir(project)
+    sys.path[:0] = [str(project), str(ROOT)]
+    with redirect_stdout(StringIO()):
+        status = pytest.main(["-q", "-p", "no:cacheprovider", "--tb=short", "-k", selection], plugins=[results])
+    outcome.tests = status == pytest.ExitCode.OK
+    outcome.built = results.passed > 0
+    outcome.driven = outcome.built and not any("machine" in test for test in results.failures)
+    outcome.failures = "; ".join(f"{test}: {raised}" for test, raised in results.failures.items())
 
 
 def table(outcomes: Sequence[Outcome]) -> Iterator[str]:
@@ -328,10 +373,13 @@ def main() -> None:
     parser.add_argument("--only", metavar="TEXT", action="append", help="only robots with this text in their name")
     parser.add_argument("--quick", action="store_true", help="only the tests that depend on the robot, and the machine")
     parser.add_argument("--no-tests", action="store_true", help="write the projects only")
+    parser.add_argument("--shuffle", metavar="SEED", type=int, help="try them in this random order")
     parser.add_argument("--cache", type=Path, default=CACHE, help="where the packages are kept [%(default)s]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the outcomes there, and go on where it ends")
     arguments = parser.parse_args()
     robots = [robot for robot in ROBOTS if not arguments.only or any(text in str(robot) for text in arguments.only)]
+    if arguments.shuffle is not None:
+        random.Random(arguments.shuffle).shuffle(robots)
     fetch(arguments.cache, sorted({robot.source for robot in robots}))
     file: Path | None = arguments.json
     outcomes = [Outcome(**json.loads(line)) for line in file.read_text().splitlines()] if file and file.exists() else []

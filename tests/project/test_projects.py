@@ -138,6 +138,11 @@ def module_of_tests(projects: Projects, name: str, monkeypatch: pytest.MonkeyPat
     return runpy.run_path(str(project / "tests" / f"test_my_{name}.py"))
 
 
+def scenario_of(tests: dict[str, Any]) -> vtb.Scenario:
+    """Return the scenario of a project, from the module of its tests."""
+    return next(v for v in tests.values() if isinstance(v, type) and issubclass(v, vtb.Scenario))()
+
+
 @pytest.mark.slow_cases
 @pytest.mark.parametrize(
     "name",
@@ -150,9 +155,10 @@ def test_other_robots_hold_move_and_drive_a_machine(
     projects: Projects, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tests = module_of_tests(projects, name, monkeypatch)
+    scenario = scenario_of(tests)
+    testbed = scenario.build()
     for test in OF_STATIONS if name in STATIONS else OF_ROBOTS:
-        tests[test]()
-    scenario = next(v for v in tests.values() if isinstance(v, type) and issubclass(v, vtb.Scenario))()
+        tests[test](testbed)
     subject = Subject(tests.get("CHECKED", scenario))
     for check in CHECKS:
         if check.__name__ in OF_THE_ROBOT and (error := subject.outcome(check)):
@@ -173,12 +179,14 @@ def test_other_robots_hold_move_and_drive_a_machine(
 
 @pytest.mark.one_python
 def test_a_robot_with_legs_stands_on_them(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
-    module_of_tests(projects, "quadruped", monkeypatch)["test_robot_stands"]()
+    tests = module_of_tests(projects, "quadruped", monkeypatch)
+    tests["test_robot_stands"](scenario_of(tests).build())
 
 
 @pytest.mark.one_python
 def test_a_finger_moves_in_spite_of_its_damping(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
-    module_of_tests(projects, "finger", monkeypatch)["test_robot_moves_to_a_posture"]()
+    tests = module_of_tests(projects, "finger", monkeypatch)
+    tests["test_robot_moves_to_a_posture"](scenario_of(tests).build())
 
 
 @pytest.mark.one_python
@@ -193,7 +201,8 @@ def test_joints_that_fall_are_not_guarded(projects: Projects, monkeypatch: pytes
 
 @pytest.mark.one_python
 def test_a_drone_hovers(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
-    module_of_tests(projects, "x2", monkeypatch)["test_robot_takes_off_and_hovers"]()
+    tests = module_of_tests(projects, "x2", monkeypatch)
+    tests["test_robot_takes_off_and_hovers"](scenario_of(tests).build())
 
 
 @pytest.mark.slow

@@ -16,8 +16,9 @@ from vtbdrake.rollout.repeatability import Sample, Trace, trace, within
 from vtbdrake.rollout.runner import RolloutRunner
 from vtbdrake.rollout.task import RolloutTask
 from vtbdrake.state import Snapshot
-from vtbdrake.testbed import Scenario, Signal, VirtualTestbed
+from vtbdrake.testbed import DpsAlone, Scenario, Signal, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
+from vtbdrake.testbed.parts import WorldAlone
 from vtbdrake.testbed.scenario import check_is_scenario
 
 # Pytest shows none of the frames of this module: what a check has found is its message.
@@ -120,6 +121,16 @@ class Subject:
             # One of the two checks has failed, and says why.
             raise CheckSkippedError("it presupposes a testbed: check_builds or check_no_algebraic_loop fails")
         return self.built
+
+    @cached_property
+    def dps_alone(self) -> DpsAlone:
+        """Return the DPS without the simulated world, which checks share."""
+        return DpsAlone(self.scenario)
+
+    @cached_property
+    def world_alone(self) -> WorldAlone:
+        """Return the simulated world without the DPS, which checks share."""
+        return WorldAlone(self.scenario)
 
     def presuppose_simulation(self) -> None:
         """Raise a CheckSkippedError if the reference simulation fails."""

@@ -11,7 +11,7 @@ import numpy as np
 from vtbdrake.control.bridge import Reports
 from vtbdrake.control.limits import Bounds
 from vtbdrake.lcm.protocol import Protocol
-from vtbdrake.testbed import DpsAlone, Scenario, VirtualTestbed
+from vtbdrake.testbed import Scenario, VirtualTestbed
 from vtbdrake.testbed.addressed import AddressedDiagram
 from vtbdrake.testbed.signal import Feed
 from vtbdrake.testbed.switch import COMMAND
@@ -80,7 +80,7 @@ def check_dps_alone_commands_the_same(subject: Subject) -> None:
     """
     testbed = subject.testbed
     _refuse_continuous(testbed)
-    alone = DpsAlone(subject.scenario)
+    alone = subject.dps_alone
     inputs, outputs = _ports(testbed), _ports(alone)
     if inputs != outputs:
         raise CheckFailedError(f"the testbed has the ports {inputs} to the machine, but the DPS alone {outputs}")

@@ -12,7 +12,7 @@ from vtbdrake.control.fault import FaultKind
 from vtbdrake.control.switching import SwitchRefusedError
 from vtbdrake.deployment import Deployment
 from vtbdrake.machine.injected_faults import Corrupt, Delay, Drop, Freeze, InjectedFault
-from vtbdrake.testbed import DpsAlone, Scenario
+from vtbdrake.testbed import Scenario
 from vtbdrake.testbed.slow_part import slow_parts
 from vtbdrake.testing.checks.repetition_checks import check_simulates
 from vtbdrake.testing.lock_step import LockStep
@@ -21,7 +21,9 @@ from vtbdrake.testing.subject import CheckFailedError, CheckSkippedError, Subjec
 # Pytest shows none of the frames of this module: what a check has found is its message.
 __tracebackhide__ = True
 
-_BEFORE = 20  # cycles before a fault
+_FIRST = 20  # cycles in which a loop must command its machine without a fault
+_BEFORE = 5  # cycles before a fault
+_AFTER = 10  # cycles after it was noticed, in which the fallback must command
 _LONGEST = 2000  # cycles after it
 _ALLOWED = 3.0  # maximum ages within which a fault must be noticed
 _TAKE_OVER = 2.0  # s of the loop's time
@@ -51,10 +53,10 @@ def check_loop_commands_its_machine(subject: Subject) -> None:
     _refuse_unsafe(subject)
     subject.presuppose(check_deployment_is_safe)
     with _loop(subject) as loop:
-        loop.runtime.run(cycles=_BEFORE)
+        loop.runtime.run(cycles=_FIRST)
         if faults := loop.runtime.guards.latched:
             raise CheckFailedError(
-                f"within {_BEFORE} cycles the fallbacks command: {'; '.join(fault.reason for fault in faults)}"
+                f"within {_FIRST} cycles the fallbacks command: {'; '.join(fault.reason for fault in faults)}"
             )
 
 
@@ -140,10 +142,10 @@ def _refuse_unsafe(subject: Subject) -> None:
 
 @contextmanager
 def _loop(subject: Subject) -> Iterator[LockStep]:
-    """Yield a loop that has taken over its machine."""
-    target = DpsAlone(subject.scenario)
+    """Yield a loop that has taken over its machine, in new contexts of the subject's DPS and world."""
+    target = subject.dps_alone
     values = {address: value for address, value in subject.values.items() if address in target.variables()}
-    with LockStep(subject.scenario, target=target, values=values) as loop, _quiet():
+    with LockStep(subject.scenario, target=target, values=values, world=subject.world_alone) as loop, _quiet():
         try:
             loop.runtime.take_over(timeout=_TAKE_OVER)
         except SwitchRefusedError as error:
@@ -169,7 +171,7 @@ def _expect_fallback(loop: LockStep, event: str) -> None:
     loop.runtime.run(cycles=min(longest, _LONGEST), until=lambda: bool(guards.latched))
     if not guards.latched:
         raise CheckFailedError(f"{event}, and after {loop.clock.now():.3g} s the DPS still commands")
-    loop.runtime.run(cycles=_BEFORE)
+    loop.runtime.run(cycles=_AFTER)
     fallbacks = loop.deployment.guards.get("fallback", {})
     for signal in interface.act:
         links = chain(fallbacks.get(signal.name) or default_fallback(signal), signal, interface=interface)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vtbdrake.control.limits import Bounds
 from vtbdrake.state.variables import A
-from vtbdrake.testbed import DpsAlone, Signal, SignalError
+from vtbdrake.testbed import Signal, SignalError
 from vtbdrake.testing.subject import CheckFailedError, CheckSkippedError, Subject
 
 # Pytest shows none of the frames of this module: what a check has found is its message.
@@ -82,7 +82,7 @@ def check_parameters_have_bounds(subject: Subject) -> None:
     ``Quantity(5.0, "1/s", bounds=(0.0, 50.0))``.
     """
     subject.presuppose_testbed()  # The DPS of a scenario that does not build tells nothing new.
-    alone = DpsAlone(subject.scenario)
+    alone = subject.dps_alone
     context = alone.default_context()
     problems = []
     for address, variable in alone.variables().items():
