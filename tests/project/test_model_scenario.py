@@ -1,13 +1,16 @@
 """A model file is shown as it is: a command moves each of its joints, as its kinematics say."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from tests.cli.program import error_of
+from tests.project.foreign_robots import CACHE, EXAMPLE_ROBOT_DATA, ROBOTS, fetch
 from vtbdrake.project import SMALL_ARM, ModelFileScenario
 from vtbdrake.testbed import VirtualTestbed
+from vtbdrake.web.live.watching import describe, opening_addresses
 from vtbdrake_diagrams.station import FILE
 
 pytestmark = pytest.mark.one_python
@@ -38,6 +41,33 @@ def test_sliders_have_the_ranges_of_the_joints() -> None:
     commands = {signal.name: signal for signal in ModelFileScenario.of(str(MODELS / "scara.urdf")).interface().commands}
     lift = commands["lift"]
     assert (lift.lower, lift.upper, lift.unit) == (0.02, 0.2, "m")
+
+
+def opening_of(scenario: ModelFileScenario) -> list[str]:
+    """Return what the page of a scenario watches at once."""
+    return opening_addresses({address: describe(v) for address, v in scenario.build().variables().items()})
+
+
+def test_page_opens_with_a_slider_for_every_joint() -> None:
+    """The arm of the station has 7 joints, its gripper 2."""
+    fingers = ["u.left_finger_sliding_joint", "u.right_finger_sliding_joint"]
+    assert opening_of(ModelFileScenario.of(f"{FILE}#Torque")) == [*(f"u.iiwa_joint_{k}" for k in range(1, 8)), *fingers]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["tiago_description/robots/tiago.urdf", "romeo_small.urdf", "ur_description/urdf/ur5_gripper.urdf"]
+)
+def test_page_of_a_foreign_robot_opens_with_its_joints(name: str) -> None:
+    """Those that move, as the text of its file has them."""
+    try:
+        fetch(CACHE, [EXAMPLE_ROBOT_DATA])
+    except ConnectionError as error:
+        pytest.skip(str(error))
+    file = next(robot.file(CACHE) for robot in ROBOTS if robot.path.endswith(name))
+    joints = [joint for joint in ElementTree.parse(file).iterfind("joint") if joint.get("type") != "fixed"]
+    assert len(joints) >= 6
+    assert sorted(opening_of(ModelFileScenario.of(str(file)))) == sorted(f"u.{joint.get('name')}" for joint in joints)
 
 
 @pytest.mark.parametrize("kind", ["mujoco", "directives", "station"])

@@ -174,10 +174,21 @@ def test_bodies_that_touch_at_home_are_listed() -> None:
     assert set(robot.touching) == {f"finger{k}_{link}" for k in (1, 2, 3) for link in ("link2", "tip_link")}
 
 
+def test_home_is_a_posture_that_the_drives_carry(tmp_path: Path) -> None:
+    """A weight of 9.81 N, 1 m from the axis, above a drive of 5 N m: the arm has to hang."""
+    heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')
+    path = urdf(tmp_path, link=heavy, joint=LIMIT.replace('"1"', '"2"', 1), further=DRIVE)
+    robot = read_robot(path)
+    (joint,) = robot.joints
+    assert 0.5 * joint.effort < 9.81 * np.cos(joint.home) < joint.effort
+    assert any("drives of hinge cannot carry the robot in the file's posture: its home is" in n for n in robot.notes)
+
+
 def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
     heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')
     robot = read_robot(urdf(tmp_path, link=heavy, further=DRIVE))
-    assert any("cannot carry the robot at home: its limit is 5, the weight 9.81" in note for note in robot.notes)
+    assert robot.joints[0].home == 0.0
+    assert any("nor in one near it: they sink" in note for note in robot.notes)
 
 
 def test_files_of_a_package_come_along(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from scipy.optimize import least_squares
 
 from vtbdrake.common.failures import one_line
 from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
@@ -42,16 +43,29 @@ _ASSUMED_SPEED = {REVOLUTE: 3.0, PRISMATIC: 0.5}
 _WEIGHTS = 2.0
 # Beside the weight, an assumed drive accelerates to its speed within this time, in s.
 _TIME_TO_SPEED = 0.02
+# The share of the effort of a drive that the weight takes at home, where the file's posture takes more than all of it.
+_CARRIED = 0.8
+# On the way to the other posture of examples, the weight takes at most this share, or as much as at home.
+_HEAVIEST = 0.9
+# A joint that is this close to its home in the file stays there, in rad or m.
+_UNMOVED = 0.005
 # The share of the effort of a drive that the damping of its joint takes at most, at the speed of the reference.
 _DAMPED = 0.5
 # The other posture of examples lies at most this far from home, and this share of the way to the farther end.
 _STEP = {REVOLUTE: 0.4, PRISMATIC: 0.1}
 _SHARE = 0.15
 
-# The other posture is moved closer to home, or to its other side, until nothing touches on the way.
-_SHARES_OF_THE_WAY = (1.0, -1.0, 0.5, -0.5, 0.2, -0.2)
+# The other posture is moved closer to home, and to its other sides, until nothing touches on the way and the drives
+# carry it.
+_SHARES_OF_THE_WAY = (1.0, 0.5, 0.2)
+# The sides of the joints that are tried at random, beside all and none.
+_RANDOM_SIDES = 4
 # The postures that are looked at on the way.
 _POSTURES = 12
+# Bodies also touch at home if they do where joints are moved by up to this much, in rad or m, at random: gains are soft.
+_AROUND_HOME = 0.02
+# The postures around home that are looked at.
+_NEIGHBOURS = 8
 
 # The file and the line with which a message of Drake's parser begins.
 _PLACE = re.compile(r"([^\s:]*:\d+): ")
@@ -229,6 +243,10 @@ class _ModelReader:
         plant, scene_graph, diagram = self._as_in_project(robot, [joint.name() for joint in joints])
         self._read_limits(plant, joints, robot)
         self._find_legs(robot)
+        if robot.standing is None:
+            self._let_drives_carry(plant, robot)
+        by_name = {joint.name: joint for joint in robot.joints}
+        robot.away = tuple(_away(by_name[name]) for name in robot.driven)
         if robot.has_constraints and plant.num_constraints() > len(robot.couplings):
             robot.motions = self._motions(robot)
         robot.touching = self._touching(plant, scene_graph, diagram, robot)
@@ -528,13 +546,6 @@ class _ModelReader:
         plant.SetPositions(context, [homes[name] for name in names])
         self._check_inertia(plant, context, joints)
         efforts = self._efforts(plant, context, joints, robot, ranges=ranges, assumed=assumed)
-        at_home = self._weights(plant, context, {name: (homes[name], homes[name]) for name in names}, names)[0]
-        for name in robot.driven:
-            if at_home[names.index(name)] > efforts[name]:
-                self._notes.append(
-                    f"{self._place(name)}: the drive of {name} cannot carry the robot at home: its limit is "
-                    f"{efforts[name]:g}, the weight {at_home[names.index(name)]:.3g} (N m or N)"
-                )
         result, damped = [], []
         for joint in joints:
             name, speed = joint.name(), _speed(joint)
@@ -554,9 +565,40 @@ class _ModelReader:
                 f"drives; the speeds (rad/s or m/s) are therefore {_listed(damped)}"
             )
         robot.joints = tuple(result)
-        by_name = {joint.name: joint for joint in result}
-        robot.away = tuple(_away(by_name[name]) for name in robot.driven)
         robot.assumptions += self._assumptions(result)
+
+    def _let_drives_carry(self, plant: MultibodyPlant, robot: ProjectRobot) -> None:
+        """Move the home of a robot whose drives cannot hold it there to the nearest posture in which they can."""
+        homes = np.array([joint.home for joint in robot.joints])
+        B, context = _selection(robot), plant.CreateDefaultContext()
+        weak = np.flatnonzero(_loads(plant, context, robot, homes) > 1.0)
+        if not weak.size:
+            return
+        moved = np.array([k for k, joint in enumerate(robot.joints) if joint.name in robot.driven])
+        lower, upper = np.transpose([(robot.joints[k].lower, robot.joints[k].upper) for k in moved])
+        follow = B @ np.eye(len(robot.driven))[[robot.driven.index(robot.joints[k].name) for k in moved]].T
+
+        def errors(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            excess = np.maximum(_loads(plant, context, robot, homes + follow @ (x - homes[moved])) - _CARRIED, 0.0)
+            return np.concatenate([10.0 * excess, 0.1 * (x - homes[moved]) / (upper - lower)])
+
+        start = np.clip(homes[moved], lower + 1e-6 * (upper - lower), upper - 1e-6 * (upper - lower))
+        solution = least_squares(errors, start, bounds=(lower, upper), diff_step=1e-3, max_nfev=100)
+        q = homes + follow @ (solution.x - homes[moved])
+        name = robot.driven[weak[0]]
+        cannot = (
+            f"{self._place(name)}: the drives of {_listed(robot.driven[k] for k in weak)} cannot carry the robot in "
+            "the file's posture"
+        )
+        if _loads(plant, context, robot, q).max() > 1.0:
+            self._notes.append(f"{cannot}, nor in one near it: they sink. Give them higher limits in the file")
+            return
+        q = np.where(np.abs(q - homes) < _UNMOVED, homes, np.round(q, 4))
+        robot.joints = tuple(
+            replace(joint, home=float(np.clip(value, joint.lower, joint.upper)))
+            for joint, value in zip(robot.joints, q, strict=True)
+        )
+        self._notes.append(f"{cannot}: its home is the nearest one in which they can")
 
     def _range(self, joint: Joint, assumed: dict[str, list[str]]) -> tuple[float, float]:
         """Return the range of a joint; what the file does not state is noted as assumed."""
@@ -673,10 +715,12 @@ class _ModelReader:
     def _touching(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, diagram: Diagram, robot: ProjectRobot
     ) -> tuple[str, ...]:
-        """Return the bodies that touch each other at home, and change ``robot.away`` until no met do on the way."""
+        """Return the bodies that touch each other at home, and change ``robot.away`` until no others do on the way."""
         contacts = _Contacts(plant, scene_graph, diagram)
         home = np.array([joint.home for joint in robot.joints])
-        touching = contacts.touching(home)
+        random = np.random.default_rng(0)
+        moves = random.uniform(-_AROUND_HOME, _AROUND_HOME, (_NEIGHBOURS, len(robot.driven))) @ _selection(robot).T
+        touching = set().union(*(contacts.touching(q) for q in (home, *(home + moves))))
         if touching:
             self._notes.append(
                 f"{self._shown}: {_listed(sorted(touching))} touch each other at home: their contact is left out "
@@ -688,13 +732,14 @@ class _ModelReader:
         start = home[[names.index(driven) for driven in robot.driven]]
         away = np.array(robot.away)
         met: set[str] = set()
-        for share in _SHARES_OF_THE_WAY:
-            step = share * (away - start)
+        context = plant.CreateDefaultContext()
+        carried = max(_HEAVIEST, _loads(plant, context, robot, home).max())
+        for step in _steps(robot, start, away - start):
             seconds = np.linspace(0.0, (np.abs(step) / speed).max(), _POSTURES)[1:]
             postures = [home + B @ np.clip(step, -t * speed, t * speed) for t in seconds]
             met = set().union(*(contacts.touching(q, among=touching) for q in postures))
             robot.away = tuple(float(f"{value:.4g}") for value in start + step)
-            if not met:
+            if not met and max(_loads(plant, context, robot, q).max() for q in postures) <= carried:
                 break
         if met:
             self._notes.append(
@@ -817,6 +862,31 @@ def _selection(robot: ProjectRobot) -> NDArray[np.float64]:
     for coupling in robot.couplings:
         B[names.index(coupling.joint), robot.driven.index(coupling.leader)] = coupling.multiplier
     return B
+
+
+def _steps(
+    robot: ProjectRobot, start: NDArray[np.float64], step: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """Yield ways of the driven joints from home, shorter ones and to other sides, within their ranges."""
+    joints = {joint.name: joint for joint in robot.joints}
+    lower, upper = np.transpose([(joints[name].lower, joints[name].upper) for name in robot.driven])
+    random = np.random.default_rng(0)
+    sides = [np.ones(len(step)), -np.ones(len(step)), *random.choice([-1.0, 1.0], (_RANDOM_SIDES, len(step)))]
+    for share in _SHARES_OF_THE_WAY:
+        for side in sides:
+            end = start + share * side * step
+            yield np.where((lower <= end) & (end <= upper), share * side, share) * step
+
+
+def _loads(
+    plant: MultibodyPlant, context: Context, robot: ProjectRobot, positions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the shares of the limits of the drives that the weight takes in a posture, shape (driven,)."""
+    plant.SetPositions(context, positions)
+    names = [joint.name for joint in robot.joints]
+    limit = np.array([robot.joints[names.index(driven)].effort for driven in robot.driven])
+    loads: NDArray[np.float64] = np.abs(_selection(robot).T @ plant.CalcGravityGeneralizedForces(context)) / limit
+    return loads
 
 
 def _listed(names: object) -> str:

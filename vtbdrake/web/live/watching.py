@@ -12,7 +12,7 @@ from vtbdrake.common.json_data import plain
 from vtbdrake.state.variables import X
 from vtbdrake.testbed.switch import COMMAND
 
-# What a page opens with, at most.
+# What a page opens with, at most; of a model file, whose joints are commands, it shows all.
 _OPENING_COMMANDS = 4
 _OPENING_JOINTS = 8
 
@@ -111,6 +111,9 @@ def describe(variable: Variable) -> dict[str, Any]:
 def opening_addresses(variables: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the addresses that a page watches first: commands u, then joints, or else poses of floating bodies.
 
+    Where nothing but commands moves the world, as in a model file that is shown without dynamics, these are all
+    commands.
+
     Args:
         variables: Descriptions by address, see `describe`.
     """
@@ -118,6 +121,8 @@ def opening_addresses(variables: Mapping[str, Mapping[str, Any]]) -> list[str]:
     commands = [address for address in moving if address.startswith(COMMAND)]
     joints = [a for a in moving if a.startswith("sim.sys.") and a.endswith(".position") and not variables[a]["shape"]]
     poses = [a for a in moving if a.startswith("sim.sys.") and a.endswith(".pose")]
+    if not (joints or poses):
+        return commands
     return [*commands[:_OPENING_COMMANDS], *(joints or poses)[:_OPENING_JOINTS]]
 
 
