@@ -185,9 +185,10 @@ def test_home_is_a_posture_that_the_drives_carry(tmp_path: Path) -> None:
 
 
 def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
+    """The range begins at home, so that the other posture is on one side."""
     heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')
-    robot = read_robot(urdf(tmp_path, link=heavy, further=DRIVE))
-    assert robot.joints[0].home == 0.0
+    robot = read_robot(urdf(tmp_path, link=heavy, joint=LIMIT.replace('"-1"', '"0"'), further=DRIVE))
+    assert robot.joints[0].home == 0.0 < robot.away[0]
     assert any("nor in one near it: they sink" in note for note in robot.notes)
 
 

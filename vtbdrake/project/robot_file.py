@@ -864,9 +864,7 @@ def _selection(robot: ProjectRobot) -> NDArray[np.float64]:
     return B
 
 
-def _steps(
-    robot: ProjectRobot, start: NDArray[np.float64], step: NDArray[np.float64]
-) -> Iterator[NDArray[np.float64]]:
+def _steps(robot: ProjectRobot, start: NDArray[np.float64], step: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
     """Yield ways of the driven joints from home, shorter ones and to other sides, within their ranges."""
     joints = {joint.name: joint for joint in robot.joints}
     lower, upper = np.transpose([(joints[name].lower, joints[name].upper) for name in robot.driven])
