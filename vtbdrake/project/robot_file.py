@@ -62,7 +62,7 @@ _SHARES_OF_THE_WAY = (1.0, 0.5, 0.2)
 _RANDOM_SIDES = 4
 # The postures that are looked at on the way.
 _POSTURES = 12
-# Bodies also touch at home if they do where joints are moved by up to this much, in rad or m, at random: gains are soft.
+# Bodies also touch at home if they do where joints are moved at random by up to this much, in rad or m: gains are soft.
 _AROUND_HOME = 0.02
 # The postures around home that are looked at.
 _NEIGHBOURS = 8
