@@ -184,6 +184,23 @@ def test_home_is_a_posture_that_the_drives_carry(tmp_path: Path) -> None:
     assert any("drives of hinge cannot carry the robot in the file's posture: its home is" in n for n in robot.notes)
 
 
+@pytest.mark.parametrize(("joints", "held"), [("XZ", ("x", "z")), ("X", ())])
+def test_planar_base_that_falls_is_held(tmp_path: Path, joints: str, held: tuple[str, ...]) -> None:
+    """A base that slides on a level rail does not fall."""
+    axes = {"X": '<joint name="x" type="slide" axis="1 0 0"/>', "Z": '<joint name="z" type="slide" axis="0 0 1"/>'}
+    path = tmp_path / "walker.xml"
+    path.write_text(
+        f'<mujoco model="r"><worldbody><body name="trunk">{"".join(axes[joint] for joint in joints)}'
+        '<geom type="sphere" size="0.1"/><body name="leg"><joint name="hip" axis="0 1 0" range="-1 1"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02"/></body></body></worldbody>'
+        '<actuator><motor joint="hip" ctrlrange="-9 9"/></actuator></mujoco>'
+    )
+    robot = read_robot(path)
+    assert robot.held == held
+    assert robot.driven == ("hip",)
+    assert any("which would fall" in note for note in robot.notes) == bool(held)
+
+
 def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
     """The range begins at home, so that the other posture is on one side."""
     heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')

@@ -47,6 +47,8 @@ _TIME_TO_SPEED = 0.02
 _CARRIED = 0.8
 # On the way to the other posture of examples, the weight takes at most this share, or as much as at home.
 _HEAVIEST = 0.9
+# A weight in N that a joint of the base does not carry, so that the base falls.
+_FALLS = 1e-3
 # A joint that is this close to its home in the file stays there, in rad or m.
 _UNMOVED = 0.005
 # The share of the effort of a drive that the damping of its joint takes at most, at the speed of the reference.
@@ -127,6 +129,7 @@ class ProjectRobot:
         away: Another posture of the driven joints, for examples.
         packages: The packages to which the model refers, by name: their folders in ``models``.
         welded: The bodies that are free in the file, and where they are welded to the world.
+        held: The joints of a base that would fall, which are held where they are.
         adds_drives: Whether the file has no actuators, so that they are added.
         servos: The names of actuators of the file with position or velocity controllers, which are left out.
         without_drive: The names of actuators of the file that are left out, with their joints' drives.
@@ -149,6 +152,7 @@ class ProjectRobot:
     away: tuple[float, ...] = ()
     packages: dict[str, Path] = field(default_factory=dict)
     welded: dict[str, RigidTransform] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
     adds_drives: bool = False
     servos: tuple[str, ...] = ()
     without_drive: tuple[str, ...] = ()
@@ -237,6 +241,8 @@ class _ModelReader:
             robot.notes = [*self._notes, *self._parser_notes.sentences()]
             return robot
         joints = self._joints(plant)
+        robot.held = self._falling_base(plant, joints)
+        joints = [joint for joint in joints if joint.name() not in robot.held]
         robot.welded = self._free_bodies(plant)
         robot.couplings = self._couplings(joints)
         self._choose_drives(plant, joints, robot)
@@ -426,6 +432,32 @@ class _ModelReader:
             standing, lambda stance: WholeBodyModel(make_plant, stance, motions=motions, limit=limit), names
         )
 
+    def _falling_base(self, plant: MultibodyPlant, joints: list[Joint]) -> tuple[str, ...]:
+        """Return the joints between the world and the first drive, if none of them carries the robot's weight.
+
+        Such a base moves in a plane, as simulated walkers' do; it is held, as free bases without a stance are welded.
+        """
+        drives = {plant.get_joint_actuator(index).joint().name() for index in plant.GetJointActuatorIndices()}
+        context = plant.CreateDefaultContext()
+        weights = plant.CalcGravityGeneralizedForces(context)
+        by_parent: dict[int, list[Joint]] = {}
+        for index in plant.GetJointIndices():
+            by_parent.setdefault(int(plant.get_joint(index).parent_body().index()), []).append(plant.get_joint(index))
+        base, body = [], int(plant.world_body().index())
+        names = {joint.name() for joint in joints}
+        while len(further := by_parent.get(body, [])) == 1 and further[0].name() in names - drives:
+            base.append(further[0])
+            body = int(further[0].child_body().index())
+        falls = any(j.type_name() == PRISMATIC and abs(weights[int(j.velocity_start())]) > _FALLS for j in base)
+        if not (drives and falls):
+            return ()
+        held = tuple(joint.name() for joint in base)
+        self._notes.append(
+            f"{self._place(held[0])}: no actuator carries {_listed(held)} of the base, which would fall: they are held "
+            "at home (hold_joint in robot.py)"
+        )
+        return held
+
     def _couplings(self, joints: list[Joint]) -> tuple[Coupling, ...]:
         names = {joint.name() for joint in joints}
         return tuple(c for c in _mimics(self._copy.xml) if c.joint in names and c.leader in names)
@@ -485,6 +517,8 @@ class _ModelReader:
         """Make the changes that ``robot`` lists, but for the drives that are added."""
         for name, X_WB in robot.welded.items():
             plant.WeldFrames(plant.world_frame(), plant.GetBodyByName(name).body_frame(), X_WB)
+        for name in robot.held:
+            hold_joint(plant, name)
         for name in robot.without_drive:
             plant.RemoveJointActuator(plant.GetJointActuatorByName(name))
         for name in robot.servos:
@@ -817,6 +851,19 @@ def replace_servo(plant: MultibodyPlant, name: str) -> None:
     drive = plant.AddJointActuator(name, joint, limit)
     drive.set_default_rotor_inertia(rotor)
     drive.set_default_gear_ratio(gear)
+
+
+def hold_joint(plant: MultibodyPlant, name: str) -> None:
+    """Replace a joint by a weld, in which its two frames coincide: the joint's zero position.
+
+    Args:
+        plant: The plant, before it is finalized; it is changed.
+        name: Name of the joint, which only one model instance has.
+    """
+    joint = plant.GetJointByName(name)
+    on_parent, on_child = joint.frame_on_parent(), joint.frame_on_child()
+    plant.RemoveJoint(joint)
+    plant.WeldFrames(on_parent, on_child)
 
 
 class _Grouped:

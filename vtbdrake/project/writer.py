@@ -326,7 +326,8 @@ def _robot_imports(robot: ProjectRobot) -> str:
     if robot.standing is not None and not moved:
         lines = ["from pydrake.math import RigidTransform"]
     lines += ["from pydrake.multibody.plant import MultibodyPlant"]
-    lines += [f"from vtbdrake.project import {'add_model, replace_servo' if robot.servos else 'add_model'}"]
+    names = ["add_model", *(["hold_joint"] if robot.held else []), *(["replace_servo"] if robot.servos else [])]
+    lines += [f"from vtbdrake.project import {', '.join(names)}"]
     return "".join(f"{line}\n" for line in lines)
 
 
@@ -344,6 +345,11 @@ def _add_robot(robot: ProjectRobot) -> list[str]:
         lines += [f"X_WB = {_pose(X_WB)}"] if pose else []
         frame = f"plant.GetBodyByName({json.dumps(name)}).body_frame()"
         lines.append(f"plant.WeldFrames(plant.world_frame(), {frame}{pose})")
+    if robot.held:
+        lines += [
+            f"for name in [{', '.join(json.dumps(name) for name in robot.held)}]:",
+            "    hold_joint(plant, name)  # The base would fall: nothing drives it.",
+        ]
     if robot.standing is not None:
         lines += [
             "base = plant.GetBodyByName(BASE)",
