@@ -56,8 +56,9 @@ class StationCommand:
 def _with_joints(command: Signal, drivers: Iterable[StationDriver]) -> Signal:
     """Return a command of a station, whose entries have the names of the joints of the arm that it begins with."""
     for arm in drivers:
-        is_of_arm = isinstance(arm, Arm) and command.name.startswith(f"{arm.name}_")
-        if is_of_arm and not command.entry_names and command.size == len(arm.joints):
+        if not isinstance(arm, Arm) or not command.name.startswith(f"{arm.name}_"):
+            continue
+        if not command.entry_names and command.size == len(arm.joints):
             return replace(command, entry_names=arm.joints)
     return command
 
