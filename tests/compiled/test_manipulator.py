@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from vtbdrake.compiled import CompiledRollouts
-from vtbdrake.compiled.agreement import TOLERANCE, compare
+from vtbdrake.compiled.agreement import compare
+from vtbdrake.compiled.equations import Equations
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
@@ -46,7 +47,7 @@ def compiled(testbed: VirtualTestbed, values: dict, parameters: tuple[str, ...] 
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_is_that_of_the_diagram(law: str) -> None:
     rollouts, apart = compiled(built(law), {"u.motion": float(Motion.HOME), PUSH: [0.1, 0.2, 0.3, 10.0, -5.0, 3.0]})
-    assert apart <= TOLERANCE
+    assert apart <= Equations.agreement
     state = rollouts().outputs["plant.state"]
     assert np.max(np.abs(state[0, -1] - state[0, 0])) > 1e-4
 
@@ -55,7 +56,7 @@ def test_errors_of_all_sensors_and_a_delay_are_those_of_the_diagram() -> None:
     names = ("position_errors", "velocity_errors", "torque_errors", "wrench_errors")
     scenario = replace(ManipulatorScenario(compile=False), **dict.fromkeys(names, ERRORS))
     _, apart = compiled(scenario.build(), {DELAY: 3.0, MASS: 2.0}, (MASS,))
-    assert apart <= TOLERANCE
+    assert apart <= Equations.agreement
 
 
 def test_varies_the_mass_of_the_tool() -> None:

@@ -22,7 +22,7 @@ from pydrake.systems.primitives import (
 )
 
 from vtbdrake.compiled import EQUATIONS, At, CompiledRollouts, Equations, UnsupportedTestbedError
-from vtbdrake.compiled.agreement import TOLERANCE, compare
+from vtbdrake.compiled.agreement import compare
 from vtbdrake.state.systems import collect
 
 BOX = SpatialInertia.SolidBoxWithMass(1.5, 0.2, 0.3, 0.4)
@@ -72,7 +72,7 @@ def test_ports_of_model_instances(sampled: bool) -> None:
     builder.Connect(hold.get_output_port(), plant.get_actuation_input_port(left))
     builder.Connect(sine.get_output_port(0), plant.get_actuation_input_port(right))
     rollouts = rollouts_of(builder.Build(), ("plant.right_state", "hold.y"), left_slider=0.1, right_slider=-0.2)
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     moved = rollouts().outputs
     assert np.ptp(moved["plant.right_state"]) > 0.1
     assert np.ptp(moved["hold.y"]) > 0.1
@@ -86,7 +86,7 @@ def test_an_actuator_without_input_rests_and_generalized_forces_act() -> None:
     source = builder.AddNamedSystem("force", ConstantVectorSource([1.0, -2.0]))
     builder.Connect(source.get_output_port(), plant.get_applied_generalized_force_input_port())
     rollouts = rollouts_of(builder.Build(), ("plant.state",))
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     end = rollouts().outputs["plant.state"][0, -1]
     np.testing.assert_allclose(end[2:], 0.3 * np.array([1.0, -2.0]) / 1.5, rtol=1e-12)
 
@@ -102,7 +102,7 @@ def test_actuation_ports_add_up() -> None:
     left = plant.GetModelInstanceByName("left")
     builder.Connect(part.get_output_port(), plant.get_actuation_input_port(left))
     rollouts = rollouts_of(builder.Build(), ("plant.state", "whole.y0"))
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     end = rollouts().outputs
     np.testing.assert_allclose(end["plant.state"][0, -1, 2:], 0.3 * np.array([4.0, -2.0]) / 1.5, rtol=1e-12)
     np.testing.assert_array_equal(end["whole.y0"][0, -1], [1.0, -2.0])
@@ -121,7 +121,7 @@ def test_a_floating_base_tumbles() -> None:
     torque = builder.AddNamedSystem("torque", Sine(1.0, 5.0, 0.0, 1))
     builder.Connect(torque.get_output_port(0), plant.get_actuation_input_port())
     rollouts = rollouts_of(builder.Build(), ("plant.state",))
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     assert np.ptp(rollouts().outputs["plant.state"][0], axis=0)[7] > 1e-3
 
 
@@ -216,7 +216,7 @@ def test_reaction_of_a_joint_whose_parent_hangs_on_its_child(hanging: str) -> No
     )
     builder, plant = weighed(plant, "hung")
     rollouts = rollouts_of(builder.Build(), ("weigh.force",))
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     # The child is the carrier, which the box pulls down.
     np.testing.assert_allclose(rollouts().outputs["weigh.force"][0], -1.5 * 9.81, rtol=1e-12)
 
@@ -286,7 +286,7 @@ def test_two_copies_of_a_robot(names: tuple[str, str]) -> None:
     builder.Connect(torque.get_output_port(), plant.get_actuation_input_port())
     masses = tuple(f"plant.{name}.link.mass" for name in names)
     rollouts = rollouts_of(builder.Build(), ("plant.state",), masses)
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     turned = [rollouts({masses[0]: m, masses[1]: 1.5}).outputs["plant.state"][0, -1] for m in (1.5, 3.0)]
     np.testing.assert_allclose(turned[0] / turned[1], [2.0, 1.0, 2.0, 1.0])
 
@@ -319,7 +319,7 @@ def test_a_constant_force_acts_on_a_body() -> None:
     source = builder.AddNamedSystem("push", ConstantValueSource(value))
     builder.Connect(source.get_output_port(), plant.get_applied_spatial_force_input_port())
     rollouts = rollouts_of(builder.Build(), ("plant.state",))
-    assert compare(rollouts, rollouts.walker.context) <= TOLERANCE
+    assert compare(rollouts, rollouts.walker.context) <= Equations.agreement
     np.testing.assert_allclose(rollouts().outputs["plant.state"][0, -1, 2:], [0.3 * 3.0 / 1.5, 0.0], rtol=1e-12)
 
 

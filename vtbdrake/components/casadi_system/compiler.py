@@ -29,6 +29,7 @@ LONGEST_COMPILATION = 600.0
 """s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
 _ONE_AT_A_TIME = threading.Lock()
 _DIGEST_SIZE = hashlib.sha256().digest_size
+_KERNELS: dict[str, Path] = {}  # Functions that are written in C -> their libraries.
 
 
 class CompilerError(RuntimeError):
@@ -54,30 +55,69 @@ def compiled(function: casadi.Function) -> casadi.Function:
         raise ValueError(
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
-    command = _command_with_flags()
-    recipe = "\n".join((source, *command, platform.system(), platform.machine(), "with its digest"))
-    library = cache_folder() / f"{function.name()}-{hashlib.sha256(recipe.encode()).hexdigest()}.so"
+    return _library_function(function.name(), source, _kernels_in(source))
+
+
+def compiled_kernel(name: str, source: str) -> casadi.Function:
+    """Return a function that is written in C, such as a solver; it has no derivatives.
+
+    Functions in which it is called can be compiled.
+
+    Args:
+        name: Its name, which only this source has.
+        source: The C code, a whole translation unit, of the function and of what `casadi.external` asks for.
+
+    Raises:
+        CompilerError: The compiler (`compiler_command`) is missing or fails.
+    """
+    function = _library_function(name, source, ())
+    _KERNELS[name] = _library(name, source)
+    return function
+
+
+def _kernels_in(source: str) -> tuple[Path, ...]:
+    """Return the libraries of the kernels that a function calls."""
+    called = set(re.findall(r"^int (\w+)\(", source, re.MULTILINE))
+    return tuple(library for name, library in _KERNELS.items() if name in called)
+
+
+def _library(name: str, source: str, kernels: Sequence[Path] = ()) -> Path:
+    recipe = (
+        source,
+        *_command_with_flags(),
+        platform.system(),
+        platform.machine(),
+        "with its digest",
+        *map(str, kernels),
+    )
+    return cache_folder() / f"{name}-{hashlib.sha256(chr(10).join(recipe).encode()).hexdigest()}.so"
+
+
+def _library_function(name: str, source: str, kernels: Sequence[Path]) -> casadi.Function:
+    library = _library(name, source, kernels)
     with _ONE_AT_A_TIME:
         try:
             if not _is_whole(library):
                 if library.exists():
                     _log.warning("%s is damaged, and compiled again", library)
-                compile_library(source, library)
+                compile_library(source, library, kernels)
         except OSError as error:
             raise CompilerError(
                 f"compiled libraries cannot be kept in {library.parent} ({error}): name another folder in the "
                 "environment variable XDG_CACHE_HOME"
             ) from error
         try:
-            return casadi.external(function.name(), str(library))
+            return casadi.external(name, str(library))
         except RuntimeError as error:
             _log.warning("%s cannot be loaded, and is compiled again: %s", library, str(error).splitlines()[-1])
             library.unlink(missing_ok=True)
-            compile_library(source, library)
+            compile_library(source, library, kernels)
     try:
-        return casadi.external(function.name(), str(library))
+        return casadi.external(name, str(library))
     except RuntimeError as error:
-        raise CompilerError(f"what {command[0]} makes cannot be loaded: {str(error).splitlines()[-1]}") from None
+        raise CompilerError(
+            f"what {compiler_command()[0]} makes cannot be loaded: {str(error).splitlines()[-1]}"
+        ) from None
 
 
 def compiled_if_possible(function: casadi.Function) -> casadi.Function:
@@ -135,12 +175,13 @@ def _command_with_flags() -> tuple[str, ...]:
     return (*compiler_command(), "-O2", *flags, "-fPIC", "-shared", "-ffp-contract=off")
 
 
-def compile_library(source: str, library: Path) -> None:
+def compile_library(source: str, library: Path, kernels: Sequence[Path] = ()) -> None:
     """Compile C code to a shared library, which is written whole or not at all, and ends with its digest.
 
     Args:
         source: The C code, a whole translation unit.
         library: The file of the library; its folder is made if there is none, for this user alone.
+        kernels: Libraries that it calls.
 
     Raises:
         CompilerError: The compiler is missing or fails, or does not end.
@@ -156,7 +197,7 @@ def compile_library(source: str, library: Path) -> None:
     with tempfile.TemporaryDirectory() as folder, whole_file(library) as partial:
         c_file = Path(folder) / "function.c"
         c_file.write_text(source, encoding="utf-8")
-        returncode, complaint = _run([*command, str(c_file), "-o", str(partial), "-lm"], folder)
+        returncode, complaint = _run([*command, str(c_file), *map(str, kernels), "-o", str(partial), "-lm"], folder)
         if returncode:
             raise CompilerError(f"{shlex.join(command)} failed ({returncode}): {complaint.strip()}")
         contents = partial.read_bytes()

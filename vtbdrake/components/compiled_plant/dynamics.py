@@ -252,6 +252,24 @@ class PlantDynamics:
                 forces[link.parent] += move.X.T @ forces[k]
         return tau
 
+    def momentum_balance(
+        self, q: Expression, v: Expression, tau: Expression, period: float
+    ) -> tuple[Expression, Expression]:
+        """Return A and p* of a step without contact, A v_next = p*: A = M(q) + period D, p* = M v + period (tau - C v + g).
+
+        Args:
+            q: Positions, shape (nq, 1).
+            v: Velocities, shape (nv, 1).
+            tau: Generalized forces, shape (nv, 1), in N m or N.
+            period: Time step in s.
+        """
+        vdot = casadi.SX.sym("vdot", self.nv)
+        torque = self.inverse_dynamics(q, v, vdot)
+        M = casadi.jacobian(torque, vdot)
+        (bias,) = casadi.substitute([torque], [vdot], [casadi.SX.zeros(self.nv, 1)])
+        damping = casadi.diag(casadi.jacobian(self.damping_torque(vdot), vdot))
+        return M + period * casadi.diag(damping), M @ v + period * (tau - bias)
+
     def damping_torque(self, v: Expression) -> Expression:
         """Return D v, the torques by which the joints' damping resists."""
         torque = casadi.SX(self.nv, 1)
@@ -399,8 +417,31 @@ class PlantDynamics:
             body: A body of the plant.
             q: Positions, shape (nq, 1).
         """
-        k, X_MB = self._mounts[int(body.index())]
+        return self.body_pose(int(body.index()), q)
+
+    def body_pose(self, body: int, q: Expression) -> Pose:
+        """Return the pose of the body with an index in the world, (R_WB, p_WB)."""
+        k, X_MB = self._mounts[body]
         return X_MB if k < 0 else times(self._poses(q)[k], X_MB)
+
+    def point_jacobian(self, body: int, p_WP: Expression, q: Expression) -> Expression:
+        """Return the Jacobian of the velocity of the point P of a body in the world, shape (3, nv).
+
+        Args:
+            body: Index of the body.
+            p_WP: Where the point is now, in the world, shape (3, 1).
+            q: Positions, shape (nq, 1).
+        """
+        motion = self._motion_on_link(*self._mounts[body], q)
+        return motion.J[3:, :] - skew(p_WP - motion.p) @ motion.J[:3, :]
+
+    def way(self, body: int) -> list[int]:
+        """Return the places of the velocities that move a body."""
+        k, places = self._mounts[body][0], []
+        while k >= 0:
+            places += range(self.nv)[self._links[k].v]
+            k = self._links[k].parent
+        return sorted(places)
 
     def generalized(self, q: Expression, forces: Sequence[AppliedForce]) -> Expression:
         """Return tau of forces in the world that act on bodies.

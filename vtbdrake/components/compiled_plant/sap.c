@@ -1,0 +1,310 @@
+/* One step of a plant with point contact, by the SAP solver of Drake (Castro, Permenter, Han 2022, arXiv:2110.10107).
+
+The velocities v after the step minimize
+
+    1/2 (v - v*)' A (v - v*) + sum over contacts l(J v),
+
+by Newton's method with an exact line search. A = M + dt D is factored as L' L along the tree of velocities
+(Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: PARENT tells the velocity next to each on the way to the
+root, and each contact moves with velocities of one way. Contact models are those of Drake's discrete plant,
+
+    SAP:    impulses projected onto the friction cone, with a compliance at least that of near-rigid contact;
+    LAGGED: Hunt and Crossley's normal force, and regularized friction under the normal force before the step.
+
+The frame of a contact has its z along the normal, from body 1 into body 2; velocities are those of 2 against 1.
+
+The text before this one defines NAME; NV, NC: the numbers of velocities and contacts; LAGGED: 0 or 1; DT: the time step
+(s); BETA: the near-rigid threshold; VS: the stiction tolerance (m/s); PARENT[NV]; COUNT[NC] and COLUMNS[NC][NV]: the
+velocities that move a contact.
+
+Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), J (3 NC, NV) in the world, normals
+(3, NC), distances (NC, m, below 0 in contact), stiffness (NC, N/m), dissipation (NC: SAP's time in s, or LAGGED's in s/m),
+friction (NC).
+Results: v (NV), forces on bodies 2 in the world (3, NC, N), and a doubt: 1 where the iteration did not converge, else 0. */
+
+#include <math.h>
+#include <string.h>
+
+#define MOST_ITERATIONS 100
+#define MOST_STEPS 60
+#define TOLERANCE 1e-9
+#define SIGMA 1e-3
+
+typedef struct {
+    int at;                     /* its number among all */
+    double J[3][NV];            /* in the contact's frame; entries of COLUMNS only */
+    double R_WC[3][3];          /* columns: two tangents, the normal */
+    double mu, k, d, phi;
+    double Rt, Rn, vn_hat;      /* SAP */
+    double n0, eps;             /* LAGGED */
+} Contact;
+
+/* Factor H = L' L in place, along the tree. Return 0 if H is not positive definite. */
+static int factor(double (*H)[NV]) {
+    for (int k = NV - 1; k >= 0; --k) {
+        if (!(H[k][k] > 0.0)) return 0;
+        double d = sqrt(H[k][k]);
+        H[k][k] = d;
+        for (int i = PARENT[k]; i >= 0; i = PARENT[i]) H[k][i] /= d;
+        for (int i = PARENT[k]; i >= 0; i = PARENT[i])
+            for (int j = i; j >= 0; j = PARENT[j]) H[i][j] -= H[k][i] * H[k][j];
+    }
+    return 1;
+}
+
+static void solve(double (*L)[NV], double *x) {
+    for (int i = NV - 1; i >= 0; --i) {
+        x[i] /= L[i][i];
+        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) x[j] -= L[i][j] * x[i];
+    }
+    for (int i = 0; i < NV; ++i) {
+        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) x[i] -= L[i][j] * x[j];
+        x[i] /= L[i][i];
+    }
+}
+
+static void multiply(double (*A)[NV], const double *x, double *y) {
+    memset(y, 0, NV * sizeof *y);
+    for (int i = 0; i < NV; ++i) {
+        y[i] += A[i][i] * x[i];
+        for (int j = PARENT[i]; j >= 0; j = PARENT[j]) {
+            y[i] += A[i][j] * x[j];
+            y[j] += A[i][j] * x[i];
+        }
+    }
+}
+
+static double dot(const double *x, const double *y) {
+    double sum = 0.0;
+    for (int i = 0; i < NV; ++i) sum += x[i] * y[i];
+    return sum;
+}
+
+/* The frame of a normal n, as Drake's RotationMatrix::MakeFromOneVector. */
+static void frame(const double *n, double (*R)[3]) {
+    int i = fabs(n[0]) <= fabs(n[1]) ? (fabs(n[0]) <= fabs(n[2]) ? 0 : 2) : (fabs(n[1]) <= fabs(n[2]) ? 1 : 2);
+    int j = (i + 1) % 3, k = (i + 2) % 3;
+    double r = sqrt(n[j] * n[j] + n[k] * n[k]);
+    R[i][0] = 0.0;
+    R[j][0] = -n[k] / r;
+    R[k][0] = n[j] / r;
+    for (int a = 0; a < 3; ++a) {
+        int b = (a + 1) % 3, c = (a + 2) % 3;
+        R[a][1] = n[b] * R[c][0] - n[c] * R[b][0];
+        R[a][2] = n[a];
+    }
+}
+
+static void contact_velocity(const Contact *c, const double *v, double *vc) {
+    const int *columns = COLUMNS[c->at];
+    for (int r = 0; r < 3; ++r) {
+        vc[r] = 0.0;
+        for (int m = 0; m < COUNT[c->at]; ++m) vc[r] += c->J[r][columns[m]] * v[columns[m]];
+    }
+}
+
+/* The impulse g at the velocity vc, and G = -dg/dvc, symmetric. */
+static void impulse(const Contact *c, const double *vc, double *g, double (*G)[3]) {
+    memset(G, 0, 9 * sizeof(double));
+#if LAGGED
+    double soft = sqrt(vc[0] * vc[0] + vc[1] * vc[1] + c->eps * c->eps);
+    double t[2] = {vc[0] / soft, vc[1] / soft};
+    double fe = -c->k * (c->phi + DT * vc[2]), damping = 1.0 - c->d * vc[2];
+    g[0] = -c->mu * c->n0 * t[0];
+    g[1] = -c->mu * c->n0 * t[1];
+    g[2] = 0.0;
+    if (fe > 0.0 && damping > 0.0) {
+        g[2] = DT * fe * damping;
+        G[2][2] = DT * (c->k * DT * damping + c->d * fe);
+    }
+    for (int r = 0; r < 2; ++r)
+        for (int s = 0; s < 2; ++s) G[r][s] = c->mu * c->n0 * ((r == s) - t[r] * t[s]) / soft;
+#else
+    double y[3] = {-vc[0] / c->Rt, -vc[1] / c->Rt, (c->vn_hat - vc[2]) / c->Rn};
+    double yr = sqrt(y[0] * y[0] + y[1] * y[1]), mu_hat = c->mu * c->Rt / c->Rn;
+    if (yr <= c->mu * y[2]) { /* it sticks */
+        memcpy(g, y, 3 * sizeof *g);
+        G[0][0] = G[1][1] = 1.0 / c->Rt;
+        G[2][2] = 1.0 / c->Rn;
+    } else if (-mu_hat * yr < y[2]) { /* it slides */
+        double f = 1.0 / (1.0 + c->mu * mu_hat), t[2] = {y[0] / yr, y[1] / yr};
+        g[2] = f * (y[2] + mu_hat * yr);
+        for (int r = 0; r < 2; ++r) {
+            g[r] = c->mu * g[2] * t[r];
+            G[r][2] = c->mu * f * t[r] / c->Rn;
+            G[2][r] = mu_hat * f * t[r] / c->Rt;
+            for (int s = 0; s < 2; ++s)
+                G[r][s] = c->mu * (g[2] / yr * ((r == s) - t[r] * t[s]) + mu_hat * f * t[r] * t[s]) / c->Rt;
+        }
+        G[2][2] = f / c->Rn;
+    } else {
+        g[0] = g[1] = g[2] = 0.0;
+    }
+#endif
+}
+
+/* What does not change in the iteration; scale is 1 / diag A, v0 the velocities before the step. */
+static void prepare(Contact *c, const double *scale, const double *v0) {
+    const int *columns = COLUMNS[c->at], count = COUNT[c->at];
+    double square = 0.0;
+    for (int r = 0; r < 3; ++r)
+        for (int s = 0; s < 3; ++s) {
+            double entry = 0.0;
+            for (int m = 0; m < count; ++m) {
+                int i = columns[m];
+                entry += c->J[r][i] * c->J[s][i] * scale[i];
+            }
+            square += entry * entry;
+        }
+    double w = sqrt(square) / 3.0; /* Drake's estimate of J A^-1 J', by the diagonal of A */
+    c->Rt = SIGMA * w;
+#if LAGGED
+    double vc[3];
+    contact_velocity(c, v0, vc);
+    c->n0 = fmax(0.0, -DT * c->k * c->phi) * fmax(0.0, 1.0 - c->d * vc[2]);
+    c->eps = fmax(VS, c->mu * c->Rt * c->n0);
+#else
+    (void)v0;
+    double near_rigid = BETA * BETA / (4.0 * M_PI * M_PI) * w;
+    c->Rn = fmax(near_rigid, 1.0 / (DT * c->k * (DT + c->d)));
+    c->vn_hat = -c->phi / (DT + c->d);
+#endif
+}
+
+/* The gradient of the cost at v, and its Hessian along the tree; the scale of the momentum's parts. */
+static double gradient(double (*A)[NV], const double *v, const double *v_star, const double *scale, const Contact *contacts,
+                       int n, double *grad, double (*H)[NV]) {
+    double d[NV], impulses[NV] = {0.0}, square = 0.0;
+    for (int i = 0; i < NV; ++i) d[i] = v[i] - v_star[i];
+    multiply(A, d, grad);
+    memcpy(H, A, NV * NV * sizeof(double));
+    for (int a = 0; a < n; ++a) {
+        const Contact *c = contacts + a;
+        const int *columns = COLUMNS[c->at], count = COUNT[c->at];
+        double vc[3], g[3], G[3][3], W[3][NV];
+        contact_velocity(c, v, vc);
+        impulse(c, vc, g, G);
+        for (int m = 0; m < count; ++m) {
+            int i = columns[m];
+            impulses[i] += c->J[0][i] * g[0] + c->J[1][i] * g[1] + c->J[2][i] * g[2];
+            for (int r = 0; r < 3; ++r) W[r][m] = G[r][0] * c->J[0][i] + G[r][1] * c->J[1][i] + G[r][2] * c->J[2][i];
+        }
+        for (int m = 0; m < count; ++m) /* columns increase: the lower half */
+            for (int l = 0; l <= m; ++l) {
+                int i = columns[m];
+                H[i][columns[l]] += c->J[0][i] * W[0][l] + c->J[1][i] * W[1][l] + c->J[2][i] * W[2][l];
+            }
+    }
+    for (int i = 0; i < NV; ++i) {
+        grad[i] -= impulses[i];
+        square += impulses[i] * impulses[i] * scale[i];
+    }
+    return square;
+}
+
+/* The step along p at which the cost is least: Newton's method within a bracket. */
+static double line_search(double (*A)[NV], const double *v, const double *v_star, const double *p, const double *grad,
+                          const Contact *contacts, int n) {
+    double Ap[NV], d[NV], begin[NC][3], along[NC][3];
+    multiply(A, p, Ap);
+    for (int i = 0; i < NV; ++i) d[i] = v[i] - v_star[i];
+    for (int a = 0; a < n; ++a) {
+        contact_velocity(contacts + a, v, begin[a]);
+        contact_velocity(contacts + a, p, along[a]);
+    }
+    double pAp = dot(p, Ap), dAp = dot(d, Ap), slope0 = fabs(dot(grad, p));
+    double step = 1.0, low = 0.0, high = INFINITY;
+    for (int k = 0; k < MOST_STEPS; ++k) {
+        double slope = dAp + step * pAp, curvature = pAp;
+        for (int a = 0; a < n; ++a) {
+            double vc[3], g[3], G[3][3];
+            for (int r = 0; r < 3; ++r) vc[r] = begin[a][r] + step * along[a][r];
+            impulse(contacts + a, vc, g, G);
+            for (int r = 0; r < 3; ++r) {
+                slope -= g[r] * along[a][r];
+                for (int s = 0; s < 3; ++s) curvature += along[a][r] * G[r][s] * along[a][s];
+            }
+        }
+        if (fabs(slope) <= 1e-8 * slope0) break;
+        if (slope > 0.0) high = step;
+        else low = step;
+        double next = step - slope / curvature;
+        if (!(next > low && next < high)) next = high < INFINITY ? 0.5 * (low + high) : 2.0 * step;
+        if (fabs(next - step) <= 1e-14 * step) break;
+        step = next;
+    }
+    return step;
+}
+
+int NAME(const double **arg, double **res, long long int *iw, double *w, int mem) {
+    (void)iw, (void)w, (void)mem;
+    static const double one = 1.0, zero = 0.0;
+    double A[NV][NV], L[NV][NV], H[NV][NV], v_star[NV], v[NV], scale[NV], grad[NV], p[NV], A_v[NV];
+    static const double none[3 * NC * NV + NV * NV] = {0.0};
+    const double *in[9];
+    for (int i = 0; i < 9; ++i) in[i] = arg[i] ? arg[i] : none; /* CasADi's way to say that all are zero */
+    for (int i = 0; i < NV; ++i) {
+        for (int j = 0; j < NV; ++j) A[i][j] = in[0][i + NV * j];
+        scale[i] = 1.0 / A[i][i];
+    }
+    memcpy(L, A, sizeof L);
+    memcpy(v_star, in[1], sizeof v_star);
+    int good = factor(L);
+    if (good) solve(L, v_star);
+    memcpy(v, v_star, sizeof v);
+
+    Contact contacts[NC];
+    int n = 0;
+    for (int at = 0; at < NC; ++at) {
+        if (!(in[5][at] < 0.0)) continue;
+        Contact *c = contacts + n++;
+        *c = (Contact){.at = at, .phi = in[5][at], .k = in[6][at], .d = in[7][at], .mu = in[8][at]};
+        frame(in[4] + 3 * at, c->R_WC);
+        for (int m = 0; m < COUNT[at]; ++m) {
+            int i = COLUMNS[at][m];
+            const double *J = in[3] + 3 * at + 3 * NC * i;
+            for (int r = 0; r < 3; ++r) c->J[r][i] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
+        }
+        prepare(c, scale, in[2]);
+    }
+    int converged = good && n == 0;
+    if (good && n) {
+        memcpy(v, in[2], sizeof v); /* where Drake begins */
+        for (int k = 0; k < MOST_ITERATIONS; ++k) {
+            double impulses = gradient(A, v, v_star, scale, contacts, n, grad, H), residual = 0.0, momentum = 0.0;
+            multiply(A, v, A_v);
+            for (int i = 0; i < NV; ++i) {
+                residual += grad[i] * grad[i] * scale[i];
+                momentum += A_v[i] * A_v[i] * scale[i];
+            }
+            converged = sqrt(residual) <= 1e-14 + TOLERANCE * sqrt(fmax(momentum, impulses));
+            if (converged || !factor(H)) break;
+            for (int i = 0; i < NV; ++i) p[i] = -grad[i];
+            solve(H, p);
+            double step = line_search(A, v, v_star, p, grad, contacts, n), change = 0.0, size = 0.0;
+            for (int i = 0; i < NV; ++i) {
+                v[i] += step * p[i];
+                change += step * p[i] * step * p[i] * A[i][i];
+                size += v[i] * v[i] * A[i][i];
+            }
+            if (change <= 1e-28 * size) { /* as near as rounding allows */
+                converged = 1;
+                break;
+            }
+        }
+    }
+    if (res[0]) memcpy(res[0], v, sizeof v);
+    if (res[1]) {
+        memset(res[1], 0, 3 * NC * sizeof(double));
+        for (int a = 0; a < n; ++a) {
+            const Contact *c = contacts + a;
+            double vc[3], g[3], G[3][3];
+            contact_velocity(c, v, vc);
+            impulse(c, vc, g, G);
+            for (int r = 0; r < 3; ++r)
+                res[1][3 * c->at + r] = (c->R_WC[r][0] * g[0] + c->R_WC[r][1] * g[1] + c->R_WC[r][2] * g[2]) / DT;
+        }
+    }
+    if (res[2]) *res[2] = converged ? zero : one;
+    return 0;
+}
