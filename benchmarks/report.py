@@ -36,6 +36,7 @@ BENCHMARKS: Registry = {
     "decision_overhead_compiled": "benchmarks.decision:decision_overhead_compiled",
     "predictive_sampling": "benchmarks.predictive_sampling:predictive_sampling",
     "predictive_sampling_testbed": "benchmarks.predictive_sampling:predictive_sampling_testbed",
+    "compiled_contact_quadruped": "benchmarks.compiled_contact:compiled_contact",
     "compiled_testbed": "benchmarks.compiled_testbed:compiled_testbed",
     "compile_time": "benchmarks.compiled_testbed:compile_time",
     "hub_round_trip_p50": "benchmarks.hub:hub_round_trip_p50",

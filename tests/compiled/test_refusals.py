@@ -40,7 +40,6 @@ from vtbdrake.compiled import (
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.state.systems import collect
 from vtbdrake_diagrams.double_pendulum import DoublePendulumScenario
-from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
 
 class Squares(AddressedSystem):
@@ -109,11 +108,6 @@ def test_of_a_continuous_world_the_plant_alone_is_named() -> None:
         "the testbed cannot be compiled: plant: MultibodyPlant has continuous state, and a compiled rollout has steps: "
         "give it a time step (MultibodyPlantConfig(time_step=0.001)), or take another executor"
     )
-
-
-def test_names_contact() -> None:
-    with pytest.raises(UnsupportedTestbedError, match=r"plant: MultibodyPlant has contact.*slab and tool can collide"):
-        ManipulatorScenario(wall=True).build().compiled(horizon=0.1, compile=False)
 
 
 def test_unconnected_inputs_are_named() -> None:

@@ -57,8 +57,9 @@ def check_rollouts(rollouts: CompiledRollouts, context: Context) -> None:
 def compare(rollouts: CompiledRollouts, begin: Context, *, updates: int = _MOST_UPDATES) -> float:
     """Compare one rollout from a root context with Drake's, and return the largest difference after one step.
 
-    Each step begins with Drake's state; `Equations.agreement` tells how near it must come. Beside that, what the whole rollout records is compared, loosely: in a fast or
-    chaotic testbed, rounding grows. It is not where a step with contact is as good as its iteration.
+    Each step begins with Drake's state; `Equations.agreement` tells how near it must come. Beside that, what the whole
+    rollout records is compared, loosely: in a fast or chaotic testbed, rounding grows. It is not compared where a step
+    with contact is as good as its iteration.
 
     Args:
         rollouts: The compiled Diagram.

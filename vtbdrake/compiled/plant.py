@@ -7,12 +7,7 @@ from typing import NamedTuple
 
 import casadi
 import numpy as np
-from pydrake.multibody.plant import (
-    DiscreteContactApproximation,
-    DiscreteContactSolver,
-    ExternallyAppliedSpatialForce,
-    MultibodyPlant,
-)
+from pydrake.multibody.plant import DiscreteContactSolver, ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context
 
@@ -30,9 +25,8 @@ _NOT_ACTING = ("geometry_query",)
 
 # The name of the present step, which several outputs share with the update.
 _STEP = "step"
-# Drake ends its iteration at an error of 1e-6 of the momentum, in which some velocities weigh little; where contact is
-# lagged, often before (5e-2 was seen). The compiled step is converged to 1e-9.
-_AGREEMENT_IN_CONTACT = {DiscreteContactApproximation.kSap: 1e-4, DiscreteContactApproximation.kLagged: 1e-2}
+# Drake ends its iteration at an error of 1e-6 of the momentum, in which some velocities weigh little.
+_AGREEMENT_IN_CONTACT = 1e-4
 
 
 class _Step(NamedTuple):
@@ -77,7 +71,7 @@ class PlantEquations(Equations):
         except CompilerError as error:
             raise refusal(system, f"has contact, whose solver is written in C: {error}") from None
         if self._contact is not None:
-            self.agreement = _AGREEMENT_IN_CONTACT[system.get_discrete_contact_approximation()]
+            self.agreement = _AGREEMENT_IN_CONTACT
         self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
         self.extras = {address: self._inputs[address] for address in self._model.inputs}
 

@@ -23,10 +23,8 @@ from vtbdrake.state.multibody import bodies
 Expression = Any  # casadi.SX
 
 _APPROXIMATIONS = {DiscreteContactApproximation.kSap: 0, DiscreteContactApproximation.kLagged: 1}
-# What a plant does not tell: MultibodyPlantConfig's defaults.
-_STICTION_TOLERANCE = 1e-3  # m/s
-_PENETRATION_ALLOWANCE = 1e-3  # m
-_RELAXATION_TIME = 0.1  # s, of each of both geometries
+# m/s, MultibodyPlantConfig's default; a plant does not tell its own. Used by lagged friction.
+_STICTION_TOLERANCE = 1e-4
 _OTHERS = (Sphere, HalfSpace, Box)
 
 
@@ -161,39 +159,34 @@ class PointContact:
             if isinstance(sphere.shape, Sphere) and isinstance(other.shape, _OTHERS):
                 return Pair(sphere, other)
         raise UnsupportedPlantError(
-            f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) is "
-            "not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
+            f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
+            "is not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
             "CollisionFilterDeclaration"
         )
 
     def _surface(self, inspector: SceneGraphInspector, geometry: GeometryId, body: int, body_name: str) -> Surface:
         properties = inspector.GetProximityProperties(geometry)
         name = f"{inspector.GetName(geometry)} of {body_name}"
-        is_point = self._plant.get_contact_model() == ContactModel.kPoint
-        if not is_point and properties.HasProperty("hydroelastic", "compliance_type"):
+        # A half-space has no mesh, but what touches it has one if their contact is hydroelastic.
+        has_mesh = inspector.maybe_get_hydroelastic_mesh(geometry) is not None
+        if has_mesh and self._plant.get_contact_model() != ContactModel.kPoint:
             raise UnsupportedPlantError(f"hydroelastic contact of {name} is not compiled: set contact_model to 'point'")
-
-        def of_material(kind: str, default: float) -> float:
-            return float(properties.GetPropertyOrDefault("material", kind, default))
-
-        if self._is_lagged:
-            dissipation = of_material("hunt_crossley_dissipation", self._default_dissipation())
-        else:
-            dissipation = of_material("relaxation_time", _RELAXATION_TIME)
-        return Surface(
-            name,
-            body,
-            inspector.GetShape(geometry),
-            inspector.GetPoseInFrame(geometry),
-            of_material("point_contact_stiffness", self._default_stiffness()),
-            dissipation,
-            float(properties.GetProperty("material", "coulomb_friction").dynamic_friction()),
-        )
+        kinds = ["point_contact_stiffness", "hunt_crossley_dissipation" if self._is_lagged else "relaxation_time"]
+        missing = [kind for kind in kinds if not properties.HasProperty("material", kind)]
+        if missing:
+            raise UnsupportedPlantError(
+                f"{name} has no {' and no '.join(missing)}: give it one (AddContactMaterial), or leave those of "
+                "SceneGraphConfig.default_proximity_properties"
+            )
+        stiffness, dissipation = (float(properties.GetProperty("material", kind)) for kind in kinds)
+        friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+        shape, X_BG = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
+        return Surface(name, body, shape, X_BG, stiffness, dissipation, friction)
 
     # -- where it touches
 
     def _meet(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
-        """Return the point of contact, the normal from the sphere into the other, both in the world, and the distance."""
+        """Return the point of contact and the normal from the sphere into the other, in the world, and the distance."""
         _, center = self._pose(pair.sphere, q)
         R, p = self._pose(pair.other, q)
         radius, shape = pair.sphere.shape.radius(), pair.other.shape
@@ -248,20 +241,6 @@ class PointContact:
 
     def _bodies(self) -> list[int]:
         return [int(body.index()) for body in bodies(self._plant)]
-
-    def _default_stiffness(self) -> float:
-        """Return the stiffness of a geometry without a material: the heaviest body sinks in as far as is allowed."""
-        return 2.0 * self._heaviest() * self._weight() / _PENETRATION_ALLOWANCE
-
-    def _default_dissipation(self) -> float:
-        frequency = np.sqrt(self._default_stiffness() / self._heaviest())
-        return float(1.0 / (frequency * _PENETRATION_ALLOWANCE))
-
-    def _heaviest(self) -> float:
-        return max(body.default_mass() for body in bodies(self._plant))
-
-    def _weight(self) -> float:
-        return float(np.linalg.norm(self._plant.gravity_field().gravity_vector())) or 9.81
 
 
 def _from_point(d: Expression) -> tuple[Expression, Expression]:

@@ -255,7 +255,7 @@ class PlantDynamics:
     def momentum_balance(
         self, q: Expression, v: Expression, tau: Expression, period: float
     ) -> tuple[Expression, Expression]:
-        """Return A and p* of a step without contact, A v_next = p*: A = M(q) + period D, p* = M v + period (tau - C v + g).
+        """Return A = M(q) + period D and p* = M v + period (tau - C v + g): without contact, A v_next = p*.
 
         Args:
             q: Positions, shape (nq, 1).

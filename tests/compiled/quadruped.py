@@ -1,0 +1,128 @@
+"""A quadruped on four round feet, and what it may touch, as a Diagram."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    CollisionFilterDeclaration,
+    GeometrySet,
+    HalfSpace,
+    ProximityProperties,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, RigidBody, RotationalInertia, SpatialInertia
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import AffineSystem
+
+LEGS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+POSTURE = {"hip": 0.0, "thigh": 0.7, "knee": -1.4}
+HEIGHT = 0.33
+
+
+def inertia(mass: float, z: float, moments: tuple[float, float, float]) -> SpatialInertia:
+    return SpatialInertia.MakeFromCentralInertia(mass, [0.0, 0.0, z], RotationalInertia(*moments))
+
+
+def surface(
+    friction: float, stiffness: float | None = None, relaxation: float | None = None, dissipation: float | None = None
+) -> ProximityProperties:
+    """Return a material; what is left out is the plant's."""
+    properties = ProximityProperties()
+    AddContactMaterial(dissipation, stiffness, CoulombFriction(friction, friction), properties)
+    if relaxation is not None:
+        properties.AddProperty("material", "relaxation_time", relaxation)
+    return properties
+
+
+def quadruped(
+    approximation: str, *, time_step: float = 0.005, playground: bool = False
+) -> tuple[Diagram, MultibodyPlant]:
+    """Return a Diagram: four legs held by joint PD, a trot's length above the ground.
+
+    Args:
+        approximation: Drake's name of the contact approximation.
+        time_step: Of plant and controller, in s.
+        playground: The ground is a slope, feet touch each other, there are a box and two balls, and materials differ.
+    """
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="point",
+        discrete_contact_approximation=approximation,
+        use_sampled_output_ports=False,
+    )
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    trunk = plant.AddRigidBody("trunk", inertia(6.0, 0.0, (0.02, 0.06, 0.07)))
+    feet = GeometrySet()
+    for number, (front, left) in enumerate(LEGS):
+        material = surface(0.8, 3e4 + 1e3 * number, 0.05, 0.3) if playground else surface(0.8)
+        shank = _leg(plant, trunk, str(number), front, left)
+        feet.Add(
+            plant.RegisterCollisionGeometry(
+                shank, RigidTransform([0, 0, -0.2]), Sphere(0.02), f"foot_{number}", material
+            )
+        )
+    world = plant.world_body()
+    if playground:
+        slope = RigidTransform(RollPitchYaw(0.1, 0.0, 0.0), [0, 0, 0])
+        plant.RegisterCollisionGeometry(world, slope, HalfSpace(), "ground", surface(0.6, 2e5, 0.02, 1.0))
+        step = RigidTransform(RollPitchYaw(0.1, 0.3, 0.2), [0.3, 0.1, 0.02])
+        plant.RegisterCollisionGeometry(world, step, Box(0.3, 0.2, 0.2), "box", surface(0.5, 1e5, 0.02, 1.0))
+        for number in range(2):
+            ball = plant.AddRigidBody(f"ball_{number}", inertia(0.5, 0.01, (0.001, 0.0012, 0.0011)))
+            offset = RigidTransform([0.01, 0, 0])
+            plant.RegisterCollisionGeometry(ball, offset, Sphere(0.08), f"ball_{number}", surface(0.4, 5e4, 0.03, 0.5))
+    else:
+        plant.RegisterCollisionGeometry(world, RigidTransform(), HalfSpace(), "ground", surface(0.8))
+    plant.SetDefaultFloatingBaseBodyPose(trunk, RigidTransform([0, 0, HEIGHT]))
+    plant.Finalize()
+    if not playground:
+        scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(feet))
+    controller = builder.AddSystem(_joint_pd(plant, stiffness=60.0, damping=2.0, period=time_step))
+    builder.Connect(plant.get_state_output_port(), controller.get_input_port())
+    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port())
+    return builder.Build(), plant
+
+
+def _leg(plant: MultibodyPlant, trunk: RigidBody, name: str, front: int, left: int) -> RigidBody:
+    """Add a leg; return its shank, at whose end, 0.2 m below the knee, is the foot."""
+    parts = (
+        ("hip", [0.18 * front, 0.05 * left, 0.0], [1, 0, 0], inertia(0.7, 0.0, (0.0005,) * 3)),
+        ("thigh", [0.0, 0.09 * left, 0.0], [0, 1, 0], inertia(1.0, -0.1, (0.005, 0.005, 0.001))),
+        ("knee", [0.0, 0.0, -0.2], [0, 1, 0], inertia(0.15, -0.1, (0.002, 0.002, 0.0001))),
+    )
+    parent = trunk
+    for kind, place, axis, mass in parts:
+        body = plant.AddRigidBody(f"{kind}_{name}_link", mass)
+        frame = plant.AddFrame(
+            FixedOffsetFrame(f"{kind}_{name}_frame", parent.body_frame(), RigidTransform(np.array(place, dtype=float)))
+        )
+        joint = plant.AddJoint(RevoluteJoint(f"{kind}_{name}", frame, body.body_frame(), axis, 0.1))
+        joint.set_default_angle(POSTURE[kind])
+        plant.AddJointActuator(f"{kind}_{name}", joint).set_default_rotor_inertia(0.01)
+        parent = body
+    return parent
+
+
+def _joint_pd(plant: MultibodyPlant, *, stiffness: float, damping: float, period: float) -> AffineSystem:
+    """Return the law from the state to the actuation that holds the default posture."""
+    nq, nv, nu = plant.num_positions(), plant.num_velocities(), plant.num_actuators()
+    gains = np.zeros((nu, nq + nv))
+    for row, index in enumerate(plant.GetJointActuatorIndices()):
+        joint = plant.get_joint_actuator(index).joint()
+        gains[row, joint.position_start()] = -stiffness
+        gains[row, nq + joint.velocity_start()] = -damping
+    nothing, none = np.zeros((0, nq + nv)), np.zeros((nu, 0))
+    posture = -gains[:, :nq] @ plant.GetDefaultPositions()
+    law = AffineSystem(A=np.zeros((0, 0)), B=nothing, f0=np.zeros(0), C=none, D=gains, y0=posture, time_period=period)
+    law.set_name("law")
+    return law

@@ -1,0 +1,282 @@
+"""Compiled contact: against Drake's steps, against the laws of contact written again, and along rollouts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi
+import numpy as np
+import pytest
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddRigidHydroelasticProperties,
+    Box,
+    HalfSpace,
+    ProximityProperties,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, inertia, quadruped, surface
+from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
+from vtbdrake.components.casadi_system import compiler
+from vtbdrake.components.compiled_plant import PlantDynamics
+from vtbdrake.components.compiled_plant.contact import PointContact
+from vtbdrake.state.systems import collect
+from vtbdrake_diagrams.manipulator import ManipulatorScenario
+
+APPROXIMATIONS = ("sap", "lagged")
+
+
+@dataclass
+class Steps:
+    """Single steps of a plant with contact, of Drake and compiled.
+
+    The impulses at given velocities are computed by `impulse`, which is written after Drake's documentation, and knows
+    nothing of the kernel in C.
+    """
+
+    diagram: Diagram
+    plant: MultibodyPlant
+    is_lagged: bool
+
+    def __post_init__(self) -> None:
+        plant = self.plant
+        self.root = self.diagram.CreateDefaultContext()
+        self.context: Context = plant.GetMyMutableContextFromRoot(self.root)
+        model = PlantDynamics(plant, plant.CreateDefaultContext())
+        self.contact = PointContact(plant, self.context, model)
+        q, v, u = model.symbols()
+        tau = model.actuation(u)
+        step = self.contact.step(q, v, tau)
+        touching = [self.contact._touch(pair, q) for pair in self.contact.pairs]
+        balance = model.momentum_balance(q, v, tau, plant.time_step())
+        parts = [
+            *balance,
+            casadi.vertcat(*(J for J, _, _ in touching)),
+            casadi.horzcat(*(n for _, n, _ in touching)),
+            casadi.vertcat(*(distance for _, _, distance in touching)),
+        ]
+        options = {"cse": True}
+        self._step = casadi.Function("step", [q, v, u], [casadi.densify(part) for part in step], options)
+        self._parts = casadi.Function("parts", [q, v, u], [casadi.densify(part) for part in parts], options)
+
+    def randomize(self, random: np.random.Generator) -> None:
+        plant = self.plant
+        for index in plant.GetFloatingBaseBodies():
+            body = plant.get_body(index)
+            low, high = ([0, 0, 0.2], [0, 0, 0.4]) if body.name() == "trunk" else ([-0.4, -0.3, 0.0], [0.5, 0.3, 0.2])
+            turned = RollPitchYaw(0.3 * random.standard_normal(3))
+            plant.SetFreeBodyPose(self.context, body, RigidTransform(turned, random.uniform(low, high)))
+        for kind, angle in POSTURE.items():
+            for leg in range(len(LEGS)):
+                joint = plant.GetJointByName(f"{kind}_{leg}")
+                joint.set_angle(self.context, angle + 0.4 * random.standard_normal())
+        speed = random.choice([0.01, 1.0, 3.0])
+        plant.SetVelocities(self.context, speed * random.standard_normal(plant.num_velocities()))
+
+    def drake(self) -> np.ndarray:
+        """Return the velocities after Drake's step."""
+        state = self.plant.get_state_output_port().Eval(self.context)
+        following = self.plant.EvalUniquePeriodicDiscreteUpdate(self.context).value()
+        assert following.size == state.size
+        return np.array(following[self.plant.num_positions() :])
+
+    def compiled(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the velocities after the compiled step, the contact forces, and the doubt."""
+        v, forces, doubt = self._step(*self._arguments())
+        return v.full().ravel(), forces.full().T, float(doubt)
+
+    def residual(self, v: np.ndarray) -> float:
+        """Return how far velocities are from a solution, relative to the momentum, as Drake measures it."""
+        q, v0, u = self._arguments()
+        A, p_star, J, normals, distances = (part.full() for part in self._parts(q, v0, u))
+        scale, impulses = 1.0 / np.sqrt(np.diag(A)), np.zeros(v.size)
+        for i, pair in enumerate(self.contact.pairs):
+            if distances[i, 0] < 0.0:
+                J_i = J[3 * i : 3 * i + 3]
+                estimate = np.linalg.norm(J_i @ np.diag(scale**2) @ J_i.T) / 3.0
+                material = pair.material(is_lagged=self.is_lagged)
+                law = lagged_impulse if self.is_lagged else sap_impulse
+                frame = normals[:, i], distances[i, 0], estimate, self.plant.time_step()
+                impulses += J_i.T @ law(J_i @ v, J_i @ v0, *frame, *material)
+        momentum = max(np.linalg.norm(scale * (A @ v)), np.linalg.norm(scale * impulses))
+        return float(np.linalg.norm(scale * (A @ v - p_star.ravel() - impulses)) / momentum)
+
+    def _arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        plant, context = self.plant, self.context
+        u = plant.get_actuation_input_port().Eval(context)
+        return plant.GetPositions(context), plant.GetVelocities(context), u
+
+
+def sap_impulse(v_c, v_c0, n, distance, w, dt, stiffness, relaxation, friction):
+    """Return the impulse of SAP's regularized friction (Castro, Permenter, Han 2022, eq. 17 to 22), in the world."""
+    R_n = max(w / (4.0 * np.pi**2), 1.0 / (dt * stiffness * (dt + relaxation)))
+    R_t = 1e-3 * w
+    v_n = n @ v_c
+    y_n = (-distance / (dt + relaxation) - v_n) / R_n
+    y_t = -(v_c - v_n * n) / R_t
+    y_r = np.linalg.norm(y_t)
+    hat = friction * R_t / R_n
+    if y_r <= friction * y_n:
+        return y_n * n + y_t
+    if y_n <= -hat * y_r:
+        return np.zeros(3)
+    g_n = (y_n + hat * y_r) / (1.0 + friction * hat)
+    return g_n * (n + friction * y_t / y_r)
+
+
+def lagged_impulse(v_c, v_c0, n, distance, w, dt, stiffness, dissipation, friction):
+    """Return the impulse of Hunt and Crossley, with friction under the normal force before the step, in the world."""
+    v_n = n @ v_c
+    elastic = -stiffness * (distance + dt * v_n)
+    g_n = dt * max(elastic, 0.0) * max(1.0 - dissipation * v_n, 0.0)
+    before = -dt * stiffness * distance * max(1.0 - dissipation * (n @ v_c0), 0.0)
+    slip = v_c - v_n * n
+    return g_n * n - friction * before * slip / np.hypot(np.linalg.norm(slip), max(1e-4, friction * 1e-3 * w * before))
+
+
+@lru_cache
+def steps_of(approximation: str) -> Steps:
+    return Steps(*quadruped(approximation, playground=True), approximation == "lagged")
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+def test_steps_are_drakes_on_a_playground(approximation: str) -> None:
+    steps, random = steps_of(approximation), np.random.default_rng(0)
+    touching = 0
+    for _ in range(100):
+        steps.randomize(random)
+        expected = steps.drake()
+        v, forces, doubt = steps.compiled()
+        assert doubt == 0.0
+        touching += np.count_nonzero(np.any(forces, axis=1))
+        # The same problem: Drake solves it to 1e-6, the kernel to 1e-9.
+        assert steps.residual(expected) < 1.1e-6
+        assert steps.residual(v) < 2e-9
+        np.testing.assert_allclose(v, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
+    assert touching > 200
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+def test_forces_balance_the_momentum(approximation: str) -> None:
+    """The forces that are returned change the momentum of a ball that nothing else touches as Newton says."""
+    diagram, plant = ball_on(HalfSpace(), approximation)
+    steps = Steps(diagram, plant, approximation == "lagged")
+    ball = plant.GetBodyByName("ball")
+    for height, v in ((0.0995, [0.3, -0.2, -0.1]), (0.098, [2.0, 0.0, -0.05]), (0.2, [0.0, 1.0, 0.0])):
+        plant.SetFreeBodyPose(steps.context, ball, RigidTransform([0.0, 0.0, height]))
+        plant.SetVelocities(steps.context, [0.1, 0.2, 0.3, *v])
+        after, forces, _ = steps.compiled()
+        # The sphere is the ball's; the forces are those on the ground.
+        change = plant.time_step() * (np.array([0.0, 0.0, -9.81]) - forces.sum(axis=0) / 1.0)
+        np.testing.assert_allclose(after[3:] - v, change, atol=1e-12)
+        assert np.any(forces) == (height < 0.1)
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+def test_rollouts_are_drakes(approximation: str) -> None:
+    diagram, plant = quadruped(approximation)
+    context = diagram.CreateDefaultContext()
+    rollouts = CompiledRollouts(
+        diagram, collect(diagram), context, horizon=1.0, sample_period=0.25, parameters=["plant.trunk.mass"]
+    )
+    batch = rollouts({"plant.trunk.mass": np.array([6.0, 7.5])})
+    assert batch.valid.all()
+    for mass, final in zip((6.0, 7.5), batch.final, strict=True):
+        simulator = Simulator(diagram, context.Clone())
+        own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+        trunk = plant.GetBodyByName("trunk")
+        trunk.SetSpatialInertiaInBodyFrame(own, inertia(mass, 0.0, tuple(mass / 6.0 * np.array([0.02, 0.06, 0.07]))))
+        simulator.AdvanceTo(1.0)
+        expected = plant.GetPositionsAndVelocities(plant.GetMyContextFromRoot(simulator.get_context()))
+        np.testing.assert_allclose(final[: expected.size], expected, atol=1e-6)
+        assert 0.2 < expected[6] < HEIGHT  # It stands on its feet.
+
+
+def ball_on(
+    shape: Shape, approximation: str = "sap", *, contact_model: str = "point", of_ball: Shape | None = None
+) -> tuple[Diagram, MultibodyPlant]:
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(
+        time_step=0.002,
+        contact_model=contact_model,
+        discrete_contact_approximation=approximation,
+        use_sampled_output_ports=False,
+    )
+    plant, _ = AddMultibodyPlant(config, builder)
+    material: ProximityProperties = surface(0.5)
+    ground: ProximityProperties = surface(0.5)
+    if contact_model != "point":
+        AddRigidHydroelasticProperties(ground)
+        AddCompliantHydroelasticProperties(0.05, 1e7, material)
+    ball = plant.AddRigidBody("ball", inertia(1.0, 0.0, (0.004, 0.004, 0.004)))
+    plant.RegisterCollisionGeometry(ball, RigidTransform(), of_ball or Sphere(0.1), "ball", material)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), shape, "ground", ground)
+    plant.Finalize()
+    actuation = builder.AddSystem(ConstantVectorSource(np.zeros(0)))
+    builder.Connect(actuation.get_output_port(), plant.get_actuation_input_port())
+    return builder.Build(), plant
+
+
+def compiled(diagram: Diagram) -> CompiledRollouts:
+    return CompiledRollouts(
+        diagram, collect(diagram), diagram.CreateDefaultContext(), horizon=0.1, sample_period=0.1, check=False
+    )
+
+
+def test_a_ball_sinks_into_a_box_by_the_nearest_face() -> None:
+    diagram, plant = ball_on(Box(1.0, 2.0, 3.0))
+    steps, ball = Steps(diagram, plant, False), plant.GetBodyByName("ball")
+    for place, normal in (([0.45, 0.3, 0.2], 0), ([0.1, -0.98, 0.2], 1), ([0.55, 0.0, 1.0], 0)):
+        plant.SetFreeBodyPose(steps.context, ball, RigidTransform(place))
+        expected, (v, forces, _) = steps.drake(), steps.compiled()
+        assert np.argmax(np.abs(forces)) == normal
+        np.testing.assert_allclose(v, expected, atol=1e-8)
+
+
+def test_other_shapes_are_refused_by_name() -> None:
+    refusal = r"contact of .*ball of ball \(Box\) and .*ground of world \(HalfSpace\) is not compiled: let a Sphere"
+    with pytest.raises(UnsupportedTestbedError, match=refusal):
+        compiled(ball_on(HalfSpace(), of_ball=Box(0.1, 0.1, 0.1))[0])
+
+
+def test_an_arm_presses_on_a_wall() -> None:
+    """The whole testbed with sensors and DPS, and the reaction forces of its joints."""
+    testbed = ManipulatorScenario(wall=True).build()
+    rollouts = testbed.compiled(horizon=0.5, sample_period=0.1, outputs=["plant.state"])
+    simulator = testbed.simulator()
+    simulator.AdvanceTo(0.5)
+    batch = rollouts({})
+    assert batch.valid.all()
+    state = testbed.plant.GetPositionsAndVelocities(testbed.plant.GetMyContextFromRoot(simulator.get_context()))
+    np.testing.assert_allclose(batch.outputs["plant.state"][0, -1], state, atol=1e-6)
+
+
+def test_other_approximations_and_models_are_refused_by_name() -> None:
+    with pytest.raises(UnsupportedTestbedError, match="approximated as kSimilar is not compiled.*'sap' or 'lagged'"):
+        compiled(ball_on(HalfSpace(), "similar")[0])
+    hydroelastic = ball_on(HalfSpace(), contact_model="hydroelastic_with_fallback")[0]
+    with pytest.raises(UnsupportedTestbedError, match="hydroelastic contact of ball of ball.*to 'point'"):
+        compiled(hydroelastic)
+
+
+def test_without_a_compiler_contact_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    monkeypatch.setattr(compiler, "_KERNELS", {})
+    with pytest.raises(UnsupportedTestbedError, match="solver is written in C: .*no-such-compiler.*install one"):
+        compiled(ball_on(HalfSpace(), "sap")[0])
+
+
+def test_a_state_that_is_not_finite_is_never_valid() -> None:
+    diagram, _ = ball_on(HalfSpace())
+    rollouts = compiled(diagram)
+    z = np.tile(rollouts.walker.read(diagram.CreateDefaultContext()), (2, 1))
+    z[1, 6] = np.nan
+    assert rollouts.from_z(z, 0.0).valid.tolist() == [True, False]
