@@ -105,7 +105,7 @@ class PointContact:
         self._is_lagged = bool(_APPROXIMATIONS[approximation])
         self._plant, self._model = plant, model
         self.pairs = tuple(self._read(plant.get_geometry_query_input_port().Eval(context).inspector()))
-        self._kernel = compiled_kernel(*self._source()) if self.pairs else None
+        self._kernel = compiled_kernel(*self._source())
 
     def step(self, q: Expression, v: Expression, tau: Expression) -> tuple[Expression, Expression, Expression]:
         """Return the velocities after one step, the contact forces, and the doubt.

@@ -437,7 +437,7 @@ class PlantDynamics:
 
     def way(self, body: int) -> list[int]:
         """Return the places of the velocities that move a body."""
-        k, places = self._mounts[body][0], []
+        k, places = self._mounts[body][0], list[int]()
         while k >= 0:
             places += range(self.nv)[self._links[k].v]
             k = self._links[k].parent
