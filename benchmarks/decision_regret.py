@@ -3,7 +3,7 @@
 Prints the table of docs/reasoning.md. The best of each decision is known in
 closed form, so that the regret of a method is exact; there is no simulation, so that the time is the method's own. A
 method begins as in a reasoner: at a plan in use, whose cost it is told. A seed determines the plan in use, the goal
-and the random numbers of the method. The regret is the cost above the best one, over that of the plan in use.
+and the random numbers of the method. The regret is the cost above the best one, over the plan in use's.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Outcome:
     """The result of one decision.
 
     Attributes:
-        regret: The cost of the best eligible candidate, over that of the plan in use; infinite without one.
+        regret: The cost of the best eligible candidate, over the plan in use's; infinite without one.
         own: The method's own processor time, in seconds.
     """
 

@@ -1,4 +1,4 @@
-"""How many rollouts fit into what is left of a budget of wall time, with a clock that moves by the rollouts' cost."""
+"""The rollouts that fit into a budget of wall time, with a clock that moves by their cost."""
 
 import pytest
 

@@ -214,7 +214,7 @@ class DecisionRun:
             raise _BudgetSpentError(ROLLOUTS, _spent(rollouts))
 
     def _fitting(self, keys: Sequence[RolloutKey]) -> int:
-        """Return how many of the rollouts to run together: the plan in use, in any case, or what fits into the time."""
+        """Return the number of rollouts to run together: the plan in use, in any case, or what fits into the time."""
         if keys[0][0] == KEEP and self._budget.seconds is not None:
             return sum(point == KEEP for point, _ in keys)
         return self._time_left.affordable(len(keys), together=min(self._reasoner.samples, len(keys)))

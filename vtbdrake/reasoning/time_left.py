@@ -16,8 +16,8 @@ _CHOICE = 1e-5
 class TimeLeft:
     """Counts the rollouts that fit into the time that is left, by the wall time that the last ones took.
 
-    Of w rollouts side by side, n take r ceil(n / w), where r is measured by the last call; a call takes at least as
-    long as the shortest call so far.
+    With w workers, n rollouts take r ceil(n / w), where r is measured by the last call; a call takes at least as long
+    as the shortest call so far.
 
     Args:
         deadline: When the budget ends, on the clock; infinity: never.
@@ -47,8 +47,8 @@ class TimeLeft:
         left = self.seconds
         if left == inf:
             return most
-        one = self._round * ceil(together / self._side_by_side)
-        if left <= max(one, self._shortest):
+        candidate_takes = self._round * ceil(together / self._side_by_side)
+        if left <= max(candidate_takes, self._shortest):
             return 0
         rounds = int(min(_SHARE * left / max(self._round, 1e-9), most))
         count = max(rounds * self._side_by_side, self._side_by_side, together)
