@@ -17,7 +17,13 @@ from pydrake.systems.framework import Context
 
 from vtbdrake.components.casadi_system.compiler import compiled_kernel
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
-from vtbdrake.components.compiled_plant.links import UnsupportedPlantError, constant_pose, contacts, times
+from vtbdrake.components.compiled_plant.links import (
+    UnsupportedPlantError,
+    constant_pose,
+    contacts,
+    rounding_beside,
+    times,
+)
 from vtbdrake.state.multibody import bodies
 
 Expression = Any  # casadi.SX
@@ -215,7 +221,8 @@ class PointContact:
         return J, normal, distance
 
     def _pose(self, surface: Surface, q: Expression) -> tuple[Expression, Expression]:
-        return times(self._model.body_pose(surface.body, q), constant_pose(surface.X_BG))
+        rounding = rounding_beside(np.max(np.abs(surface.X_BG.translation())))
+        return times(self._model.body_pose(surface.body, q), constant_pose(surface.X_BG, rounding))
 
     # -- the solver
 
