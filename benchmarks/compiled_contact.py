@@ -15,7 +15,7 @@ STEP, HORIZON, ROLLOUTS = 0.005, 2.0, 64
 
 
 def compiled_contact(repeats: int = 5) -> list[Benchmark]:
-    """Compare the time of a step with that of Drake's SAP and of MuJoCo's Newton solver."""
+    """Compare the time of a step with the same in Drake, by SAP, and in MuJoCo, by its Newton solver."""
     diagram, plant = quadruped("sap", time_step=STEP)
     context = diagram.CreateDefaultContext()
     rollouts = CompiledRollouts(

@@ -136,7 +136,7 @@ def test_recordings_of_the_gallery_move() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_blocks_of_one_thing_stand_together(page: Path) -> None:
-    """What the site shows as tabs: a label in Python and one on the command line, each right above its block."""
+    """The site shows them as tabs: a label in Python and one on the command line, each right above its block."""
     text = page.read_text("utf-8")
     labels = re.findall(r"^\*\*(In Python|On the command line)\*\*\n\n```(\w+)$", text, re.MULTILINE)
     assert len(labels) == len(re.findall(r"^\*\*(?:In Python|On the command line)\*\*", text, re.MULTILINE))

@@ -202,7 +202,7 @@ def argument_names(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_metho
 def misdescribed(body: list[ast.stmt], *, is_method: bool = False) -> Iterator[tuple[int, str]]:
     """Yield line and name of public functions whose two or more arguments are not those that their docstring describes.
 
-    A method without a docstring is skipped: it inherits one.
+    A method without a docstring is skipped: it inherits one. So is an overload: the function itself has one.
 
     Args:
         body: The statements of a module, or of a class.
@@ -213,7 +213,8 @@ def misdescribed(body: list[ast.stmt], *, is_method: bool = False) -> Iterator[t
             yield from misdescribed(node.body, is_method=True)
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("_"):
             names, text = argument_names(node, is_method=is_method), ast.get_docstring(node)
-            if len(names) < 2 or is_command(node) or (is_method and text is None):
+            is_overload = any(isinstance(each, ast.Name) and each.id == "overload" for each in node.decorator_list)
+            if len(names) < 2 or is_command(node) or is_overload or (is_method and text is None):
                 continue
             section = SECTION.search(text or "")
             entries = DESCRIBED.findall(section[1]) if section else []

@@ -50,7 +50,7 @@ def quadruped(
 
     Args:
         approximation: Drake's name of the contact approximation.
-        time_step: Of plant and controller, in s.
+        time_step: The time step of the plant, and the period of the controller, in s.
         playground: The ground is a slope, feet touch each other, there are a box and two balls, and materials differ.
     """
     builder = DiagramBuilder()

@@ -25,7 +25,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, inertia, quadruped, surface
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
-from vtbdrake.components.casadi_system import compiler
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.components.compiled_plant.contact import PointContact
 from vtbdrake.state.systems import collect
@@ -55,7 +54,7 @@ class Steps:
         q, v, u = model.symbols()
         tau = model.actuation(u)
         step = self.contact.step(q, v, tau)
-        touching = [self.contact._touch(pair, q) for pair in self.contact.pairs]
+        touching = [self.contact.touch(pair, q) for pair in self.contact.pairs]
         balance = model.momentum_balance(q, v, tau, plant.time_step())
         parts = [
             *balance,
@@ -269,7 +268,6 @@ def test_other_approximations_and_models_are_refused_by_name() -> None:
 
 def test_without_a_compiler_contact_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
-    monkeypatch.setattr(compiler, "_KERNELS", {})
     with pytest.raises(UnsupportedTestbedError, match="solver is written in C: .*no-such-compiler.*install one"):
         compiled(ball_on(HalfSpace(), "sap")[0])
 

@@ -196,7 +196,7 @@ _MODELS = {
 OF_THE_ROBOT = "holds or stands or hovers or moves or shifts or believed or drives"
 # The time after which a robot is given up, in s.
 _LONGEST = 1800.0
-# A server with all that has been imported, of which every robot gets a fork.
+# A server that has imported everything; every robot gets a fork.
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(["vtbdrake.project", "vtbdrake.testing.checks", "vtbdrake.testing.lock_step", "pytest"])
 

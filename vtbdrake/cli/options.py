@@ -323,12 +323,12 @@ def scenario_argument(
     """
 
     @wraps(command)
-    def with_scenario(*, scenario: Any, scenario_fields: tuple[tuple[str, Any], ...], **others: Any) -> Any:
+    def with_scenario(*, scenario: Any, scenario_fields: tuple[tuple[str, Any], ...], **parameters: Any) -> Any:
         from vtbdrake.testbed import Scenario
 
         if isinstance(scenario, Scenario):
             scenario = scenario.with_fields(settings(scenario_fields))
-        return command(scenario=scenario, **others)
+        return command(scenario=scenario, **parameters)
 
     argument = click.argument("scenario", callback=converted(parse), shell_complete=complete, metavar=metavar)
     decorated = argument(_field_option(with_scenario))

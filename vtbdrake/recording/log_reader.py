@@ -390,9 +390,9 @@ def read_log(path: str | os.PathLike[str], scenario: Scenario | None = None) -> 
 
     With a scenario, the `Log` of its vector signals is returned. What a `Recorder` has written is in
     `ControlLog.signals`; a log of another program, such as lcm-logger, is read through the `Protocol` of the scenario,
-    by the rules of `LcmBridge`. Its times are those of the events, in s since the first one: when the logger received a
-    message. It has no switches and no state of the DPS. `Log.remarks` say what else is missing: signals without
-    messages, damaged events, messages that were rejected.
+    by the rules of `LcmBridge`. The times are when the logger received a message, in s since the first event. It has no
+    switches and no state of the DPS. `Log.remarks` say what else is missing: signals without messages, damaged events,
+    messages that were rejected.
 
     Args:
         path: Path of the file.

@@ -20,7 +20,7 @@ LOG_TIME = "log_time"
 """The column of a topic with the times at which its messages were recorded, in s."""
 
 _SECONDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
-"""Fields of time stamps: those of ROS 2, of ROS 1 and Foxglove's JSON, and of protobuf."""
+"""Fields of time stamps in ROS 2, in ROS 1 and Foxglove's JSON, and in protobuf."""
 
 _MAGIC = b"\x89MCAP0\r\n"
 """The last bytes of an MCAP file that is whole, and the first ones of every one."""
@@ -96,7 +96,7 @@ class MessageTable(ABC, Mapping[str, Any]):
 
 
 def _names(message: Any) -> list[str]:
-    """Return the names of the fields of a message: JSON's, protobuf's or those of a dataclass."""
+    """Return the names of the fields of a message in JSON, in protobuf or as a dataclass."""
     if isinstance(message, Mapping):
         return [*message]
     if hasattr(message, "DESCRIPTOR"):

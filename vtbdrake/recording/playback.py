@@ -136,10 +136,10 @@ def feed(
     over when all its sensor signals have come. So a log that lacks the state of a DPS can be replayed and viewed.
 
     Args:
-        log: The log, whose vector signals are those of the DPS.
+        log: The log, which has the vector signals of the DPS.
         scenario: The scenario of the DPS, which is stepped alone, as fast as it computes.
         path: Path of the file that is written.
-        period: The period of the loop, in s; None: that of the scenario's deployment.
+        period: The period of the loop, in s; None: as in the scenario's deployment.
         overwrite: Whether to replace an existing file.
 
     Raises:

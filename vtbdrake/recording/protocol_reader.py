@@ -20,7 +20,7 @@ from vtbdrake.recording.log_events import LogEvents
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.testbed import Scenario, Signal
 
-_REORDER_WINDOW = 0.1  # s, as that of a bridge
+_REORDER_WINDOW = 0.1  # s, as in a bridge
 
 _REASONS = {
     "fingerprint": "of another message type",
@@ -53,13 +53,13 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
     trouble: list[str] = []
 
     def read(maps: Sequence[LcmMap], signals: Sequence[Signal], reported: Sequence[Signal] = ()) -> dict[str, Series]:
-        kept = {signal.name: _KeptSamples() for signal in signals if signal.is_vector}
-        others = {signal.name: ReceivedSignal() for signal in (*signals, *reported) if signal.name not in kept}
+        vectors = {signal.name: _KeptSamples() for signal in signals if signal.is_vector}
+        abstract = {signal.name: ReceivedSignal() for signal in (*signals, *reported) if signal.name not in vectors}
         for map in maps:
-            trouble.extend(_read_channel(ordered, map, [*signals, *reported], kept | others))
+            trouble.extend(_read_channel(ordered, map, [*signals, *reported], vectors | abstract))
         return {
             name: checked_series(f"{source}: {name}", np.array(samples.times), np.array(samples.values), remarks)
-            for name, samples in kept.items()
+            for name, samples in vectors.items()
             if samples.values
         }
 
@@ -101,7 +101,7 @@ class _OrderedEvents:
         self._events = events
         self._places = {channel: _in_order(events.places(channel)) for channel in events.channels}
         self._origin = min((int(places[0, 1]) for places in self._places.values()), default=0)
-        self.remarks = [f"time 0 is that of the first event, {np.datetime64(self._origin, 'us')} UTC"]
+        self.remarks = [f"the first event, at time 0, is of {np.datetime64(self._origin, 'us')} UTC"]
         if events.damages:
             offset, kind = events.damages[0]
             self.remarks.append(
@@ -131,12 +131,12 @@ def _in_order(places: np.ndarray) -> np.ndarray:
         length = bisect_right(times, time)
         before.append(last[length - 1] if length else -1)
         times[length : length + 1], last[length : length + 1] = [time], [k]
-    kept = []
+    rows = []
     k = last[-1]
     while k >= 0:
-        kept.append(k)
+        rows.append(k)
         k = before[k]
-    return places[kept[::-1]]
+    return places[rows[::-1]]
 
 
 def _read_channel(

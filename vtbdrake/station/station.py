@@ -36,14 +36,18 @@ _DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"  # LCM's default
 
 @dataclass
 class StationCommand:
-    """A command u of a station's DPS: an input port for what an operator or a task asks of it."""
+    """A command u of a station's DPS: an input port for what an operator or a task asks of it.
 
-    default: list[float] = field(default_factory=list)  # the values that it has at first
+    Attributes:
+        default: The values that it has at first.
+        entry_names: Short names of the entries; empty: the joints of the arm that the command's name begins with, if
+            there is one, and an entry for each of them.
+    """
+
+    default: list[float] = field(default_factory=list)
     unit: str = setting("1", "The unit of the values.")
     lower: float | None = setting(None, "The least value of each entry.")
     upper: float | None = setting(None, "The largest value of each entry.")
-    # Short names of the entries; empty: the joints of the arm that the command's name begins with, if there is one, and
-    # an entry for each of them.
     entry_names: list[str] = field(default_factory=list)
 
     def signal(self, name: str) -> Signal:

@@ -44,7 +44,7 @@ class Surface:
         shape: Its shape.
         X_BG: Its pose in the body's frame.
         stiffness: Stiffness of its material, in N/m.
-        dissipation: Of its material: the relaxation time (s), or Hunt and Crossley's dissipation (s/m) if the plant's
+        dissipation: The material's relaxation time (s), or Hunt and Crossley's dissipation (s/m) if the plant's
             approximation is lagged.
         friction: Coefficient of dynamic friction.
     """
@@ -60,7 +60,12 @@ class Surface:
 
 @dataclass(frozen=True)
 class Pair:
-    """A sphere, and another geometry that it may touch."""
+    """Two geometries that may touch.
+
+    Attributes:
+        sphere: One of them, a sphere.
+        other: The other one.
+    """
 
     sphere: Surface
     other: Surface
@@ -119,7 +124,7 @@ class PointContact:
         Args:
             q: Positions, shape (nq, 1).
             v: Velocities, shape (nv, 1).
-            tau: Generalized forces without those of contact, shape (nv, 1).
+            tau: Generalized forces, without contact, shape (nv, 1).
 
         Returns:
             The velocities, shape (nv, 1); the forces on the other geometry of each of the pairs, in the world, shape
@@ -127,7 +132,7 @@ class PointContact:
         """
         period = self._plant.time_step()
         A, p_star = self._model.momentum_balance(q, v, tau, period)
-        J, normals, distances = zip(*(self._touch(pair, q) for pair in self.pairs), strict=True)
+        J, normals, distances = zip(*(self.touch(pair, q) for pair in self.pairs), strict=True)
         material = casadi.DM(np.array([pair.material(is_lagged=self._is_lagged) for pair in self.pairs]))
         arguments = (
             A, p_star, v, casadi.vertcat(*J), casadi.horzcat(*normals), casadi.vertcat(*distances),
@@ -212,8 +217,18 @@ class PointContact:
         share = stiffnesses / stiffnesses.sum()
         return share[0] * on_sphere + share[1] * on_other, -n, distance
 
-    def _touch(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
-        """Return the Jacobian of the velocity of the other against the sphere, the normal and the distance."""
+    def touch(self, pair: Pair, q: Expression) -> tuple[Expression, Expression, Expression]:
+        """Return Jacobian, normal and distance of a pair.
+
+        Args:
+            pair: The pair.
+            q: Positions, shape (nq, 1).
+
+        Returns:
+            The Jacobian of the velocity of the other geometry against the sphere, at the point of contact, shape
+            (3, nv); the normal from the sphere into the other, shape (3, 1), both in the world; and the distance in m,
+            below 0 in contact.
+        """
         point, normal, distance = self._meet(pair, q)
         J = self._model.point_jacobian(pair.other.body, point, q) - self._model.point_jacobian(
             pair.sphere.body, point, q
@@ -294,7 +309,7 @@ def _elimination_tree(cliques: Sequence[Sequence[int]], size: int) -> list[int]:
 
 
 def _signature(name: str, shapes_in: Sequence[tuple[int, int]], shapes_out: Sequence[tuple[int, int]]) -> str:
-    """Return what CasADi asks a library about a function of dense matrices."""
+    """Return the C functions that describe a function of dense matrices to CasADi."""
     parts = []
     for kind, shapes in (("in", shapes_in), ("out", shapes_out)):
         table = ", ".join(f"{{{rows}, {columns}, 1}}" for rows, columns in shapes)

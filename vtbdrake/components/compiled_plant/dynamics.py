@@ -420,7 +420,12 @@ class PlantDynamics:
         return self.body_pose(int(body.index()), q)
 
     def body_pose(self, body: int, q: Expression) -> Pose:
-        """Return the pose of the body with an index in the world, (R_WB, p_WB)."""
+        """Return the pose of a body in the world, (R_WB, p_WB).
+
+        Args:
+            body: Index of the body.
+            q: Positions, shape (nq, 1).
+        """
         k, X_MB = self._mounts[body]
         return X_MB if k < 0 else times(self._poses(q)[k], X_MB)
 
