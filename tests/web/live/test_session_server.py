@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import re
 import socket as socketlib
 import urllib.error
 import urllib.request
@@ -227,7 +226,7 @@ def test_meshcat_that_has_ended_is_told_to_the_browser(monkeypatch: pytest.Monke
     with socketlib.socket() as closed:
         closed.bind(("127.0.0.1", 0))  # which does not listen
         address = f"http://127.0.0.1:{closed.getsockname()[1]}"
-        host = Host(lambda: address, script="theme.js", serve=nothing)
+        host = Host(lambda: address, script="view.js", serve=nothing)
         url = entered(host.address())
         try:
             for path in ("", "favicon.ico"):
@@ -235,14 +234,6 @@ def test_meshcat_that_has_ended_is_told_to_the_browser(monkeypatch: pytest.Monke
                 assert status == 502 and "Meshcat does not answer: " in text
         finally:
             host.close()
-
-
-def test_browser_is_told_at_once_all_that_the_page_needs(running: View) -> None:
-    _, text, _ = ask(entered(running.url))
-    head, body = text.split("</head>")
-    needed = {"view.css", "vendor/uPlot.min.css", "view.js", "common.js", "watched.js", "pad.js", "vr.js"}
-    assert needed <= set(re.findall(r'href="page/([^"]+)"', head))
-    assert "uPlot.iife.min.js" in body
 
 
 def test_one_page_steers_and_the_others_watch(running: View) -> None:

@@ -83,7 +83,6 @@ class Server:
         self.host = Host(
             lambda: session.meshcat_url,
             script="view.js",
-            needs=("view.css", "vendor/uPlot.min.css", "vendor/uPlot.iife.min.js"),
             packages=("vtbdrake.web.live", "vtbdrake.web.vr", "vtbdrake.visualization"),
             serve=self._serve_page,
             routes=routes,

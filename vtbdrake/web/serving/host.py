@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import reprlib
 import socket
 import threading
@@ -14,7 +13,6 @@ import webbrowser
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
@@ -42,7 +40,6 @@ CLOSED = (WebSocketDisconnect, websockets.ConnectionClosed, OSError, RuntimeErro
 NEXT_MESHCAT_TIME = 10.0  # s of wall time, for a Meshcat that follows one that has died
 _MESHCAT_PERIOD = 0.1  # s of wall time between two looks for it
 _NO_MESHCAT = 502  # status: Bad Gateway
-_IMPORT = re.compile(r'^(?:import\b[^"]*|} from )"\./([\w.]+)";$', re.MULTILINE)  # of another module of a page
 _CLEAR = msgpack.packb({"type": "delete", "path": "/drake"})  # removes what a Meshcat has drawn
 # Meshcat is on this machine, whatever proxies the environment names.
 _OPENER = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -59,7 +56,6 @@ class Host:
         meshcat_url: Returns the address of the Meshcat that the page shows; empty while there is none. If one dies, the
             page goes on with the next.
         script: The module that Meshcat's page loads, in one of the folders ``page``; empty for none.
-        needs: What the module needs, in these folders: stylesheets (.css), and scripts that run before it (.js).
         packages: Packages whose folders ``page`` are served at ``page/``, beside the one of this package.
         serve: Serves the socket of one page, from its acceptance on; None if there is none.
         routes: What else is served.
@@ -78,7 +74,6 @@ class Host:
         meshcat_url: Callable[[], str],
         *,
         script: str = "",
-        needs: Collection[str] = (),
         packages: Collection[str] = (),
         serve: Callable[[WebSocket], Awaitable[None]] | None = None,
         routes: Collection[BaseRoute] = (),
@@ -87,14 +82,8 @@ class Host:
         tls: Tls | None = None,
     ) -> None:
         self._meshcat_url, self._serve = meshcat_url, serve
-        files = StaticFiles(packages=[(name, "page") for name in (__package__, *packages)])
-        styles = [f'<link rel="stylesheet" href="page/{name}">\n' for name in needs if name.endswith(".css")]
-        scripts = [f'<script defer src="page/{name}"></script>\n' for name in needs if name.endswith(".js")]
-        # All are asked for at once: one after another, each would wait until Meshcat has drawn.
-        modules = [f'<link rel="modulepreload" href="page/{name}">\n' for name in _modules(script, files)]
-        self._head = "".join([*styles, *modules])
         # Behind the last script of Meshcat's page, whose viewer it uses.
-        self._scripts = "".join([*scripts, f'<script type="module" src="page/{script}"></script>\n'] if script else [])
+        self._script = f'<script type="module" src="page/{script}"></script>\n' if script else ""
         for name in hosts:
             check_host(name)
         self._socket = _listen(port, *(tls.address() if tls else (socket.AF_INET, "127.0.0.1")))
@@ -104,7 +93,7 @@ class Host:
                 *([WebSocketRoute("/session", until_closed(self._serve_socket))] if serve else []),
                 WebSocketRoute("/", until_closed(self._relay_meshcat)),
                 *routes,
-                Mount("/page", files),
+                Mount("/page", StaticFiles(packages=[(name, "page") for name in (__package__, *packages)])),
                 Route("/", self._index),
                 Route("/{path:path}", self._asset),
             ]
@@ -174,8 +163,7 @@ class Host:
         status, body, kind = await self._fetched("")
         head, end, tail = body.decode().rpartition("</body>")
         headers = {"X-Content-Type-Options": "nosniff"}  # Not of assets: Meshcat calls its script text.
-        head = head.replace("</head>", f"{self._head}</head>", 1)
-        return Response(f"{head}{self._scripts}{end}{tail}", status_code=status, media_type=kind, headers=headers)
+        return Response(f"{head}{self._script}{end}{tail}", status_code=status, media_type=kind, headers=headers)
 
     async def _asset(self, request: Request) -> Response:
         path = quote(request.path_params["path"])
@@ -353,16 +341,6 @@ def until_closed(serve: Callable[[WebSocket], Awaitable[None]]) -> Callable[[Web
             await serve(browser)
 
     return serve_until_closed
-
-
-def _modules(script: str, files: StaticFiles) -> list[str]:
-    """Return a module with all that it imports, directly or not; nothing for an empty name."""
-    names = [script] if script else []
-    for name in names:
-        path, _ = files.lookup_path(name)
-        imported = _IMPORT.findall(Path(path).read_text(encoding="utf-8"))
-        names += [other for other in dict.fromkeys(imported) if other not in names]
-    return names
 
 
 def _listen(port: int, family: socket.AddressFamily, address: str) -> socket.socket:

@@ -87,7 +87,6 @@ class StudyView(WebPage):
                 Host(
                     lambda: self.scene.meshcat_url,
                     script="study.js",
-                    needs=("view.css", "study.css"),
                     packages=("vtbdrake.web.study", "vtbdrake.visualization"),  # uPlot: in page/vendor of the latter
                     serve=self._serve_page,
                     port=port,

@@ -1,7 +1,7 @@
 // The controls of a session, beside Meshcat's viewer, whose page loads this module.
 
 import { Camera } from "./camera.js";
-import { Connection, Telling, button, choice, element, isHeld } from "./common.js";
+import { Connection, Telling, button, choice, element, isHeld, load } from "./common.js";
 import { Drive } from "./drive.js";
 import { GhostLegend, otherCourse } from "./ghost_legend.js";
 import { Keep } from "./keep.js";
@@ -494,5 +494,10 @@ class Page extends Telling {
   }
 }
 
+await Promise.all([
+  load("link", { rel: "stylesheet", href: "page/view.css" }),
+  load("link", { rel: "stylesheet", href: "page/vendor/uPlot.min.css" }),
+  load("script", { src: "page/vendor/uPlot.iife.min.js" }),
+]);
 globalThis.vtb = new Page();
 vtb.camera.followBody();

@@ -19,6 +19,17 @@ export function element(tag, properties = {}, ...children) {
 }
 
 /**
+ * @param {"script" | "link"} tag
+ * @param {Record<string, any>} properties
+ * @returns {Promise<Event>} fulfilled when it is loaded
+ */
+export function load(tag, properties) {
+  return new Promise((resolve, reject) => {
+    document.head.append(element(tag, { ...properties, onload: resolve, onerror: reject }));
+  });
+}
+
+/**
  * @param {number | string | null | undefined} value
  * @param {number} [digits]
  * @returns {string} its text; "none" for none

@@ -1,7 +1,7 @@
 // The page of a study, beside Meshcat's viewer, whose page loads this module.
 
 import { Attempts } from "./attempts.js";
-import { Connection, Telling, button, counted, element, number, replaceContent } from "./common.js";
+import { Connection, Telling, button, counted, element, load, number, replaceContent } from "./common.js";
 import { Interventions } from "./interventions.js";
 import { Playback } from "./playback.js";
 import { Rollouts } from "./rollouts.js";
@@ -381,4 +381,8 @@ class Page extends Telling {
   }
 }
 
+await Promise.all([
+  load("link", { rel: "stylesheet", href: "page/view.css" }),
+  load("link", { rel: "stylesheet", href: "page/study.css" }),
+]);
 globalThis.vtb = new Page();
