@@ -129,7 +129,8 @@ def test_keys_that_are_pressed_twice_between_two_frames_count_twice(page: Page, 
         page.keyboard.press(key)
     assert commands(page) == ["play", "speed", "speed", "pause"]
     page.evaluate(RELEASE)
-    page.wait_for_function("vtb.speed.value === '4' && vtb.playButton.textContent === 'play'")
+    page.wait_for_function("vtb.reflects(vtb.session.asked)")
+    assert page.evaluate("[vtb.speed.value, vtb.playButton.textContent]") == ["4", "play"]
     assert running.session.latest is not None
     assert (running.session.latest.speed, running.session.latest.playing) == (4.0, False)
 
