@@ -138,7 +138,8 @@ class PointContact:
             A, p_star, v, casadi.vertcat(*J), casadi.horzcat(*normals), casadi.vertcat(*distances),
             *casadi.horzsplit(casadi.SX(material)),
         )  # fmt: skip
-        return tuple(self._kernel(*map(casadi.densify, arguments)))
+        v_next, forces, doubt = self._kernel(*map(casadi.densify, arguments))
+        return v_next, forces, doubt
 
     def forces_on(self, body: int, forces: Expression, q: Expression) -> Iterator[tuple[Expression, Expression]]:
         """Yield the contact forces on a body: where they act, and what they are; both in the world, shape (3, 1).
