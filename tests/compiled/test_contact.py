@@ -26,7 +26,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, inertia, quadruped, surface
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.components.compiled_plant import PlantDynamics
-from vtbdrake.components.compiled_plant.contact import PointContact
+from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
 from vtbdrake.state.systems import collect
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
@@ -50,7 +50,7 @@ class Steps:
         self.root = self.diagram.CreateDefaultContext()
         self.context: Context = plant.GetMyMutableContextFromRoot(self.root)
         model = PlantDynamics(plant, plant.CreateDefaultContext())
-        self.contact = PointContact(plant, self.context, model)
+        self.contact = PointContact(plant, model, contact_pairs(plant, self.context))
         q, v, u = model.symbols()
         tau = model.actuation(u)
         step = self.contact.step(q, v, tau)

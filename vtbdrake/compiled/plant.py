@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import casadi
@@ -15,7 +16,7 @@ from vtbdrake.compiled.equations import At, Equations, Expression, Timing, refus
 from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
-from vtbdrake.components.compiled_plant.contact import PointContact, has_contact
+from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
 from vtbdrake.state.multibody import POSE_ENTRIES, bodies, element_address, multibody_variables
 from vtbdrake.state.variables import A, Variable
 
@@ -63,15 +64,20 @@ class PlantEquations(Equations):
         bare = system.CreateDefaultContext()
         bare.SetTimeStateAndParametersFrom(context)
         self._inputs = {v.address: int(np.prod(v.shape)) for v in _inputs(system)}
-        try:
+        reasons: list[str] = []
+        with _noted(reasons):
             self._model = PlantDynamics(system, bare, inputs=sorted(varied & self._inputs.keys()))
-            self._contact = PointContact(system, context, self._model) if has_contact(system, context) else None
-        except (UnsupportedPlantError, ValueError) as error:
-            raise refusal(system, f"is refused: {error}") from None
-        except CompilerError as error:
-            raise refusal(system, f"has contact, whose solver is written in C: {error}") from None
-        if self._contact is not None:
+        with _noted(reasons):
+            pairs = contact_pairs(system, context)
+        if reasons:
+            raise refusal(system, f"is refused: {'; '.join(reasons)}")
+        self._contact: PointContact | None = None
+        if pairs:
             self.agreement = _AGREEMENT_IN_CONTACT
+            try:
+                self._contact = PointContact(system, self._model, pairs)
+            except CompilerError as error:
+                raise refusal(system, f"has contact, whose solver is written in C: {error}") from None
         self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
         self.extras = {address: self._inputs[address] for address in self._model.inputs}
 
@@ -191,6 +197,15 @@ class PlantEquations(Equations):
                 starts = [self._plant.get_joint_actuator(index).input_start() for index in indices]
                 u[starts] += at.input(port)
         return u
+
+
+@contextmanager
+def _noted(reasons: list[str]) -> Iterator[None]:
+    """Add the reason of a refusal to the others."""
+    try:
+        yield
+    except (UnsupportedPlantError, ValueError) as error:
+        reasons.append(str(error))
 
 
 def _force(force: AppliedForce | ExternallyAppliedSpatialForce) -> AppliedForce:

@@ -28,7 +28,7 @@ from vtbdrake.state.multibody import bodies
 
 Expression = Any  # casadi.SX
 
-_APPROXIMATIONS = {DiscreteContactApproximation.kSap: 0, DiscreteContactApproximation.kLagged: 1}
+_APPROXIMATIONS = (DiscreteContactApproximation.kSap, DiscreteContactApproximation.kLagged)
 # m/s, MultibodyPlantConfig's default; a plant does not tell its own. Used by lagged friction.
 _STICTION_TOLERANCE = 1e-4
 _OTHERS = (Sphere, HalfSpace, Box)
@@ -81,14 +81,79 @@ class Pair:
         return stiffness, dissipation, 2.0 * a.friction * b.friction / both if both else 0.0
 
 
-def has_contact(plant: MultibodyPlant, context: Context) -> bool:
-    """Return whether bodies of a plant may touch each other.
+def contact_pairs(plant: MultibodyPlant, context: Context) -> tuple[Pair, ...]:
+    """Return the pairs of geometries that may touch.
 
     Args:
-        plant: The plant, finalized.
+        plant: The discrete plant, finalized.
         context: The plant's own Context; unless its geometry query is connected, there is no contact.
+
+    Raises:
+        UnsupportedPlantError: A shape, a contact model or an approximation is not compiled.
     """
-    return any(contacts(plant, context))
+    if not any(contacts(plant, context)):
+        return ()
+    approximation = plant.get_discrete_contact_approximation()
+    if approximation not in _APPROXIMATIONS:
+        raise UnsupportedPlantError(
+            f"contact approximated as {approximation.name} is not compiled: set discrete_contact_approximation to "
+            "'sap' or 'lagged'"
+        )
+    return tuple(_PairReader(plant, plant.get_geometry_query_input_port().Eval(context).inspector()))
+
+
+class _PairReader:
+    """Reads the pairs of geometries that may touch."""
+
+    def __init__(self, plant: MultibodyPlant, inspector: SceneGraphInspector) -> None:
+        self._plant, self._inspector = plant, inspector
+        dissipation = "hunt_crossley_dissipation" if _is_lagged(plant) else "relaxation_time"
+        self._kinds = "point_contact_stiffness", dissipation
+
+    def __iter__(self) -> Iterator[Pair]:
+        plant = self._plant
+        body_of = {
+            geometry: (int(body.index()), body.name())
+            for body in (plant.world_body(), *bodies(plant))
+            for geometry in plant.GetCollisionGeometriesForBody(body)
+        }
+        candidates = self._inspector.GetCollisionCandidates()
+        for first, second in sorted(candidates, key=lambda ids: [i.get_value() for i in ids]):
+            if first in body_of and second in body_of:
+                yield self._pair(*(self._surface(geometry, *body_of[geometry]) for geometry in (first, second)))
+
+    def _pair(self, first: Surface, second: Surface) -> Pair:
+        for sphere, other in ((first, second), (second, first)):
+            if isinstance(sphere.shape, Sphere) and isinstance(other.shape, _OTHERS):
+                return Pair(sphere, other)
+        raise UnsupportedPlantError(
+            f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
+            "is not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
+            "CollisionFilterDeclaration"
+        )
+
+    def _surface(self, geometry: GeometryId, body: int, body_name: str) -> Surface:
+        inspector = self._inspector
+        properties = inspector.GetProximityProperties(geometry)
+        name = f"{inspector.GetName(geometry)} of {body_name}"
+        # A half-space has no mesh, but what touches it has one if their contact is hydroelastic.
+        has_mesh = inspector.maybe_get_hydroelastic_mesh(geometry) is not None
+        if has_mesh and self._plant.get_contact_model() != ContactModel.kPoint:
+            raise UnsupportedPlantError(f"hydroelastic contact of {name} is not compiled: set contact_model to 'point'")
+        missing = [kind for kind in self._kinds if not properties.HasProperty("material", kind)]
+        if missing:
+            raise UnsupportedPlantError(
+                f"{name} has no {' and no '.join(missing)}: give it one (AddContactMaterial), or leave those of "
+                "SceneGraphConfig.default_proximity_properties"
+            )
+        stiffness, dissipation = (float(properties.GetProperty("material", kind)) for kind in self._kinds)
+        friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+        shape, X_BG = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
+        return Surface(name, body, shape, X_BG, stiffness, dissipation, friction)
+
+
+def _is_lagged(plant: MultibodyPlant) -> bool:
+    return plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kLagged
 
 
 class PointContact:
@@ -96,26 +161,19 @@ class PointContact:
 
     Args:
         plant: The discrete plant, finalized.
-        context: The plant's own Context, whose geometry query is connected.
         model: The plant's equations.
+        pairs: What may touch, see `contact_pairs`; at least one.
 
     Attributes:
         pairs: What may touch.
 
     Raises:
-        UnsupportedPlantError: A shape, a contact model or an approximation is not compiled.
+        CompilerError: There is no C compiler, or it fails.
     """
 
-    def __init__(self, plant: MultibodyPlant, context: Context, model: PlantDynamics) -> None:
-        approximation = plant.get_discrete_contact_approximation()
-        if approximation not in _APPROXIMATIONS:
-            raise UnsupportedPlantError(
-                f"contact approximated as {approximation.name} is not compiled: set discrete_contact_approximation to "
-                "'sap' or 'lagged'"
-            )
-        self._is_lagged = bool(_APPROXIMATIONS[approximation])
-        self._plant, self._model = plant, model
-        self.pairs = tuple(self._read(plant.get_geometry_query_input_port().Eval(context).inspector()))
+    def __init__(self, plant: MultibodyPlant, model: PlantDynamics, pairs: Sequence[Pair]) -> None:
+        self._is_lagged = _is_lagged(plant)
+        self._plant, self._model, self.pairs = plant, model, tuple(pairs)
         self._kernel = compiled_kernel(*self._source())
 
     def step(self, q: Expression, v: Expression, tau: Expression) -> tuple[Expression, Expression, Expression]:
@@ -153,47 +211,6 @@ class PointContact:
             for surface, sign in ((pair.sphere, 1.0), (pair.other, -1.0)):
                 if surface.body == body:
                     yield self._meet(pair, q)[0], sign * forces[:, i]
-
-    # -- what may touch
-
-    def _read(self, inspector: SceneGraphInspector) -> Iterator[Pair]:
-        body_of = {
-            geometry: (int(body.index()), body.name())
-            for body in (self._plant.world_body(), *bodies(self._plant))
-            for geometry in self._plant.GetCollisionGeometriesForBody(body)
-        }
-        for first, second in sorted(inspector.GetCollisionCandidates(), key=lambda ids: [i.get_value() for i in ids]):
-            if first in body_of and second in body_of:
-                yield self._pair(*(self._surface(inspector, g, *body_of[g]) for g in (first, second)))
-
-    def _pair(self, first: Surface, second: Surface) -> Pair:
-        for sphere, other in ((first, second), (second, first)):
-            if isinstance(sphere.shape, Sphere) and isinstance(other.shape, _OTHERS):
-                return Pair(sphere, other)
-        raise UnsupportedPlantError(
-            f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
-            "is not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
-            "CollisionFilterDeclaration"
-        )
-
-    def _surface(self, inspector: SceneGraphInspector, geometry: GeometryId, body: int, body_name: str) -> Surface:
-        properties = inspector.GetProximityProperties(geometry)
-        name = f"{inspector.GetName(geometry)} of {body_name}"
-        # A half-space has no mesh, but what touches it has one if their contact is hydroelastic.
-        has_mesh = inspector.maybe_get_hydroelastic_mesh(geometry) is not None
-        if has_mesh and self._plant.get_contact_model() != ContactModel.kPoint:
-            raise UnsupportedPlantError(f"hydroelastic contact of {name} is not compiled: set contact_model to 'point'")
-        kinds = ["point_contact_stiffness", "hunt_crossley_dissipation" if self._is_lagged else "relaxation_time"]
-        missing = [kind for kind in kinds if not properties.HasProperty("material", kind)]
-        if missing:
-            raise UnsupportedPlantError(
-                f"{name} has no {' and no '.join(missing)}: give it one (AddContactMaterial), or leave those of "
-                "SceneGraphConfig.default_proximity_properties"
-            )
-        stiffness, dissipation = (float(properties.GetProperty("material", kind)) for kind in kinds)
-        friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
-        shape, X_BG = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
-        return Surface(name, body, shape, X_BG, stiffness, dissipation, friction)
 
     # -- where it touches
 
