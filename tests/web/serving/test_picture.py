@@ -60,7 +60,7 @@ def scene(socket: ClientConnection, path: str, kind: str = "set_transform") -> d
 def paths(url: str, *, until: str) -> set[str]:
     """Return the paths of the objects of a Meshcat up to one of them."""
     found = {""}
-    with connect(url.replace("http", "ws", 1), max_size=None, proxy=None) as socket:
+    with connect(url.replace("http", "ws", 1), max_size=None, max_queue=None, proxy=None) as socket:
         while not any(path.startswith(until) for path in found):
             message = msgpack.unpackb(socket.recv(PATIENCE))
             if message["type"] == "set_object":
@@ -140,7 +140,7 @@ def test_picture_of_a_loop_goes_on() -> None:
         frame(session, lambda shown: shown.playing)
         killed(session)
         assert frame(session, lambda shown: bool(shown.picture)).picture.startswith(DIED)
-        with connect(session.meshcat_url.replace("http", "ws", 1), max_size=None, proxy=None) as socket:
+        with connect(session.meshcat_url.replace("http", "ws", 1), max_size=None, max_queue=None, proxy=None) as socket:
             while abs(scene(socket, CART)["matrix"][12] - 0.3) > 1e-6:
                 pass
 
@@ -229,7 +229,7 @@ def test_page_that_is_loaded_while_there_is_no_meshcat_waits_for_the_next() -> N
             assert status == 200 and "viewer" in text and len(waited) == 4
             waited.clear()
             relayed = entered(host.address()).replace("http", "ws", 1)
-            with connect(relayed, max_size=None, proxy=None) as socket:
+            with connect(relayed, max_size=None, max_queue=None, proxy=None) as socket:
                 scene(socket, CAMERA, "set_property")  # It was not shown anything yet, and gets the camera, too.
         finally:
             host.close()
