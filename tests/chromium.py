@@ -89,3 +89,11 @@ def until(take: Callable[[], np.ndarray], shows: Callable[[np.ndarray], bool]) -
     while not shows(picture := take()) and time.monotonic() < end:
         pass
     return picture
+
+
+def in_time(shows: Callable[[], Any]) -> bool:
+    """Return whether pictures that are taken one after the other come to show what they should, see `until`."""
+    end = time.monotonic() + PATIENCE / 1e3
+    while not (shown := shows()) and time.monotonic() < end:
+        pass
+    return bool(shown)

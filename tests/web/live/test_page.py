@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import PATIENCE, needs_chromium, new_page, opened_page, screenshot
+from tests.chromium import PATIENCE, in_time, needs_chromium, new_page, opened_page, screenshot
 from tests.control.scripted import ScriptedBridge
 from tests.web.live.test_drive import LimitedPendulumScenario, problem
 from tests.web.live.test_session import ANGLE, MASS, START, angle, angle_by_hand, frame
@@ -108,30 +108,30 @@ def test_time_runs_and_the_robot_moves(page: Page, running: View) -> None:
     page.keyboard.press("Space")
     drawn(page, "vtb.rate.textContent === 'paused'")
     settle(page)
-    assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.002  # the pole
+    assert in_time(lambda: np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.002)  # the pole
     steps = round(running.session.snapshot().time / running.session.config.step)
     assert angle(running.session) == angle_by_hand(steps)
     page.keyboard.press("r")
     drawn(page, "vtb.clock.textContent === '0.000 s'")
     settle(page)
-    assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) < 0.0005
+    assert in_time(lambda: np.mean(np.abs(picture(page) - before).max(axis=2) > 30) < 0.0005)
 
 
 def test_dragged_slider_previews_and_its_release_commits(page: Page, running: View) -> None:
     page.click("#vtb-step")
     watch(page, ANGLE)
     settle(page)
-    assert share(picture(page), GREEN) < 1e-4
+    assert in_time(lambda: share(picture(page), GREEN) < 1e-4)
     drag(page, 0.7)
     page.wait_for_selector("[data-kind=preview]")
     drawn(page, "vtb.messages.textContent.includes('preview until 2.01 s')")
     settle(page)
-    assert share(picture(page), GREEN) > 0.002
+    assert in_time(lambda: share(picture(page), GREEN) > 0.002)
     page.keyboard.press("Escape")
     page.wait_for_selector("[data-kind=preview]", state="detached")
     page.mouse.up()
     settle(page)
-    assert share(picture(page), GREEN) < 1e-4
+    assert in_time(lambda: share(picture(page), GREEN) < 1e-4)
     assert angle(running.session) == angle_by_hand(1)  # Esc does nothing.
     drag(page, 0.7)
     drawn(page, f"vtb.watched.get('{ANGLE}').draft === 'open'")
@@ -201,7 +201,7 @@ def test_place_dragged_in_the_scene_previews_and_its_release_commits(browser: Br
             page.mouse.move(*aside, steps=4)
             page.wait_for_selector("[data-kind=preview]")
             settle(page)
-            assert share(picture(page), GREEN) > 0.0005
+            assert in_time(lambda: share(picture(page), GREEN) > 0.0005)
             assert page.evaluate(knob) != knob_at_start  # The pad shows the draft, too.
             if cancelled:
                 page.keyboard.press("Escape")
@@ -239,7 +239,7 @@ def test_course_without_the_change_is_a_ghost_with_a_table(page: Page, running: 
     page.click("#vtb-play")
     settle(page)
     assert MASS in page.inner_text("#vtb-differences")
-    assert share(picture(page), BLUE) > 0.002
+    assert in_time(lambda: share(picture(page), BLUE) > 0.002)
     assert float(running.session.snapshot().values[MASS]) == 0.9
 
 
@@ -262,7 +262,7 @@ def test_scrubbed_history_goes_back(page: Page, running: View) -> None:
     assert page.inner_text("#vtb-differences").startswith("differs first from the other branch (orange):")
     settle(page)
     # Where the pole was, there is the ghost of the other branch.
-    assert share(picture(page), YELLOW) > share(before, YELLOW) + 0.002
+    assert in_time(lambda: share(picture(page), YELLOW) > share(before, YELLOW) + 0.002)
 
 
 def test_camera_follows_a_body(page: Page) -> None:
@@ -351,6 +351,7 @@ def test_saved_snapshot_opens_with_the_same_camera(page: Page, running: View, br
     with view(CartPoleScenario(), start=snapshot) as again:
         second = new_page(browser)
         second.goto(again.url)
+        drawn(second, "window.viewer")
         drawn(second, "Math.abs(viewer.camera.position.x - 0.9) < 1e-6 && viewer.controls.target.x === 0.1")
         camera = "[...viewer.camera.position.toArray(), ...viewer.controls.target.toArray()]"
         np.testing.assert_allclose(second.evaluate(camera), page.evaluate(camera), atol=1e-6)
@@ -522,7 +523,7 @@ def test_log_is_replayed_and_left_with_its_course_as_a_ghost(browser: Browser, t
         drawn(opened, "parseFloat(vtb.clock.textContent) > 0.5")
         opened.keyboard.press("Space")
         drawn(opened, "vtb.rate.textContent === 'paused'")
-        assert share(picture(opened), PURPLE) < 1e-4
+        assert in_time(lambda: share(picture(opened), PURPLE) < 1e-4)
         watch(opened, "u.angle")
         assert opened.evaluate(text_of("u.angle")) == "0.9"
         opened.fill(f"{watched('u.angle')} input[type=text]", "-0.9")
@@ -532,8 +533,8 @@ def test_log_is_replayed_and_left_with_its_course_as_a_ghost(browser: Browser, t
         running.session.advance(40)
         drawn(opened, f"parseFloat(vtb.clock.textContent) > {left + 0.3}")
         settle(opened)
-        assert share(picture(opened), PURPLE) > 0.001
+        assert in_time(lambda: share(picture(opened), PURPLE) > 0.001)
         opened.click("#vtb-back-to-log")
         opened.wait_for_selector("body[data-log=recorded]", state="attached")
         settle(opened)
-        assert share(picture(opened), PURPLE) < 1e-4
+        assert in_time(lambda: share(picture(opened), PURPLE) < 1e-4)

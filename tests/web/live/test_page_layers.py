@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from tests.chromium import needs_chromium, opened_page
+from tests.chromium import in_time, needs_chromium, opened_page
 from tests.web.live.test_page import READY, drawn, picture, settle, share
 from tests.web.live.test_session import ANGLE
 from vtbdrake.testbed import Scenario
@@ -60,7 +60,7 @@ def test_contact_forces_and_names_come_and_go(browser: Browser) -> None:
         assert box is not None and box["x"] > 340.0
         page.uncheck("#vtb-layer-names")
         drawn(page, "document.querySelectorAll('#vtb-names span').length === 0")
-        assert changed(without, picture(page)).mean() < 1e-4
+        assert in_time(lambda: changed(without, picture(page)).mean() < 1e-4)
 
 
 def test_perceived_ghost_and_candidates_come_and_go(browser: Browser) -> None:
@@ -75,14 +75,14 @@ def test_perceived_ghost_and_candidates_come_and_go(browser: Browser) -> None:
         red, green, blue = picture(page)[new].mean(axis=0)
         assert red > green + 5.0 and blue > green + 5.0  # purple
         toggle(page, "perceived")
-        assert changed(without, picture(page)).mean() < 1e-4
+        assert in_time(lambda: changed(without, picture(page)).mean() < 1e-4)
         toggle(page, "decisions")
         running.session.advance(20)
         drawn(page, "document.querySelector('#vtb-layers').textContent.includes('plan in use black')")
         settle(page)
         with_paths = picture(page)
         toggle(page, "decisions")
-        assert changed(picture(page), with_paths).mean() > 0.001
+        assert in_time(lambda: changed(picture(page), with_paths).mean() > 0.001)
 
 
 def test_laser_points_frustum_and_image_of_a_satellite(browser: Browser) -> None:
@@ -91,13 +91,13 @@ def test_laser_points_frustum_and_image_of_a_satellite(browser: Browser) -> None
         settle(page)
         without = picture(page)
         toggle(page, "laser")
-        assert share(picture(page), RED) > share(without, RED) + 2e-4
+        assert in_time(lambda: share(picture(page), RED) > share(without, RED) + 2e-4)
         page.uncheck("#vtb-layer-laser")
         toggle(page, "cameras")
         new = changed(without, picture(page))
         assert 2e-4 < new.mean() < 0.02
         toggle(page, "cameras")
-        assert changed(without, picture(page)).mean() < 1e-4
+        assert in_time(lambda: changed(without, picture(page)).mean() < 1e-4)
         image = "sim.sense.docking_camera"
         page.check(f"[id='vtb-layer-image-{image}']")
         drawn(page, "document.querySelector('#vtb-images figure')?.dataset.images >= 2")

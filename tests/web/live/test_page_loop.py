@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from tests.chromium import needs_chromium, new_page
+from tests.chromium import in_time, needs_chromium, new_page
 from tests.web.live.loops import cart_pole_loop
 from tests.web.live.test_page import drawn, picture, settle, watch
 from vtbdrake.lcm.hub import Hub
@@ -32,7 +32,7 @@ def test_loop_is_watched_until_it_ends(browser: Browser) -> None:
             watch(page, PERCEIVED)
             drawn(page, f"vtb.watched.get('{PERCEIVED}').values[1] === 1.0")
             settle(page)
-            assert np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.01  # cart and pole
+            assert in_time(lambda: np.mean(np.abs(picture(page) - before).max(axis=2) > 30) > 0.01)  # cart and pole
             assert page.is_disabled("#vtb-act-force") and page.input_value("#vtb-act-force") == "real"
             assert not page.is_visible("#vtb-play") and not page.is_visible("#vtb-history")
             assert "joint_position" in page.inner_text("#vtb-loop") and page.inner_text("#vtb-age").endswith("ms ago")

@@ -104,6 +104,7 @@ export class Camera {
     this.isWidened = true;
     const further = PICTURE / camera.aspect;
     if (further > 1) camera.position.sub(controls.target).multiplyScalar(further).add(controls.target);
+    viewer.set_dirty();
   }
 
   // Called in each animation frame: what it follows keeps its place in the picture.
@@ -132,6 +133,7 @@ export class Camera {
           point.y += y;
           point.z += z;
         }
+        if (x || y || z) viewer.set_dirty(); // The viewer draws for messages only.
       }
       this.place = place;
     }

@@ -90,11 +90,15 @@ export class Layers {
       const { box, note } = /** @type {{ box: any, note: any }} */ (this.toggles.get(name));
       note.textContent = box.checked ? (layers[name] ?? "") : "";
       const node = this.#node([name]);
-      if (node) node.object.visible = box.checked;
+      if (!node || node.object.visible === box.checked) continue;
+      node.object.visible = box.checked;
+      viewer.set_dirty();
     }
     for (const path of ON_TOP) {
       this.#node(path)?.object.traverse((/** @type {any} */ { material }) => {
-        if (material) material.depthTest = false;
+        if (!material?.depthTest) return;
+        material.depthTest = false;
+        viewer.set_dirty();
       });
     }
   }
