@@ -55,7 +55,8 @@ def compiled(function: casadi.Function) -> casadi.Function:
         raise ValueError(
             f"{function.name()} contains {', '.join(impossible)}, for which there is no C code: leave out compile=True."
         )
-    return _library_function(function.name(), source, _kernels_in(source))
+    kernels = _kernels_in(source)
+    return _loaded(function.name(), source, _library(function.name(), source, kernels), kernels)
 
 
 def compiled_kernel(name: str, source: str) -> casadi.Function:
@@ -70,8 +71,9 @@ def compiled_kernel(name: str, source: str) -> casadi.Function:
     Raises:
         CompilerError: The compiler (`compiler_command`) is missing or fails.
     """
-    function = _library_function(name, source, ())
-    _KERNELS[name] = _library(name, source)
+    library = _library(name, source, ())
+    function = _loaded(name, source, library, ())
+    _KERNELS[name] = library
     return function
 
 
@@ -81,7 +83,8 @@ def _kernels_in(source: str) -> tuple[Path, ...]:
     return tuple(library for name, library in _KERNELS.items() if name in called)
 
 
-def _library(name: str, source: str, kernels: Sequence[Path] = ()) -> Path:
+def _library(name: str, source: str, kernels: Sequence[Path]) -> Path:
+    """Return the file of a function's library in the cache, which need not be there."""
     recipe = (
         source,
         *_command_with_flags(),
@@ -93,8 +96,8 @@ def _library(name: str, source: str, kernels: Sequence[Path] = ()) -> Path:
     return cache_folder() / f"{name}-{hashlib.sha256(chr(10).join(recipe).encode()).hexdigest()}.so"
 
 
-def _library_function(name: str, source: str, kernels: Sequence[Path]) -> casadi.Function:
-    library = _library(name, source, kernels)
+def _loaded(name: str, source: str, library: Path, kernels: Sequence[Path]) -> casadi.Function:
+    """Return the function in a library, which is compiled if it is not there."""
     with _ONE_AT_A_TIME:
         try:
             if not _is_whole(library):

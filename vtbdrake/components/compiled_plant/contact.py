@@ -13,14 +13,15 @@ import numpy as np
 from pydrake.geometry import Box, GeometryId, HalfSpace, SceneGraphInspector, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactModel, DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context
 
 from vtbdrake.components.casadi_system.compiler import compiled_kernel
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
 from vtbdrake.components.compiled_plant.links import (
     UnsupportedPlantError,
+    colliding,
     constant_pose,
-    contacts,
     rounding_beside,
     times,
 )
@@ -91,7 +92,8 @@ def contact_pairs(plant: MultibodyPlant, context: Context) -> tuple[Pair, ...]:
     Raises:
         UnsupportedPlantError: A shape, a contact model or an approximation is not compiled.
     """
-    if not any(contacts(plant, context)):
+    candidates = list(colliding(plant, context))
+    if not candidates:
         return ()
     approximation = plant.get_discrete_contact_approximation()
     if approximation not in _APPROXIMATIONS:
@@ -99,43 +101,24 @@ def contact_pairs(plant: MultibodyPlant, context: Context) -> tuple[Pair, ...]:
             f"contact approximated as {approximation.name} is not compiled: set discrete_contact_approximation to "
             "'sap' or 'lagged'"
         )
-    return tuple(_PairReader(plant, plant.get_geometry_query_input_port().Eval(context).inspector()))
+    reader = _SurfaceReader(plant, plant.get_geometry_query_input_port().Eval(context).inspector())
+    in_order = sorted(candidates, key=lambda pair: [geometry.get_value() for geometry, _ in pair])
+    return tuple(_pair(*(reader.surface(geometry, body) for geometry, body in pair)) for pair in in_order)
 
 
-class _PairReader:
-    """Reads the pairs of geometries that may touch."""
+class _SurfaceReader:
+    """Reads collision geometries with what their contact takes."""
 
     def __init__(self, plant: MultibodyPlant, inspector: SceneGraphInspector) -> None:
         self._plant, self._inspector = plant, inspector
         dissipation = "hunt_crossley_dissipation" if _is_lagged(plant) else "relaxation_time"
         self._kinds = "point_contact_stiffness", dissipation
 
-    def __iter__(self) -> Iterator[Pair]:
-        plant = self._plant
-        body_of = {
-            geometry: (int(body.index()), body.name())
-            for body in (plant.world_body(), *bodies(plant))
-            for geometry in plant.GetCollisionGeometriesForBody(body)
-        }
-        candidates = self._inspector.GetCollisionCandidates()
-        for first, second in sorted(candidates, key=lambda ids: [i.get_value() for i in ids]):
-            if first in body_of and second in body_of:
-                yield self._pair(*(self._surface(geometry, *body_of[geometry]) for geometry in (first, second)))
-
-    def _pair(self, first: Surface, second: Surface) -> Pair:
-        for sphere, other in ((first, second), (second, first)):
-            if isinstance(sphere.shape, Sphere) and isinstance(other.shape, _OTHERS):
-                return Pair(sphere, other)
-        raise UnsupportedPlantError(
-            f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
-            "is not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
-            "CollisionFilterDeclaration"
-        )
-
-    def _surface(self, geometry: GeometryId, body: int, body_name: str) -> Surface:
+    def surface(self, geometry: GeometryId, body: RigidBody) -> Surface:
+        """Return the geometry with an id on a body."""
         inspector = self._inspector
         properties = inspector.GetProximityProperties(geometry)
-        name = f"{inspector.GetName(geometry)} of {body_name}"
+        name = f"{inspector.GetName(geometry)} of {body.name()}"
         # A half-space has no mesh, but what touches it has one if their contact is hydroelastic.
         has_mesh = inspector.maybe_get_hydroelastic_mesh(geometry) is not None
         if has_mesh and self._plant.get_contact_model() != ContactModel.kPoint:
@@ -149,7 +132,18 @@ class _PairReader:
         stiffness, dissipation = (float(properties.GetProperty("material", kind)) for kind in self._kinds)
         friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
         shape, X_BG = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
-        return Surface(name, body, shape, X_BG, stiffness, dissipation, friction)
+        return Surface(name, int(body.index()), shape, X_BG, stiffness, dissipation, friction)
+
+
+def _pair(first: Surface, second: Surface) -> Pair:
+    for sphere, other in ((first, second), (second, first)):
+        if isinstance(sphere.shape, Sphere) and isinstance(other.shape, _OTHERS):
+            return Pair(sphere, other)
+    raise UnsupportedPlantError(
+        f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
+        "is not compiled: let a Sphere touch a HalfSpace, a Box or a Sphere, or exclude the two by a "
+        "CollisionFilterDeclaration"
+    )
 
 
 def _is_lagged(plant: MultibodyPlant) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import casadi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import GeometryId
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -27,6 +28,7 @@ from vtbdrake.state.multibody import bodies, element_address
 
 Expression = Any  # casadi.SX
 Pose = tuple[Expression, Expression]  # R, shape (3, 3), and p, shape (3, 1)
+_OnBody = tuple[GeometryId, RigidBody]
 
 # A number of a constant below this, in SI units, is what rounding left of a zero; in small models, a number below this
 # part of the largest one of its kind.
@@ -324,8 +326,8 @@ def _other_inputs(plant: MultibodyPlant, context: Context) -> Iterator[str]:
             yield f"the input port {port.get_name()} is connected or has a fixed value"
 
 
-def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
-    """Yield the pairs of bodies that may touch each other.
+def colliding(plant: MultibodyPlant, context: Context) -> Iterator[tuple[_OnBody, _OnBody]]:
+    """Yield the pairs of collision geometries that may touch each other, each with its body.
 
     Args:
         plant: The plant, finalized.
@@ -334,17 +336,24 @@ def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     port = plant.get_geometry_query_input_port()
     if not plant.num_collision_geometries() or not port.HasValue(context):
         return
-    inspector = port.Eval(context).inspector()
     body_of = {
-        geometry: body.name()
+        geometry: body
         for body in (plant.world_body(), *bodies(plant))
         for geometry in plant.GetCollisionGeometriesForBody(body)
     }
-    pairs = {
-        tuple(sorted((body_of[a], body_of[b])))
-        for a, b in inspector.GetCollisionCandidates()
-        if a in body_of and b in body_of
-    }
+    for a, b in port.Eval(context).inspector().GetCollisionCandidates():
+        if a in body_of and b in body_of:
+            yield (a, body_of[a]), (b, body_of[b])
+
+
+def contacts(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+    """Yield the pairs of bodies that may touch each other.
+
+    Args:
+        plant: The plant, finalized.
+        context: The plant's own Context; unless its geometry query is connected, there is no contact.
+    """
+    pairs = {tuple(sorted((body_a.name(), body_b.name()))) for (_, body_a), (_, body_b) in colliding(plant, context)}
     for first, second in sorted(pairs):
         yield f"{first} and {second} can collide (exclude them by a CollisionFilterDeclaration)"
 
