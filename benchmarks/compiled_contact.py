@@ -11,7 +11,9 @@ from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, quadruped
 from vtbdrake.compiled import CompiledRollouts
 from vtbdrake.state.systems import collect
 
-STEP, HORIZON, ROLLOUTS = 0.005, 2.0, 64
+STEP = 0.005  # s
+HORIZON = 2.0  # s
+ROLLOUTS = 64
 
 
 def compiled_contact(repeats: int = 5) -> list[Benchmark]:

@@ -25,10 +25,11 @@ from vtbdrake.optimization.solvers.solver import Evaluation, Point, SolverError
 METHODS = ("MPPI", "CEM", "predictive-sampling", "CMA-ES", "random")
 # Methods that take a second or more for a decision: only by name, and with fewer seeds.
 SLOW = ("auto", "bayesian")
-SEEDS, SEEDS_OF_SLOW = 15, 3
+SEEDS = 15
+SEEDS_OF_SLOW = 3
 ROLLOUTS = (30, 100)
-# A budget of wall time, and what a rollout takes, in seconds.
-SECONDS, ROLLOUT = 0.1, 1e-3
+SECONDS = 0.1  # a budget of wall time
+ROLLOUT = 1e-3  # s, what a rollout takes
 # A decision ends after this many batches in a row with known candidates only, as a reasoner's.
 SILENT = 50
 # Regrets below this are equal.
@@ -55,7 +56,7 @@ def _box(size: int, lower: float, upper: float) -> tuple[Parameter, ...]:
 
 
 def switching_time(generator: np.random.Generator) -> Known:
-    """When to brake a mass that comes to rest s^2 further if it is braked after s; its goal is within reach."""
+    """Return the problem when to brake a mass, which comes to rest s^2 further if it is braked after s."""
     goal = generator.uniform(0.2, 2.0)
     return Known(_box(1, 0.0, 3.0), lambda p: abs(p[0] ** 2 - goal))
 
@@ -79,7 +80,7 @@ def many_basins(generator: np.random.Generator) -> Known:
 
 
 def constrained(generator: np.random.Generator) -> Known:
-    """As little stiffness of four joints as their loads allow; the deviation of each is its load over its stiffness."""
+    """Return the least stiffness of four joints under loads: each gives way by its load over its stiffness."""
     load = generator.uniform(0.2, 0.8, 4)
     return Known(
         _box(4, 0.1, 4.0),

@@ -1,4 +1,4 @@
-"""From a bare machine to the moving robot in the browser: the first minutes of a new user."""
+"""This benchmark measures the first minutes of a new user: from a bare machine to the moving robot in the browser."""
 
 from __future__ import annotations
 

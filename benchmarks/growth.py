@@ -1,4 +1,4 @@
-"""How processor time grows with the size of what is worked on: 1 is in proportion to it."""
+"""These benchmarks measure how processor time grows with the size of a task: an exponent of 1 is in proportion."""
 
 from __future__ import annotations
 

@@ -18,7 +18,10 @@ from vtbdrake.recording import DrivenScenario, Log, read_table
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 PERIOD = 0.004
-ARM, DRIVES = "sim.sys.pendulum", "sim.act.drives"
+ARM = "sim.sys.pendulum"
+DRIVES = "sim.act.drives"
+MASS = f"{ARM}.link.mass"
+COULOMB = f"{DRIVES}.coulomb[0]"
 
 
 @dataclass

@@ -9,7 +9,9 @@ from pydrake.systems.framework import Context, LeafSystem
 from tests.testbeds import PendulumScenario
 from vtbdrake.testbed import VirtualTestbedBuilder
 
-BUILDING, STEPPING, JUDGING = "it is building", "it is stepping", "it is judging"
+BUILDING = "it is building"
+STEPPING = "it is stepping"
+JUDGING = "it is judging"
 
 
 def last(state: str) -> None:

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import ARM, DRIVES, PendulumScenario, recorded
+from tests.calibration.pendulum import COULOMB, MASS, PendulumScenario, recorded
 from tests.cli.program import error_of, run
 from vtbdrake import Parameter, load_scenario
 from vtbdrake.calibration import calibrate
 from vtbdrake_diagrams.manipulator.arm import Arm
 
 SCENARIO = "tests.calibration.pendulum:PendulumScenario"
-MASS, COULOMB = f"{ARM}.link.mass", f"{DRIVES}.coulomb[0]"
 SIGNALS = ("--position", "position", "--torque", "torque")
 COLUMNS = ("--position-columns", "q", "--torque-columns", "u")
 VARY = ("--vary", f"{MASS}=0.3:3", "--vary", f"{COULOMB}=0:1")

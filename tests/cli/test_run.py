@@ -150,7 +150,7 @@ def test_in_the_end_the_fallback_goes_out_once(hub: Hub, ending: signal.Signals)
 def test_log_holds_the_last_commands_when_the_whole_group_is_ended(
     hub: Hub, tmp_path: Path, ending: signal.Signals
 ) -> None:
-    """As systemd and ``timeout`` do it, the second of them twice."""
+    """systemd and ``timeout`` end a whole group so; ``timeout`` sends its signal twice."""
     path = tmp_path / "log.lcm"
     fields = ("--field", "leave_time=0.5", "--set", "u.target=[0.1,-0.05]", "--set", "dps.gain=2.0")
     with MachineProcess(ServoMachineScenario(), hub.url):

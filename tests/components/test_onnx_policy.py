@@ -15,7 +15,9 @@ from pydrake.systems.analysis import Simulator
 
 from vtbdrake.components.onnx_policy import OnnxPolicy
 
-FLOAT, DOUBLE, INT = TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.INT64
+FLOAT = TensorProto.FLOAT
+DOUBLE = TensorProto.DOUBLE
+INT = TensorProto.INT64
 Info = tuple[str, int, list[Any]]
 
 

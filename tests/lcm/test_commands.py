@@ -28,7 +28,8 @@ from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import replay
 
 CHANNEL = "TARGET"
-GO, STOP = [1.0, 0.5], [0.0, 0.0]
+GO = [1.0, 0.5]
+STOP = [0.0, 0.0]
 REPETITIONS = 20
 
 

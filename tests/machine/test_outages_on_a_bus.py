@@ -34,7 +34,7 @@ TO_MACHINE = f"{COMMAND}|SCHUNK_WSG_COMMAND"
 
 
 def test_arm_on_a_bus_does_not_lunge_after_an_outage() -> None:
-    """In lock-step, every command acts in a cycle of its own, however busy the computer is."""
+    """The loop runs in lock-step: each command acts in its own cycle, however busy the computer is."""
     scenario = ManipulatorScenario()
     deployment = Deployment.of(scenario).in_lock_step("wrench", wait=PATIENCE)
     with (

@@ -59,7 +59,7 @@ def test_page_opens_with_a_slider_for_every_joint() -> None:
     "name", ["tiago_description/robots/tiago.urdf", "romeo_small.urdf", "ur_description/urdf/ur5_gripper.urdf"]
 )
 def test_page_of_a_foreign_robot_opens_with_its_joints(name: str) -> None:
-    """Those that move, as the text of its file has them."""
+    """The page shows the joints that the text of the robot's file lets move."""
     try:
         fetch(CACHE, [EXAMPLE_ROBOT_DATA])
     except ConnectionError as error:

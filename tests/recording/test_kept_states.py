@@ -151,7 +151,7 @@ def test_states_of_another_log_are_replaced(log, testbed, truth, file, recorded)
 
 
 def test_states_of_other_code_are_replaced(log, testbed, truth, file):
-    """As after a change of the user's code: the file is whole, but this replay has other states."""
+    """The user's code has changed: the file is whole, but this replay has other states."""
     prepared(log, testbed)
     kept = KeptStates(log.path, {"log": log.identity, "versions": installed_versions()})
     notes = kept.before(60).notes

@@ -8,7 +8,7 @@ import lcm
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import ARM, DRIVES, PendulumScenario, recorded
+from tests.calibration.pendulum import ARM, COULOMB, MASS, PendulumScenario, recorded
 from tests.recording.lcm_logger import BEGIN, PERIOD, LcmPendulum, write_log
 from vtbdrake.calibration import calibrate, compare
 from vtbdrake.lcm.protocol import ProtocolError
@@ -18,8 +18,6 @@ from vtbdrake.recording.export import export
 from vtbdrake.recording.log_format import EVENT
 from vtbdrake.recording.replay import replay
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
-
-MASS, COULOMB = f"{ARM}.link.mass", f"{DRIVES}.coulomb[0]"
 
 
 @pytest.fixture(scope="module")

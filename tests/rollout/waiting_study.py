@@ -11,7 +11,8 @@ from tests.optimization.studies import pendulum_problem
 from vtbdrake.optimization import Study
 from vtbdrake.rollout import RolloutResult
 
-SLOTS, ROLLOUTS = 40, 160
+SLOTS = 40
+ROLLOUTS = 160
 
 
 def waiting_study(path: str | None = None) -> Study:

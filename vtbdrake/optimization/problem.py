@@ -64,7 +64,7 @@ class Motion:
         times: The times in s, shape (n,).
         states: The plant's states [q; v] at these times, shape (n, nq + nv).
         quality: The quality trajectory f' at these times, equation (13), shape (n,), or None.
-        t_star: The instant t* of the rollout, equation (16), in s; NaN if there is none.
+        t_star: The time at which equation (16) reads the quality, in s; NaN if the rollout has none.
     """
 
     scenario: Scenario

@@ -1,4 +1,4 @@
-// The colours of the charts: those of the style sheet, in light and in dark, and the scale of values.
+// The charts have the colours of the style sheet, in light and in dark, and a scale of colours for values.
 
 import { color } from "./theme.js";
 
