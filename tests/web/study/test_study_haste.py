@@ -43,12 +43,13 @@ def page(browser: Browser, opened: StudyView) -> Iterator[Page]:
 
 
 def test_row_that_is_renewed_while_it_is_pressed_is_chosen(page: Page) -> None:
-    row = page.locator("#vtb-trials tbody tr >> nth=3")
-    trial = row.get_attribute("data-trial")
-    row.scroll_into_view_if_needed()
-    box = row.bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.5 * box["height"])
+    trial, x, y = page.evaluate("""() => {  // In one step: the table may be renewed between two.
+      const row = document.querySelectorAll("#vtb-trials tbody tr")[3];
+      row.scrollIntoView({ block: "center", behavior: "instant" });
+      const box = row.getBoundingClientRect();
+      return [row.dataset.trial, box.x + 0.7 * box.width, box.y + 0.5 * box.height];
+    }""")
+    page.mouse.move(x, y)
     page.mouse.down()
     page.evaluate("vtb.table.show()")
     page.mouse.up()
@@ -70,7 +71,7 @@ def test_status_from_before_a_change_does_not_take_it_back(page: Page, opened: S
     page.wait_for_function("document.body.dataset.interventions === '2'")
     (chosen,) = [dimension for dimension in opened.study.search.ranges if dimension.address == PLACE]
     assert isinstance(chosen, Choice) and list(chosen.options) == [0.0, 0.25]
-    boxes.nth(1).uncheck()  # It is refused: a choice has two options at least.
+    boxes.nth(1).click()  # It is refused: a choice has two options at least.
     page.wait_for_function("vtb.messages.querySelector('.bad')")
     page.wait_for_function(
         "[...document.querySelectorAll('.vtb-options input')].map((box) => +box.checked) + '' === '0,1,1,0'"
