@@ -31,7 +31,7 @@ APPLICATIONS: Registry = {
 }
 
 FILE = "answers.json"
-FIELDS = ("id", "answer", "unit", "interval", "paper", "seconds", "holds")
+FIELDS = ("id", "answer", "unit", "interval", "paper", "cases", "held_out", "baseline", "refused", "seconds", "holds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +45,10 @@ class Answer:
         unit: SI; empty for words.
         interval: (lower, upper), in which the answer lies; an infinite end is open. None if it has no uncertainty.
         paper: The paper's answer.
+        cases: On which cases the answer was found, in words.
+        held_out: On which others it is judged, in words; empty if it is judged on the same.
+        baseline: What an engineer would take instead, and its result; empty if the row has none.
+        refused: The number of cases that have no answer.
         holds: Whether the criterion of the application is met.
         note: Further information.
         seconds: Seconds of wall time; measured if left out.
@@ -56,6 +60,10 @@ class Answer:
     unit: str
     interval: tuple[float, float] | None
     paper: str
+    cases: str
+    held_out: str
+    baseline: str
+    refused: int = 0
     holds: bool
     note: str = ""
     seconds: float | None = None
@@ -94,8 +102,15 @@ def answers_table(answers: Sequence[Answer | Crash]) -> str:
     """Return the table of the answers, with the notes below it."""
     header = ("id", "question", "answer", "the paper's", "time", "holds")
     rows = [_crash_row(a) if isinstance(a, Crash) else _row(a) for a in answers]
-    notes = [f"{a.id}: {a.note}" for a in answers if isinstance(a, Answer) and a.note]
+    notes = [_note(answer) for answer in answers if isinstance(answer, Answer)]
     return "\n".join([table(header, rows), *notes])
+
+
+def _note(answer: Answer) -> str:
+    judged = answer.held_out or "the same"
+    refused = f"; {answer.refused} without an answer" if answer.refused else ""
+    evidence = f"found on {answer.cases}; judged on {judged}{refused}; instead: {answer.baseline or 'no baseline'}."
+    return f"{answer.id}: {evidence} {answer.note}".rstrip()
 
 
 def _row(answer: Answer) -> tuple[str, ...]:
@@ -144,14 +159,17 @@ def _fields(answer: Answer | Crash) -> dict[str, Any]:
 @click.argument("only", nargs=-1)
 @click.option("--full", is_flag=True, help="The long versions.")
 def main(only: tuple[str, ...], full: bool) -> None:
-    """Answer the questions of the applications ONLY (for example O4), or of all."""
+    """Answer the questions of the applications ONLY (for example O4), or of all.
+
+    The exit code is 1 if a row does not hold.
+    """
     try:
         answers = answer_all(only, full=full, echo=lambda line: click.echo(line, err=True))
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     write_answers(Path(FILE), answers)
     click.echo(answers_table(answers))
-    if any(isinstance(answer, Crash) for answer in answers):
+    if not all(isinstance(answer, Answer) and answer.holds for answer in answers):
         raise SystemExit(1)
 
 

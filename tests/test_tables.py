@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from benchmarks.import_time import import_time
 from benchmarks.measure import Benchmark, interleaved, interleaved_values, ratio
 from benchmarks.report import BENCHMARKS, ONLY_BY_NAME, benchmark_all, results_page, results_table, write_results
-from vtbdrake_diagrams.answers import APPLICATIONS, Answer, answer_all, answers_table, write_answers
+from vtbdrake_diagrams.answers import APPLICATIONS, FIELDS, Answer, answer_all, answers_table, main, write_answers
 from vtbdrake_diagrams.tables import Crash, write_json
 
 pytestmark = pytest.mark.one_python
@@ -28,6 +29,9 @@ HEAVY = Answer(
     unit="kg",
     interval=(43.0, 44.0),
     paper="about 45 kg",
+    cases="8 start phases",
+    held_out="another engine",
+    baseline="statics, 50 kg",
     holds=True,
     note="3 phases",
 )
@@ -38,6 +42,10 @@ SLOW = Answer(
     unit="",
     interval=None,
     paper="0 deg",
+    cases="10 craters",
+    held_out="",
+    baseline="",
+    refused=2,
     holds=False,
     seconds=7.5,
 )
@@ -101,7 +109,10 @@ def test_answers_table_shows_what_does_not_hold() -> None:
     assert lines[3].endswith("NO")
     assert "straight on" in lines[4]
     assert lines[4].endswith("7.5 s  NO")
-    assert lines[5:] == ["O4: 3 phases"]
+    assert lines[5:] == [
+        "O4: found on 8 start phases; judged on another engine; instead: statics, 50 kg. 3 phases",
+        "R1: found on 10 craters; judged on the same; 2 without an answer; instead: no baseline.",
+    ]
 
 
 def test_answers_have_no_more_digits_than_they_may_claim() -> None:
@@ -109,11 +120,27 @@ def test_answers_have_no_more_digits_than_they_may_claim() -> None:
     assert "31.9 times in [12.7, 51.1]" in answers_table([answer])
 
 
+@pytest.mark.parametrize(("answer", "code"), [(HEAVY, 0), (SLOW, 1), (broken, 1)])
+def test_program_fails_unless_each_row_holds(
+    answer: object, code: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(APPLICATIONS, "O1", answer if callable(answer) else lambda full: answer)  # type: ignore[arg-type]
+    assert CliRunner().invoke(main, ["O1"]).exit_code == code
+    assert len(json.loads((tmp_path / "answers.json").read_text())) == 1
+
+
 def test_answers_file(tmp_path: Path) -> None:
     answers = answer_all(registry=ANSWERS, echo=quiet)
     write_answers(tmp_path / "answers.json", answers)
     heavy, crash, slow = json.loads((tmp_path / "answers.json").read_text())
-    assert list(heavy) == ["id", "answer", "unit", "interval", "paper", "seconds", "holds"]
+    assert tuple(heavy) == FIELDS
+    assert [heavy[name] for name in ("cases", "held_out", "baseline", "refused")] == [
+        "8 start phases",
+        "another engine",
+        "statics, 50 kg",
+        0,
+    ]
     assert (heavy["id"], heavy["answer"], heavy["interval"], heavy["holds"]) == ("O4", 43.0, [43.0, 44.0], True)
     assert crash == dict.fromkeys(heavy) | {"id": "O5", "holds": False}
     assert (slow["answer"], slow["interval"], slow["seconds"]) == ("straight on", None, 7.5)

@@ -385,10 +385,13 @@ def lighting(full: bool) -> Answer:
         unit="",
         interval=None,
         paper="none given",
+        cases=f"{len(CHOSEN_ON)} start poses, {len(LIGHTS)} lights",
+        held_out=f"{count} other start poses, the same lights",
+        baseline=f"the default settings, {default:.1f} s in the worst light",
+        refused=int(answer.checked.failures[1].sum()),
         holds=answer.holds,
-        note=f"Compared with the default from {count} start poses, other than the choice's; without success "
-        f"{FAILURE:g} s; {1e3 * ACCURACY:g} mm allowed. By default: {_table(answer.checked, 0)}. With the choice: "
-        f"{_table(answer.checked, 1)}. "
+        note=f"Without success {FAILURE:g} s; {1e3 * ACCURACY:g} mm allowed. "
+        f"By default: {_table(answer.checked, 0)}. With the choice: {_table(answer.checked, 1)}. "
         + (
             f"Best for each light: {best_by_light}"
             if best_by_light

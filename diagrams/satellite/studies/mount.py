@@ -392,8 +392,11 @@ def mount(full: bool) -> Answer:
         unit="",
         interval=None,
         paper="none given",
+        cases=f"{len(result.best.rollouts)} captures",
+        held_out="",
+        baseline=f"by hand: {by_hand}",
         holds=result.holds,
-        note=f"By hand: {by_hand}. Thought of afterwards: {afterwards}. Largest of the one found "
+        note=f"Thought of afterwards: {afterwards}. Largest of the one found "
         f"{result.best.most:.1f}. Best of the grid over the position: {result.best_on_grid:.2f}. Mean of "
         f"{len(result.best.rollouts)} captures; differences under {TELLING} mean nothing.",
     )

@@ -386,6 +386,10 @@ def frequency(full: bool) -> Answer:
         unit="Hz",
         interval=(lower, upper),
         paper="none given",
+        cases=f"{result.raw.values.shape[2]} approaches at each of {result.tumbles.size} tumble rates",
+        held_out="",
+        baseline="the same scans, raw",
+        refused=sum(bounds[1] == inf for bounds in least["de-skewed"]),
         holds=result.holds,
         note=f"Least frequency for which the error at the bar is below {1e3 * TOLERANCE:.1f} mm in {QUANTILE:.0%} of "
         f"the approaches, at all tumble rates, with de-skewed scans; of {result.raw.values.shape[2]} approaches, with "

@@ -346,6 +346,9 @@ def answer(full: bool) -> Answer:
         unit="times less rotation at the end than on the straight joint-space path (median)",
         interval=result.interval,
         paper="none given",
+        cases="the momentum model, for each motion anew",
+        held_out=f"the full testbed, {len(result.factors)} random motions and the one that the DPS decides on board",
+        baseline="the straight path in joint space",
         holds=result.holds and onboard.factor >= _FACTOR and onboard.within_limits,
         note=(
             f"In the full testbed: the DPS's decision on board turns the base by {turned[1]:.3f} deg instead of "

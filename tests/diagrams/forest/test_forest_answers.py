@@ -8,8 +8,17 @@ import pytest
 from vtbdrake.components.localization.landmarks import Landmarks
 from vtbdrake.components.localization.unit import SEARCHING, TRACKING
 from vtbdrake_diagrams.forest.scenario import ForestScenario
-from vtbdrake_diagrams.forest.studies.answers import over_lcm
-from vtbdrake_diagrams.forest.studies.drives import REACH, Drive, Track, against_best, best_estimates
+from vtbdrake_diagrams.forest.studies.answers import LocalizationAnswer, OverLcm, over_lcm
+from vtbdrake_diagrams.forest.studies.drives import (
+    GOALS,
+    REACH,
+    BestError,
+    Drive,
+    Score,
+    Track,
+    against_best,
+    best_estimates,
+)
 from vtbdrake_diagrams.forest.world.stand import MAPS, MapErrors
 
 POOR = MAPS["poor"]
@@ -103,3 +112,51 @@ def test_only_scans_with_a_pose_are_compared() -> None:
     # Later, more trees have been seen.
     assert late.least < whole.least
     assert late.interval == (late.ratio, late.ratio)  # One forest tells nothing about others.
+
+
+SCORES = {
+    name: Score(
+        forests=4,
+        path=100.0,
+        position=0.9 * goal.position,
+        heading=0.9 * goal.heading,
+        wrong=0,
+        nees=3.0,
+        independent_nees=3.0,
+        bounds=(2.0, 4.0),
+        first_fix=(1.0, 2.0),
+        localized=0.95,
+        losses=0,
+    )
+    for name, goal in GOALS.items()
+}
+KNOWN = LocalizationAnswer(SCORES, BestError(0.4, 0.4, 1.05, (1.0, 1.1)), OverLcm(is_tracking=True, difference=1e-5))
+
+
+def score(name: str, **changed: object) -> dict[str, object]:
+    return {"scores": SCORES | {name: replace(SCORES[name], **changed)}}
+
+
+@pytest.mark.one_python
+def test_unit_that_knows_where_it_is_holds() -> None:
+    assert KNOWN.holds
+    assert replace(KNOWN, **score("poor", position=9.0)).holds  # Judged by the best estimate.
+
+
+@pytest.mark.one_python
+@pytest.mark.parametrize(
+    "change",
+    [
+        score("accurate", position=9.0),
+        score("accurate", heading=9.0),
+        score("accurate", wrong=1),
+        score("poor", wrong=1),
+        score("poor", independent_nees=4.1),
+        score("poor", localized=0.89),
+        {"best": BestError(0.4, 0.4, 1.11, (1.0, 1.2))},
+        {"machine": OverLcm(is_tracking=False, difference=0.0)},
+        {"machine": OverLcm(is_tracking=True, difference=0.01)},
+    ],
+)
+def test_each_part_of_the_localization_can_fail(change: dict[str, object]) -> None:
+    assert not replace(KNOWN, **change).holds
