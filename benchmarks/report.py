@@ -49,6 +49,8 @@ BENCHMARKS: Registry = {
     "recording_cost": "benchmarks.recording:recording_cost",
     "replay_cost": "benchmarks.recording:replay_cost",
     "payload_alarm": "benchmarks.residuals:payload_alarm",
+    "read_table_csv": "benchmarks.tables:read_table_csv",
+    "read_table_parquet": "benchmarks.tables:read_table_parquet",
     "log_replay": "benchmarks.compiled_testbed:log_replay",
     "seeds_varied": "benchmarks.compiled_testbed:seeds_varied",
     "calibration_time": "benchmarks.calibration:calibration_time",

@@ -206,24 +206,31 @@ def checked_series(label: str, times: Array, values: Array, remarks: list[str]) 
             f"({times[row + 1]:.9g} s), {backwards.size} times in all: split the recording there, or sort it if only "
             "the order of its rows is wrong"
         )
-    whole = np.asarray(np.isfinite(values).all(axis=1))
-    if not whole.any():
-        raise LogError(f"{label} has no row that is whole")
-    if not whole.all():
+    # Most recordings are whole: one pass tells, and only others are looked at row by row.
+    if not (len(values) and np.isfinite(values).all()):
+        whole = np.asarray(np.isfinite(values).all(axis=1))
+        if not whole.any():
+            raise LogError(f"{label} has no row that is whole")
         remarks.append(f"{label}: {int((~whole).sum())} of {len(whole)} rows are not whole")
         times, values = times[whole], values[whole]
     series = Series.with_last_of_equal_times(times, values)
     if len(series) < len(times):
         remarks.append(f"{label}: {len(times) - len(series)} of {len(times)} times are repeated; the last row counts")
-    period = series.uniformity.period
-    gaps = np.flatnonzero(np.diff(series.times) > GAP * period)
+    steps = np.diff(series.times)
+    period = float(np.median(steps)) if steps.size else np.nan
+    gaps = np.flatnonzero(steps > GAP * period)
     if gaps.size:
         first = gaps[0]
         remarks.append(
             f"{label}: {counted(gaps.size, 'gap')} of more than {GAP:g} periods of {1e3 * period:.4g} ms, the first "
             f"from {series.times[first]:.6g} to {series.times[first + 1]:.6g} s"
         )
-    still: list[int] = np.flatnonzero((series.values == series.values[0]).all(axis=0)).tolist()
+    still = [k for k in range(series.values.shape[1]) if _never_changes(series.values[:, k])]
     if still and len(series) > 1:
         remarks.append(f"{label}: entries that never change: {', '.join(map(str, still))}")
     return series
+
+
+def _never_changes(entry: Array) -> bool:
+    """Return whether all samples of an entry, (n,), are equal; the first and the last one differ in most recordings."""
+    return bool(entry[0] == entry[-1] and (entry == entry[0]).all())
