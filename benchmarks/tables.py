@@ -20,15 +20,15 @@ _ACT = {"torque": ["u0", "u1", "u2"]}
 
 
 def read_table_csv(rows: int = 1_000_000, repeats: int = 5) -> Benchmark:
-    """Processor time of `read_table` of a CSV file with ten columns, over that of pyarrow's own reader, in turns.
+    """Measure the processor time of `read_table` for a CSV file of ten columns, relative to pyarrow's own reader.
 
-    Both end with numpy's arrays; `read_table` also looks for rows that are not whole, for gaps and repeated times.
+    They run in turns. Both end with numpy's arrays; `read_table` also looks for rows that are not whole, for gaps and repeated times.
     """
     return _against_arrow("read_table_csv", "t.csv", csv.write_csv, csv.read_csv, rows, repeats)
 
 
 def read_table_parquet(rows: int = 1_000_000, repeats: int = 9) -> Benchmark:
-    """As `read_table_csv`, of a Parquet file."""
+    """Measure the processor time of `read_table` for a Parquet file, relative to pyarrow's own reader."""
     return _against_arrow("read_table_parquet", "t.parquet", parquet.write_table, parquet.read_table, rows, repeats)
 
 

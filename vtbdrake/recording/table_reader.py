@@ -97,7 +97,7 @@ def read_table(
         for signal, column in signals.items():
             each = [column] if isinstance(column, str) else column
             label = f"{name}: {signal}"
-            entries = _side_by_side([_column(table, one, name) for one in each], _factor(units.get(signal)), label)
+            entries = _side_by_side([_column(table, entry, name) for entry in each], _factor(units.get(signal)), label)
             stamps = times.get(signal, time)
             if isinstance(stamps, str):
                 at = times_in(_time_column(table, stamps, each[0]), units.get(stamps))
