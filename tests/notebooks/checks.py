@@ -1,9 +1,10 @@
 """Checks of a notebook: it runs, shows each figure once, and is stored with its text and plots."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import nbformat
+import numpy as np
 from nbformat import NotebookNode
 
 from tools.run_notebooks import FOLDER, run
@@ -33,6 +34,37 @@ def check_stored(name: str) -> None:
         text = str(cell.outputs)
         assert "<iframe" not in text, f"{cell.id} holds a 3D recording"
         assert not re.search(r"/(home|root|tmp|work|usr)/", text), f"{cell.id} shows a path of a machine"
+
+
+def printed(cell: NotebookNode) -> str:
+    """Return what a cell has printed and shown as text."""
+    data = [output.get("data", {}) for output in cell.outputs]
+    texts = [output.get("text", "") for output in cell.outputs]
+    return "\n".join([*texts, *(one.get(kind, "") for one in data for kind in ("text/plain", "text/html"))])
+
+
+# How text may write a number of the code: as it is, in mm or %, in thousands, in degrees.
+SCALES = (1.0, 100.0, 1000.0, 1e-3, 180.0 / np.pi)
+NUMBER = r"\d+(?:\.\d+)?"
+
+
+def check_numbers(name: str, *, given: Collection[str]) -> None:
+    """Check that each number in the text is one of the code or of what it prints, as far as the text writes it out.
+
+    ``given`` are the others: years, volumes, and what the code takes from elsewhere.
+    """
+    notebook = stored(name)
+    shown = "\n".join(f"{cell.source}\n{printed(cell)}" for cell in code_cells(notebook))
+    known = np.outer([float(number) for number in re.findall(rf"{NUMBER}(?:e-?\d+)?", shown)], SCALES).ravel()
+    unknown = set()
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            text = re.sub(r"\]\([^)]*\)|`[^`]*`", "", cell.source)  # Targets of links and names.
+            for number in re.findall(rf"(?<![\w.\-/]){NUMBER}", text):
+                rounding = 0.5 * 10.0 ** -len(number.partition(".")[2])
+                if not (np.abs(known - float(number)) <= rounding + 1e-12).any():
+                    unknown.add(number)
+    assert unknown == set(given)
 
 
 def check_runs(name: str, *, shorter: Mapping[str, str]) -> None:
