@@ -383,6 +383,14 @@ class Segments:
             slopes[..., index] += np.einsum("twij,twj->twi", by_m, by[:, :, k])
         return Linearization(A, by_m @ self.model.selection.T, following[..., 0] - self.trajectory[1:], slopes.copy())
 
+    def torques(self, z: Array) -> tuple[Array, Array]:
+        """Return the motors' torques and the friction of the drives at the joints, (N, W, nq) each, in N m or N."""
+        motors = [self.model.motor(recording.times, recording.u, z)[0] for recording in self._recordings]
+        m = np.stack([motors[i][span][:-1] for i, span in self._pieces], axis=1)
+        v = self.trajectory[:-1, :, self.model.nq :].reshape(-1, self.model.nq)
+        friction = np.asarray(self.model.friction.map(len(v))(v.T, np.tile(z[:, np.newaxis], (1, len(v))))).T
+        return m @ self.model.selection.T, friction.reshape(*m.shape[:2], self.model.nq)
+
     def innovations(self, noise: Noise, model: Linearization) -> Innovations:
         """Return the innovations of all segments.
 

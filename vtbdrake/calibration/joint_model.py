@@ -115,6 +115,8 @@ class JointModel:
         start: z in the testbed's default context.
         lower, upper: The range of each entry.
         nq, nu: Numbers of joint positions, and of actuators.
+        joint_names: Names of the joints, by position.
+        edges: The velocity below which the Coulomb friction of a joint fades, (nq,), in rad/s or m/s.
 
     Raises:
         CalibrationError: A parameter is none of the model, or given twice; the plant cannot be compiled.
@@ -229,6 +231,9 @@ class JointModel:
             raise CalibrationError("a floating joint cannot be calibrated: fix the base")
         self.nq, self.nu, self.step_size = dynamics.nq, dynamics.nu, float(plant.time_step())
         inputs = {address: _filled(dynamics.values[address], parts) for address, parts in entries.items()}
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        moving = sorted((joint.position_start(), joint.name()) for joint in joints if joint.num_positions())
+        self.joint_names = tuple(name for _, name in moving)
         self.selection: Array = plant.MakeActuationMatrix()
         selection = casadi.SX(casadi.DM(self.selection))
         drive = {name: self._drive_parameter(name, testbed, context, z) for name in _FRICTION}
@@ -236,10 +241,12 @@ class JointModel:
         a, h = casadi.SX.sym("a", self.nq), casadi.SX.sym("h")
         x, v_before = casadi.vertcat(q, v), casadi.SX.sym("v_before", self.nq)
 
-        def driven(velocities: Expression) -> Expression:
+        def friction(velocities: Expression) -> Expression:
             speeds = selection.T @ velocities
-            friction = drive["viscous"] * speeds + drive["coulomb"] * casadi.tanh(speeds / drive["coulomb_velocity"])
-            return selection @ (m - friction)
+            return drive["viscous"] * speeds + drive["coulomb"] * casadi.tanh(speeds / drive["coulomb_velocity"])
+
+        def driven(velocities: Expression) -> Expression:
+            return selection @ (m - friction(velocities))
 
         # The drives of a discrete plant act in the step after that in which they saw the velocities.
         tau = driven(v_before if self.step_size > 0.0 else v)
@@ -249,6 +256,10 @@ class JointModel:
         if self.step_size > 0.0:
             results.append(casadi.vertcat(*dynamics.step(q, v, tau, self.step_size)))
         needed, tau, rate, *step = dynamics.substituted(results, inputs)
+        edges = casadi.Function("edges", [z], [drive["coulomb_velocity"]])(self.start)
+        self.edges = self.selection @ np.asarray(edges).ravel()
+        lost = selection @ friction(v) + dynamics.substituted([dynamics.damping_torque(v)], inputs)[0]
+        self.friction = casadi.Function("friction", [v, z], [casadi.densify(lost)])
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
         following = step[0] if step else _runge_kutta(lambda state: f(state, tau, z), x, h)

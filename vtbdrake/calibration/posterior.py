@@ -25,17 +25,23 @@ def sandwich_covariance(innovations: Innovations, used: NDArray[np.bool], period
         period: The time between two steps in s.
         info: What the segments tell about the parameters.
     """
-    length, steps = max(round(_BLOCK / period), 10), len(innovations.white)
-    spans = [slice(k, k + length) for k in range(0, steps - length + 1, length)]
-    scores = np.array(
-        [
-            np.einsum("twij,twi->wj", innovations.slopes[span][:, used], innovations.white[span][:, used])
-            for span in spans
-        ]
-    ).reshape(-1, len(info.names))
-    scores = scores * info.scales
+    scores = block_scores(innovations.slopes[:, used], innovations.white[:, used], period) * info.scales
     inverse = info.covariance
     sandwich = inverse @ (scores.T @ scores) @ inverse
     # Never less than what the noise alone leaves: few blocks make a sandwich too small now and then.
     larger = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
     return np.asarray(sandwich * np.outer(larger, larger))
+
+
+def block_scores(slopes: Array, white: Array, period: float) -> Array:
+    """Return the gradients of half the sum of squares in blocks that are long against correlations, (blocks, nz).
+
+    Args:
+        slopes: Derivatives of the whitened innovations, (N, W, nq, nz).
+        white: The whitened innovations, (N, W, nq).
+        period: The time between two steps in s.
+    """
+    length, steps = max(round(_BLOCK / period), 10), len(white)
+    spans = [slice(k, k + length) for k in range(0, steps - length + 1, length)]
+    scores = [np.einsum("twij,twi->wj", slopes[span], white[span]) for span in spans]
+    return np.concatenate(scores)

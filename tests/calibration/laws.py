@@ -1,0 +1,65 @@
+"""Verdicts about a pendulum of other laws of friction: ``python -m tests.calibration.laws`` prints a table.
+
+The pendulum is not made of the package's parts, and is calibrated with Coulomb and viscous friction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.calibration.plain_pendulum import LAWS, recorded
+from tests.calibration.test_calibration import VALUES, calibrated
+from vtbdrake.calibration import Calibration
+from vtbdrake.state.variables import text_table
+
+SEEDS = range(20, 32)
+DISTURBANCES = (0.0, 0.1)  # N m
+OFFSET = 0.1  # rad
+# Law, or a fault of another kind -> what names it.
+CAUSES = {
+    "Coulomb": "",
+    "Stribeck": "its speed near rest",
+    "direction": "the direction of its motion",
+    "load": "its load",
+    "zero offset": "the encoder of",
+}
+
+
+def main() -> None:
+    """Print accepted and named recordings, coverage and errors for each law, without and with a disturbance."""
+    names = [address.split(".")[-1] for address in VALUES]
+    header = ("law", "disturbance", "accepted", "named", "intervals of accepted that are right", *names)
+    rows = [row(law, disturbance) for law in CAUSES for disturbance in DISTURBANCES]
+    print(text_table(header, rows))
+    print("Errors are medians, of the truth.")
+
+
+def row(law: str, disturbance: float) -> tuple[str, ...]:
+    """Return the row of a law and a disturbance, over all seeds."""
+    offset = 0.0 if law in LAWS else OFFSET
+    logs = [
+        recorded(law if law in LAWS else "Coulomb", seed=seed, offset=offset, disturbance=disturbance) for seed in SEEDS
+    ]
+    results = [calibrated(log) for log in logs]
+    accepted = [result for result in results if result.accepted]
+    named = sum(bool(CAUSES[law]) and CAUSES[law] in " ".join(result.reasons) for result in results)
+    inside = [value for result in accepted for value in covered(result)]
+    errors = [[abs(result.parameters[a].value / value - 1.0) for a, value in VALUES.items()] for result in results]
+    return (
+        law,
+        f"{disturbance:g} N m",
+        f"{len(accepted)} of {len(results)}",
+        f"{named}" if CAUSES[law] else "",
+        f"{sum(inside)} of {len(inside)}",
+        *(f"{error:.1%}" for error in np.median(errors, axis=0)),
+    )
+
+
+def covered(result: Calibration) -> list[bool]:
+    """Return for each number whether its interval contains the truth."""
+    each = [(result.parameters[address], value) for address, value in VALUES.items()]
+    return [number.lower <= value <= number.upper for number, value in each]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""A driven pendulum that is not made of the package's parts: small steps, friction that sticks, of several laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.calibration.pendulum import PERIOD
+from vtbdrake.recording import Log, read_table
+
+MASS, CENTER, MOMENT = 1.0, 0.36, 0.03
+COULOMB, VISCOUS = 0.2, 0.03
+GRAVITY = 9.81
+# (velocity in rad/s, torque in N m) -> the size of the friction beside the viscous one, in N m.
+Law = Callable[[float, float], float]
+
+LAWS: dict[str, Law] = {
+    "Coulomb": lambda v, torque: COULOMB,
+    "Stribeck": lambda v, torque: COULOMB * (1.0 + 0.8 * np.exp(-((v / 0.3) ** 2))),
+    "direction": lambda v, torque: COULOMB * (1.3 if v > 0.0 else 0.7),
+    "load": lambda v, torque: 0.5 * COULOMB + 0.1 * abs(torque),
+}
+
+
+def commanded(rng: np.random.Generator, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return torques that move the pendulum: four waves."""
+    waves = [
+        rng.uniform(0.5, 1.5) * np.sin(2.0 * np.pi * rng.uniform(0.1, 2.0) * times + rng.uniform(0.0, 6.0))
+        for _ in range(4)
+    ]
+    return np.sum(waves, axis=0) * (1.0 - np.exp(-times / 0.1))
+
+
+def recorded(
+    law: str = "Coulomb",
+    *,
+    seed: int,
+    offset: float = 0.0,
+    disturbance: float = 0.0,
+    seconds: float = 8.0,
+    moment: float = MOMENT,
+    coulomb: float = 0.0,
+    step: float = 4e-4,
+) -> Log:
+    """Return a log of the pendulum, with noise of 0.2 mrad.
+
+    Each step takes the friction implicitly: it never turns the velocity around.
+
+    Args:
+        law: Name of the friction's law.
+        seed: Seed of motion and noise.
+        offset: What the encoder shows at zero, in rad.
+        disturbance: Deviation of a torque that is not in the log, in N m; it is correlated over 50 ms.
+        seconds: Duration.
+        moment: Moment of inertia about the centre of mass, in kg m^2.
+        coulomb: Friction beside that of the law, in N m.
+        step: Step of the simulation, in s.
+    """
+    rng = np.random.default_rng(seed)
+    times = PERIOD * np.arange(round(seconds / PERIOD))
+    torques = commanded(rng, times)
+    decay, walk = np.exp(-PERIOD / 0.05), np.zeros(times.size)
+    for k in range(1, times.size):
+        walk[k] = decay * walk[k - 1] + np.sqrt(1.0 - decay**2) * rng.normal()
+    acting = torques + disturbance * walk
+    inertia = moment + MASS * CENTER**2
+    q = v = 0.0
+    positions = []
+    for k in range(times.size):
+        positions.append(q)
+        torque = acting[k - 1] if k else 0.0  # A command acts a period later, as with the testbed's drives.
+        for _ in range(round(PERIOD / step)):
+            free = v + step * (torque - VISCOUS * v - MASS * GRAVITY * CENTER * np.sin(q)) / inertia
+            friction = coulomb + LAWS[law](v, torque)
+            v = np.sign(free) * max(abs(free) - step * friction / inertia, 0.0)
+            q += step * v
+    measured = np.array(positions) + offset + 2e-4 * rng.normal(size=times.size)
+    return read_table({"time": times, "q": measured, "u": torques}, sense={"position": "q"}, act={"torque": "u"})

@@ -1,0 +1,62 @@
+"""What a model of joints lacks is named: on a machine that is not made of the package's parts."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.calibration.plain_pendulum import commanded, recorded
+from tests.calibration.test_calibration import VALUES, calibrated
+from vtbdrake.calibration.calibration import Verdict
+
+pytestmark = pytest.mark.one_python
+
+NUMBER = r"(\d+(?:\.\d+)?)"
+
+
+@pytest.mark.parametrize(
+    "seed", [20, pytest.param(21, marks=pytest.mark.slow), pytest.param(22, marks=pytest.mark.slow)]
+)
+def test_right_law_is_accepted(seed: int) -> None:
+    result = calibrated(recorded("Coulomb", seed=seed, disturbance=0.05))
+    assert result.accepted, result
+    errors = {name: abs(each.value - VALUES[name]) for name, each in result.parameters.items()}
+    assert all(error < 4.0 * result.parameters[name].deviation for name, error in errors.items())
+
+
+@pytest.mark.parametrize(
+    ("law", "dependence"),
+    [
+        ("load", "its load"),
+        pytest.param("direction", "the direction of its motion", marks=pytest.mark.slow),
+        pytest.param("Stribeck", "its speed near rest", marks=pytest.mark.slow),
+    ],
+)
+def test_wrong_law_is_named(law: str, dependence: str) -> None:
+    result = calibrated(recorded(law, seed=20))
+    assert {each.verdict for each in result.parameters.values()} == {Verdict.DISCREPANT}
+    (reason,) = result.reasons
+    assert reason.startswith(f"the torque of pivot depends on {dependence}")
+
+
+def test_size_of_a_missing_torque_is_told() -> None:
+    """0.1 |torque| resists the motion: its root mean square is a tenth of the torque's."""
+    result = calibrated(recorded("load", seed=21))
+    found = re.search(rf"{NUMBER} \+- {NUMBER} N m", result.reasons[0])
+    assert found is not None
+    torques = commanded(np.random.default_rng(21), 0.004 * np.arange(2000))
+    expected = 0.1 * np.sqrt(np.mean(torques**2))
+    assert float(found[1]) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "seed", [21, pytest.param(22, marks=pytest.mark.slow), pytest.param(24, marks=pytest.mark.slow)]
+)
+def test_zero_offset_of_an_encoder_is_told(seed: int) -> None:
+    result = calibrated(recorded(seed=seed, offset=0.1))
+    assert not result.accepted
+    found = re.search(rf"encoder of pivot seems to be off by {NUMBER} \+- {NUMBER} rad", result.reasons[0])
+    assert found is not None, result.reasons
+    assert abs(float(found[1]) - 0.1) < 3.0 * float(found[2])

@@ -1,0 +1,149 @@
+r"""What a fitted model of joints lacks: torques that depend on speed, direction, load or position, and zero offsets.
+
+A disturbance of the torques is part of the filter, and it takes what the friction's law does not have: the innovations
+stay white, and segments that were kept back fit as well. So terms that the model could have are tried one by one, at
+their value zero, beside all parameters that were fitted (a score test; C. R. Rao, Proc. Cambridge Philos. Soc. 44,
+1948): the estimate of a term is one step of Gauss and Newton, and its deviation that of the sandwich estimator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.calibration.filtering import Linearization, Noise, Segments
+from vtbdrake.calibration.fisher import Information
+from vtbdrake.calibration.posterior import block_scores
+from vtbdrake.common.arrays import Array
+
+# A term is missed if it lies so many deviations from zero.
+SIGNIFICANT = 6.0
+# Torques below this share of a joint's friction, or its torques if it has no friction, are left to the disturbance.
+SHARE_OF_FRICTION = 0.15
+# The smallest offset of an encoder that is named, in rad or m.
+LEAST_OFFSET = 2e-3
+# An offset turns gravity by one number, as torques that depend on the position could by several: it comes first.
+_SIMPLER = 1.25
+# The noise was fitted without the term, and is too large if there is one: the deviation is at least this share of the
+# one by the noise.
+_LEAST_DEVIATION = 0.5
+# A term of whose information the fitted parameters take more than all but this share is not told apart from them.
+_OWN = 0.15
+# The quantiles of a joint's speeds at which Stribeck's friction is tried, and how much wider than the edge of Coulomb's
+# friction it is at least: the edge is the model's own simplification.
+_SLOW = (0.1, 0.3)
+_WIDER = 4.0
+
+
+@dataclass(frozen=True)
+class MissingTerm:
+    """A term that the fitted model lacks.
+
+    Attributes:
+        joint: Name of the joint.
+        what: What the torque depends on, in words.
+        size: Root mean square of the torque in N m or N, or the offset in rad or m.
+        deviation: Standard deviation of ``size``.
+        share: The share of the joint's friction that the torque is; NaN of an offset.
+    """
+
+    joint: str
+    what: str
+    size: float
+    deviation: float
+    share: float = float("nan")
+
+    def __str__(self) -> str:
+        if np.isnan(self.share):
+            return (
+                f"the encoder of {self.joint} seems to be off by {self.size:.3g} +- {self.deviation:.2g} rad (or m), "
+                "which the model does not have"
+            )
+        return (
+            f"the torque of {self.joint} depends on {self.what}, which the model does not have: {self.size:.3g} +- "
+            f"{self.deviation:.2g} N m (or N) in the mean, {self.share:.0%} of its friction"
+        )
+
+
+def missing_terms(
+    segments: Segments, noise: Noise, z: Array, used: NDArray[np.bool], info: Information
+) -> list[MissingTerm]:
+    """Return what the model lacks at its estimate, the most significant term of each joint.
+
+    Args:
+        segments: The recordings, with their filtered trajectories.
+        noise: The likeliest noise.
+        z: The estimate, (nz,).
+        used: The segments that were fitted.
+        info: What they tell about the parameters.
+    """
+    linearized = segments.linearized(z)
+    terms = list(_terms(segments, linearized, z))
+    columns = np.stack([column for *_, column in terms], axis=-1)
+    extended = linearized._replace(slopes=np.concatenate([linearized.slopes, columns], axis=-1))
+    innovations = segments.innovations(noise, extended)
+    white = innovations.white[:, used]
+    fitted, tried = np.split(innovations.slopes[:, used], [len(z)], axis=-1)
+    J, G = (fitted * info.scales).reshape(-1, len(z)), tried.reshape(-1, len(terms))
+    # What the fitted parameters leave of the terms.
+    shared = info.covariance @ (J.T @ G)
+    own = tried - (fitted * info.scales) @ shared
+    power, whole = (own**2).sum(axis=(0, 1, 2)), (G**2).sum(axis=0)
+    gradients = np.einsum("twij,twi->j", own, white)
+    found: dict[str, tuple[float, MissingTerm]] = {}
+    for k, (joint, what, rms, friction, _) in enumerate(terms):
+        if power[k] <= _OWN * whole[k]:
+            continue
+        value = -gradients[k] / power[k]
+        # Without the term, the scores are those of a wrong model.
+        scores = block_scores(own[..., [k]], white + value * own[..., k], segments.period)
+        deviation = max(np.sqrt((scores**2).sum()), _LEAST_DEVIATION * np.sqrt(power[k])) / power[k]
+        is_offset = np.isnan(friction)
+        size = abs(value) * rms
+        large = size > (LEAST_OFFSET if is_offset else SHARE_OF_FRICTION * friction)
+        significance = abs(value) / deviation
+        rank = significance * (_SIMPLER if is_offset else 1.0)
+        if large and significance > SIGNIFICANT and rank > found.get(joint, (0.0,))[0]:
+            share = float("nan") if is_offset else size / friction
+            found[joint] = rank, MissingTerm(joint, what, float(size), float(deviation * rms), share)
+    return [term for _, term in found.values()]
+
+
+def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[tuple[str, str, float, float, Array]]:
+    """Yield joint, dependence, RMS of the torque for a coefficient of 1, that of the friction, and slopes of defects.
+
+    Of the offset of an encoder, the RMS is 1 and the friction NaN.
+    """
+    model = segments.model
+    n = model.nq
+    x = segments.trajectory[:-1]
+    motor, friction = segments.torques(z)
+    for j, name in enumerate(model.joint_names):
+        q, v, load = x[..., j], x[..., n + j], motor[..., j]
+        sign, speed = np.sign(v), abs(v)
+        rms = _rms(friction[..., j]) or _rms(load)
+        if rms > 0.0:
+            shapes = {
+                "the direction of its motion (friction that is not the same in both)": [np.ones_like(v), sign],
+                "its speed near rest (Stribeck's friction)": [
+                    sign * np.exp(-((v / max(width, _WIDER * model.edges[j])) ** 2))
+                    for width in np.quantile(speed, _SLOW)
+                ],
+                "its speed (friction that is not linear in it)": [v * speed],
+                "its load (friction that grows with the torque)": [sign * abs(load)],
+                "its position": [np.sin(q), np.cos(q), np.sin(2.0 * q), np.cos(2.0 * q)],
+            }
+            for what, torques in shapes.items():
+                for torque in torques:
+                    yield name, what, _rms(torque), rms, linearized.B[..., j] * torque[..., np.newaxis]
+        unit = np.zeros(2 * n)
+        unit[j] = 1.0
+        # The model at q + offset, and back: what the positions become differs from the measured ones by the offset.
+        yield name, "the zero of its encoder", 1.0, float("nan"), unit - linearized.A[..., j]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
