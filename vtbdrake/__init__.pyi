@@ -5,6 +5,9 @@ from .common.validity_domain import ValidityDomainError as ValidityDomainError
 from .control.realtime import RealTime as RealTime
 from .control.runtime import Runtime as Runtime
 from .deployment.deployment import Deployment as Deployment
+from .environments.make import gymnasium_env as gymnasium_env
+from .environments.make import gymnasium_vector_env as gymnasium_vector_env
+from .environments.rewards import Reward as Reward
 from .lcm.hub import Hub as Hub
 from .lcm.protocol import Protocol as Protocol
 from .machine import MachineProcess as MachineProcess

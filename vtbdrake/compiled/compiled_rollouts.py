@@ -74,6 +74,9 @@ class CompiledRollouts:
         parameters: The addresses that a call can vary; others that lie in the compiled state can be, too.
         outputs: The addresses that are recorded.
         times: The sample times from the begin (s), shape (m,).
+        timings: (period, offset) of all periodic events, in seconds.
+        columns: Where each output lies among the recorded values of an instant; the doubt is the last of these.
+        shapes: The shape of each output.
     """
 
     def __init__(
@@ -122,12 +125,12 @@ class CompiledRollouts:
             self._z, self._time = casadi.SX.sym("z", self.walker.size), casadi.SX.sym("time")
             self._w = casadi.SX.sym("w", max(1, self.walker.noise))
             recorded, doubt = self._recorded_values()
-            self._shapes = {
+            self.shapes = {
                 name: variables[name].shape if name in variables else (value.numel(),)
                 for name, value in recorded.items()
             } | dict.fromkeys(self._measures, ())
-            ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self._shapes.values())]).tolist()
-            self._columns = {name: slice(*ends[k : k + 2]) for k, name in enumerate(self._shapes)}
+            ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self.shapes.values())]).tolist()
+            self.columns = {name: slice(*ends[k : k + 2]) for k, name in enumerate(self.shapes)}
             result = casadi.densify(casadi.vertcat(*recorded.values(), doubt))
             self._record = casadi.Function("record", [self._z, self._time, self._w], [result], {"cse": True})
             self._updates = [self._update(timing) for timing in self.walker.timings]
@@ -136,15 +139,15 @@ class CompiledRollouts:
         _refuse_many_instants(horizon, sample_period, [timing.period for timing in self.walker.timings])
         self.times = sample_times(horizon, sample_period)
         by_default = [(timing.period, timing.offset) for timing in self.walker.timings]
-        self._timings = by_default if timings is None else list(timings)
+        self.timings = by_default if timings is None else list(timings)
         self._z0 = self.walker.read(self.walker.context)
-        self._programs: LruDict[int, _Program] = LruDict(_MAX_PROGRAMS)
+        self._programs: LruDict[int, Program] = LruDict(_MAX_PROGRAMS)
         self._last_schedule: tuple[float, list[Instant]] = np.nan, []
-        self._last_plan: tuple[list[Instant], _Program, Array] | None = None
+        self._last_plan: tuple[list[Instant], Program, Array] | None = None
         self._last_noise: tuple[object, Array] = None, np.zeros(0)
         self._lock = threading.Lock()
         self._refuse_initialization()
-        program = self._program(self.schedule_at(context.get_time()))
+        program = self.program(self.schedule_at(context.get_time()))
         if compile is None and not program.is_machine_code:
             _log.warning("the testbed is interpreted by CasADi, several times more slowly: see `vtbdrake doctor`")
         if check:
@@ -238,7 +241,8 @@ class CompiledRollouts:
 
         def run(chunk: slice) -> None:
             noise = self._noise(z[chunk], instants, program.count)
-            final[chunk], recorded[chunk] = program.run(z[chunk], noise, plan)
+            final[chunk], records = program.run(z[chunk], noise, plan)
+            recorded[chunk] = records[:, plan[:, 1] != 0.0]
 
         if len(chunks) <= 1:
             run(slice(None))
@@ -247,8 +251,8 @@ class CompiledRollouts:
                 list(pool.map(run, chunks))
         valid: NDArray[np.bool_] = np.all(recorded[:, :, -1] <= 0.0, axis=1)
         outputs = {
-            name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self._shapes[name])
-            for name, columns in self._columns.items()
+            name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self.shapes[name])
+            for name, columns in self.columns.items()
         }
         return CompiledBatch(self.times, outputs, final, valid)
 
@@ -283,7 +287,7 @@ class CompiledRollouts:
             z[place] = expression
         _, recorded = self.function(z, *self.arguments())
         samples = [k for k, i in enumerate(self.schedule_at(self.walker.context.get_time())) if i.is_sample]
-        return {name: recorded[columns, samples] for name, columns in self._columns.items()}
+        return {name: recorded[columns, samples] for name, columns in self.columns.items()}
 
     def advanced(self, z: Array, instant: Instant) -> Array:
         """Return z, shape (nz,), after what happens at an instant; it is interpreted.
@@ -308,7 +312,7 @@ class CompiledRollouts:
             instant: The instant.
         """
         values = self._record(z, instant.time, self._noise_at(z, instant)).full().ravel()
-        return {name: values[columns] for name, columns in self._columns.items()}, values[-1]
+        return {name: values[columns] for name, columns in self.columns.items()}, values[-1]
 
     def read(self, address: str, context: Context) -> Any:
         """Return the value of an output in a root context.
@@ -327,7 +331,7 @@ class CompiledRollouts:
         other arguments are returned by `arguments`. The recorded values have a column per instant; the last one is
         positive where z or they differ from the Diagram's.
         """
-        return self._program(self.schedule_at(self.walker.context.get_time())).function
+        return self.program(self.schedule_at(self.walker.context.get_time())).function
 
     def arguments(self) -> tuple[Array, Array]:
         """Return the arguments of `function` beside z: the instants, shape (m, count), and the random numbers of s0."""
@@ -376,11 +380,11 @@ class CompiledRollouts:
         """Return the instants of a rollout that begins at t0 (s)."""
         t_last, instants = self._last_schedule
         if t_last != t0:
-            instants = schedule(self.walker.timings, sample_instants(self.times, t0, self._timings))
+            instants = schedule(self.walker.timings, sample_instants(self.times, t0, self.timings))
             self._last_schedule = t0, instants
         return instants
 
-    def _program(self, instants: Sequence[Instant]) -> _Program:
+    def program(self, instants: Sequence[Instant]) -> Program:
         """Return a program for as many instants; updates may coincide at any of them."""
         with self._lock, making():
             needed = len(instants)
@@ -392,7 +396,7 @@ class CompiledRollouts:
             count = needed + len(self.walker.timings)
             unrestricted = [timing.unrestricted for timing in self.walker.timings]
             function = _rollout(self._updates, unrestricted, self._record, count)
-            program = _Program(function, count, self._translate)
+            program = Program(function, count, self._translate)
             self._programs.add(count, program)
             return program
 
@@ -401,11 +405,11 @@ class CompiledRollouts:
         w: Array = self.walker.draw_numbers(self.walker.seeds(z[np.newaxis]), [instant], 1)[0, 0]
         return w
 
-    def _planned(self, instants: list[Instant]) -> tuple[_Program, Array]:
+    def _planned(self, instants: list[Instant]) -> tuple[Program, Array]:
         """Return the program for some instants, and its plan of them; both are kept for the last begin."""
         last = self._last_plan
         if last is None or last[0] is not instants:
-            program = self._program(instants)
+            program = self.program(instants)
             last = self._last_plan = instants, program, program.plan(instants)
         return last[1:]
 
@@ -423,7 +427,7 @@ class CompiledRollouts:
         return last[1]
 
 
-class _Program:
+class Program:
     """The rollout over a number of instants as machine code.
 
     Attributes:
@@ -456,7 +460,15 @@ class _Program:
         return plan
 
     def run(self, z: Array, noise: Array | None, plan: Array) -> tuple[Array, Array]:
-        """Return z at the end, shape (n, nz), and what was recorded, shape (n, m, ny); see `plan`."""
+        """Return z at the end, shape (n, nz), and the records of all instants, shape (n, count, ny).
+
+        The thread's next call overwrites the records.
+
+        Args:
+            z: State and parameters at the start, shape (n, nz).
+            noise: The random numbers, shape (n, count, noise), or (1, ...) if all rollouts have the same; None: none.
+            plan: What happens at the instants, see `plan`: one for all rollouts, or one for each in front.
+        """
         n, nz = z.shape
         with self._lock:
             buffers = self._buffers.use(n)
@@ -464,15 +476,14 @@ class _Program:
                 buffers = Buffers(self._packed.map(n) if n > 1 else self._packed, may_fail=False)
                 self._buffers.add(n, buffers)
         arguments, evaluate, result = buffers.parts
+        size = self.count * plan.shape[-1]
         arguments[: n * nz] = z.ravel()
-        arguments[n * nz : n * (nz + plan.size)].reshape(n, -1)[:] = plan.ravel()
+        arguments[n * nz : n * (nz + size)].reshape(n, -1)[:] = plan.reshape(-1, size)
         if noise is not None:
-            arguments[n * (nz + plan.size) :].reshape(n, -1)[:] = noise.reshape(len(noise), -1)
+            arguments[n * (nz + size) :].reshape(n, -1)[:] = noise.reshape(len(noise), -1)
         evaluate()
-        # The thread's next call overwrites the result.
         rows = result.reshape(n, -1)
-        recorded = rows[:, nz:].reshape(n, self.count, -1)
-        return rows[:, :nz].copy(), recorded[:, plan[:, 1] != 0.0]
+        return rows[:, :nz].copy(), rows[:, nz:].reshape(n, self.count, -1)
 
 
 def _check_options(compile: bool | None, check: bool, workers: int) -> None:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from vtbdrake.rollout.quality import READINGS, Measure, QualityError, exceeds, r
 from vtbdrake.rollout.recorded_motion import MotionPlayer, Recording
 from vtbdrake.rollout.start import Start, StartContext
 from vtbdrake.rollout.task import FAILED, HORIZON, QUALITY_FAILED, TERMINATED, THRESHOLD, RolloutResult, RolloutTask
+from vtbdrake.state import Snapshot
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.integrator import apply_simulator_config, controls_error
 
@@ -63,7 +65,6 @@ class RolloutRunner:
         self._variables = self.testbed.variables()
         # f first, then what else is measured.
         self._measures = [*([task.quality] if task.quality else []), *task.measures]
-        self._readers = {a: self.testbed.reader(a) for measure in self._measures for a in measure.of}
         self._bound_readers = [self.testbed.reader(a) for a in task.pruning.of] if task.pruning is not None else []
         self._recorders = {address: self.testbed.reader(address) for address in task.record}
         self._times = task.sample_times()
@@ -76,12 +77,14 @@ class RolloutRunner:
         self._controls_error = controls_error(self.testbed.simulator_config) and bool(self._s0.num_continuous_states())
         self._simulator = Simulator(self.testbed.diagram, self.testbed.default_context())
         self._context = self._simulator.get_mutable_context()
+        self._readers = {a: self.testbed.bound_reader(self._context, a) for m in self._measures for a in m.of}
         self._step_watch = self.testbed.step_watch(self._simulator)
         self._world_state = _world_state(self.testbed, self._context)
         self._copier = self.testbed.copier_from(self.testbed)
         self._start_context = StartContext(self.testbed, self._s0, self._copier)
         self._player = MotionPlayer(task.motion, self.testbed) if task.motion is not None else None
         self._initialized: SimulatorStatus | None = None  # what the systems said at the begin of the rollout
+        self.termination = ""  # why a system has ended the rollout of `simulate`; empty if none has
         self._timed = False  # Whether the times belong to the present start.
         self._set_times()
         # The hidden variables that differ from s0; None: any may, since a snapshot was restored.
@@ -208,12 +211,19 @@ class RolloutRunner:
         instants = self.task.instants(self._t0, self._timings, times=times)
         return zip(times.tolist(), *marks.tolist(), instants.tolist(), strict=True)
 
-    def simulate(self, parameters: Mapping[str, Any], *, start: Start | None = None) -> Iterator[float]:
+    def simulate(
+        self, parameters: Mapping[str, Any], *, start: Start | None = None, begun: float | None = None
+    ) -> Iterator[float]:
         """Simulate from s0, and yield every sample time when the simulation has reached it.
+
+        At each of them, variables may be set in `context`. If a system ends the simulation, `termination` tells why,
+        and the last time comes early.
 
         Args:
             parameters: Address -> value, set in s0.
             start: Where the rollout begins instead of the task's s0.
+            begun: The time (s) at which a rollout began that goes on at ``start``, which lies at one of its samples:
+                the other ones follow at the same instants, to the last bit. By default, it begins at the start.
 
         Raises:
             SimulationError: The simulation cannot go on.
@@ -221,16 +231,30 @@ class RolloutRunner:
         """
         self._set_start(start)
         self._reset(parameters)
-        for t, instant in zip(self._times, self._instants, strict=True):
-            status = self._advance(t, instant)
-            yield float(t)
+        times, instants = self._times, self._instants
+        if begun is not None:
+            instants = self.task.instants(begun, self._timings, times=times)
+            is_left = instants >= self._t0
+            times, instants = times[is_left], instants[is_left]
+        for t, instant in zip(times.tolist(), instants.tolist(), strict=True):
+            status = self._advance(0.0 if instant == self._t0 else t, instant)
             if _terminated(status):
+                self.termination = status.FormatMessage()
+            yield t
+            if self.termination:
                 return
+
+    def fork(self) -> Snapshot:
+        """Return the state in `context`, from which the rest follows as in the present rollout.
+
+        See `AddressedDiagram.fork`.
+        """
+        return self.testbed.fork(self._simulator)
 
     def measured(self, t: float) -> list[float]:
         """Return f and the other measures in the present state, at the sample time ``t``."""
         with _failures_as_outcomes:
-            values = {address: read(self._context) for address, read in self._readers.items()}
+            values = {address: read() for address, read in self._readers.items()}
         return [_sample(measure, [_copied(values[a]) for a in measure.of], t) for measure in self._measures]
 
     def state(self, parameters: Mapping[str, Any], t: float, *, start: Start | None = None) -> Any:
@@ -321,6 +345,7 @@ class RolloutRunner:
             self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
 
     def _reset(self, parameters: Mapping[str, Any]) -> None:
+        self.termination = ""
         # A new integrator: the step size of a used one would change the trajectory.
         apply_simulator_config(self.testbed.simulator_config, self._simulator)
         self._simulator.set_target_realtime_rate(0.0)
@@ -374,7 +399,9 @@ class RolloutRunner:
 
     def _refuse_nonfinite(self, t: float) -> None:
         # NaN is allowed in a DPS, for unknown values, but not in the simulated world.
-        if not np.isfinite(self._world_state()).all():
+        state = self._world_state()
+        # The sum of squares, which is quick, is finite only if all are.
+        if not isfinite(state @ state) and not np.isfinite(state).all():
             raise SimulationError(f"the state is not finite at t = {t:g} s: the simulation diverged")
 
     @property

@@ -1,0 +1,106 @@
+"""Rollouts in segments, between which variables may be set: each rollout at its own place, all in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vtbdrake.common.arrays import Array
+from vtbdrake.compiled.compiled_rollouts import CompiledRollouts, Program
+from vtbdrake.compiled.schedule import Instant, schedule
+from vtbdrake.testbed.instants import sample_instants
+
+
+class Segments:
+    """A compiled rollout from t0 that stops at each k-th sample, as Drake's Simulator would at a boundary time.
+
+    A segment begins with the updates of its first instant, which so see what was set there, and ends with the last
+    sample, before the updates of that instant.
+
+    Args:
+        rollouts: The compiled Diagram, with what is recorded.
+        times: The sample times from the begin (s), the first is 0, the last the end of the last segment.
+        every: The number of samples of a segment.
+        t0: The time at which the rollouts begin (s).
+
+    Attributes:
+        instants: The simulator's times at the samples (s), shape (segments * every + 1,).
+    """
+
+    def __init__(self, rollouts: CompiledRollouts, times: Array, *, every: int, t0: float) -> None:
+        self._rollouts, self._walker = rollouts, rollouts.walker
+        self.instants = sample_instants(times, t0, rollouts.timings)
+        instants = schedule(self._walker.timings, self.instants)
+        at_samples = [k for k, instant in enumerate(instants) if instant.is_sample]
+        ends = at_samples[::every]
+        self._parts = [
+            [
+                instants[begin]._replace(is_sample=False),
+                *instants[begin + 1 : end],
+                instants[end]._replace(updates=()),
+            ]
+            for begin, end in zip(ends[:-1], ends[1:], strict=True)
+        ]
+        self._program: Program = rollouts.program(max(self._parts, key=len))
+        self._plans = np.array([self._program.plan(part) for part in self._parts])
+        samples = np.array(at_samples[1:]).reshape(-1, every)
+        self._samples = samples - np.array(ends[:-1])[:, np.newaxis]
+        self._first = [Instant(float(self.instants[0]), True, ())]
+
+    def begin(self, z: Array) -> Array:
+        """Return the records of the first sample of rollouts that begin at z, shape (n, ny).
+
+        Args:
+            z: State and parameters, shape (n, nz).
+        """
+        records = np.empty((len(z), self._program.function.size1_out(1)))
+        plan = self._program.plan(self._first)
+        noise = self._drawn(z, self._first) if self._walker.noise else None
+        for chunk in self._chunks(len(z)):
+            each = None if noise is None else noise[chunk]
+            records[chunk] = self._program.run(z[chunk], each, plan)[1][:, 0]
+        return records
+
+    def advance(self, z: Array, segments: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Simulate one segment of each rollout.
+
+        Args:
+            z: State and parameters at the begin of the segments, shape (n, nz).
+            segments: The number of the segment of each rollout, from 0 on, shape (n,).
+
+        Returns:
+            z at the end, shape (n, nz), and the records of the samples, shape (n, every, ny), whose last column, the
+            doubt, is positive where the rollout has departed from Drake's.
+        """
+        samples = self._samples[segments]
+        after = np.empty_like(z)
+        records = np.empty((*samples.shape, self._program.function.size1_out(1)))
+        is_same = bool((segments == segments[0]).all())
+        plans = self._plans[segments[0]] if is_same else self._plans[segments]
+        noise = self._noise(z, segments)
+        for chunk in self._chunks(len(z)):
+            each = None if noise is None else noise[chunk]
+            after[chunk], recorded = self._program.run(z[chunk], each, plans if is_same else plans[chunk])
+            if is_same:
+                records[chunk] = recorded[:, samples[0]]
+            else:
+                records[chunk] = np.take_along_axis(recorded, samples[chunk, :, np.newaxis], axis=1)
+        return after, records
+
+    def _chunks(self, count: int) -> list[slice]:
+        return [slice(k, k + self._program.most) for k in range(0, count, self._program.most)]
+
+    def _noise(self, z: Array, segments: NDArray[np.intp]) -> Array | None:
+        """Return the random numbers of all rollouts in their segments, shape (n, count, noise); None: there are none."""
+        if not self._walker.noise:
+            return None
+        noise = np.empty((len(z), self._program.count, self._walker.noise))
+        for number in np.unique(segments).tolist():
+            rows = np.flatnonzero(segments == number)
+            noise[rows] = self._drawn(z[rows], self._parts[number])
+        return noise
+
+    def _drawn(self, z: Array, instants: Sequence[Instant]) -> Array:
+        return self._walker.draw_numbers(self._walker.seeds(z), instants, self._program.count)

@@ -1,0 +1,80 @@
+"""What the steps of an episode are worth: the increase of a quality, or a reward of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vtbdrake.rollout.quality import Constraint, Measure, Quality
+
+# One sample, or those of many episodes: a float, or an array of shape (n,).
+Samples = Any
+
+
+@dataclass(frozen=True, repr=False)
+class Reward(Measure):
+    """The reward of a step: f of variables at the end of the step, a finite number of any sign.
+
+    Attributes:
+        f: The function. It gets the values of the variables in the order of ``of``, floats or arrays.
+        of: Addresses of variables or vector output ports (``path.port``) of the testbed; ``time`` is the simulation's
+            clock.
+        unit: The unit of f.
+    """
+
+    role: ClassVar[str] = "reward"
+
+    reading: str = field(default="end", init=False)
+
+    def read(self, times: np.ndarray, samples: np.ndarray) -> np.ndarray:
+        """Return the sum of the rewards, shape (...), of the samples, shape (..., n): all but the first, at the start.
+
+        Args:
+            times: The times of the steps' ends, and of the start, in s, shape (n,).
+            samples: Values of f, shape (..., n).
+        """
+        return np.asarray(samples)[..., 1:].sum(axis=-1)
+
+
+def first_score(measure: Quality | Reward, sample: Samples) -> Samples:
+    """Return the score of an episode at its start: the reading of a quality over one sample, 0 for a `Reward`.
+
+    Args:
+        measure: The quality or the reward.
+        sample: The sample at the start, a float or shape (n,).
+    """
+    return sample if isinstance(measure, Quality) and measure.reading != "integral" else 0.0 * sample
+
+
+def next_score(measure: Quality | Reward, score: Samples, last: Samples, sample: Samples, seconds: float) -> Samples:
+    """Return the score of an episode after one more sample: the reading of the quality over all samples so far.
+
+    Args:
+        measure: The quality; the score of a `Reward` is the sum of its samples.
+        score: The score before, a float or shape (n,).
+        last: The sample before, likewise.
+        sample: The sample, likewise.
+        seconds: The time between the two samples.
+    """
+    if isinstance(measure, Reward):
+        return score + sample
+    match measure.reading:
+        case "integral":
+            return score + 0.5 * seconds * (last + sample)
+        case "end":
+            return sample
+        case reading:
+            is_larger = (reading == "best") != measure.minimize
+            return (np.maximum if is_larger else np.minimum)(score, sample)
+
+
+def violates(constraint: Constraint, sample: Samples) -> Any:
+    """Return whether a sample, or which of several, breaks a constraint."""
+    return (sample > constraint.at_most) | (sample < constraint.at_least)
+
+
+def sign_of(measure: Quality | Reward) -> float:
+    """Return 1, or -1 for a cost: the reward of a step is this times the increase of the score."""
+    return measure.sign if isinstance(measure, Quality) else 1.0
