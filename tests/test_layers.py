@@ -61,6 +61,7 @@ BELOW["common"] = set()
 BELOW["project"] = {"state", "testbed", "components", "station", "common"}
 BELOW["visualization"] = set(BELOW)
 BELOW["campaigns"] = {"state", "testbed", "rollout", "optimization", "visualization", "common"}
+BELOW["environments"] = {"state", "testbed", "rollout", "optimization", "compiled", "common"}
 BELOW["testing"] = set(BELOW)
 BELOW["web"] = set(BELOW)
 BELOW["cli"] = set(BELOW)

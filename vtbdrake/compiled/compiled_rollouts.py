@@ -430,6 +430,11 @@ class CompiledRollouts:
 class Program:
     """The rollout over a number of instants as machine code.
 
+    Args:
+        function: The function of one rollout; see `_rollout`.
+        count: The number of instants.
+        translate: Makes machine code of a function, or returns it as it is.
+
     Attributes:
         count: The number of instants.
         function: The function of one rollout; see `_rollout`.

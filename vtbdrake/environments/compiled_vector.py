@@ -12,12 +12,13 @@ from gymnasium.utils import seeding
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.compiled import CompiledRollouts
-from vtbdrake.compiled.segments import Segments
+from vtbdrake.compiled.segmented_rollouts import SegmentedRollouts
 from vtbdrake.compiled.tracing import traced
 from vtbdrake.environments.episodes import Episodes, FailedEpisodeError, seed_addresses
-from vtbdrake.environments.rewards import first_score, next_score, sign_of
+from vtbdrake.environments.rewards import first_score, next_score, step_reward
 from vtbdrake.environments.spaces import Channels, switch_values
-from vtbdrake.environments.vector import Flags, Step, TestbedVectorEnv
+from vtbdrake.environments.vector import Flags, Rows, Step, TestbedVectorEnv
+from vtbdrake.rollout import Quality
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.start import Start
 from vtbdrake.testbed import VirtualTestbed
@@ -27,7 +28,7 @@ _CHECKED_STEPS = 12
 
 
 class CompiledVectorEnv(TestbedVectorEnv):
-    """Environments of the compiled testbed, equal to single ones in Drake to about 1e-15; see docs/compiled_testbeds.md.
+    """Environments of the compiled testbed, whose steps equal Drake's to about 1e-15; see docs/compiled_testbeds.md.
 
     A step that the compiled testbed cannot make (a joint reaches its stop, the state is not finite) is made in Drake.
 
@@ -55,21 +56,23 @@ class CompiledVectorEnv(TestbedVectorEnv):
         self._rollouts = self._compiled(s0, compile)
         walker, t0 = self._rollouts.walker, s0.get_time()
         self._times = self._task.sample_times()
-        self._segments = Segments(self._rollouts, self._times, every=episodes.every, t0=t0)
+        self._segments = SegmentedRollouts(self._rollouts, self._times, every=episodes.every, t0=t0)
         self._seeds = [address for address in seed_addresses(testbed.variables()) if walker.can_vary(address)]
         self._in_drake = _StepInDrake(testbed, self._rollouts, self._segments, episodes, self._actions)
-        self._acted = np.concatenate([np.arange(walker.size)[walker.place(a)] for a in self._actions.addresses])
-        self._seen = np.concatenate([self._entries(address) for address in self._observations.addresses])
+        self._action_entries = np.concatenate(
+            [np.arange(walker.size)[walker.place(a)] for a in self._actions.addresses]
+        )
+        self._observed_entries = np.concatenate([self._entries(address) for address in self._observations.addresses])
         self._z0 = self._rollouts.z_of(s0)
         self._z = np.repeat(self._z0[np.newaxis], num_envs, axis=0)
         self._random = [seeding.np_random()[0] for _ in range(num_envs)]
         self._steps = np.zeros(num_envs, dtype=np.intp)
         self._done: Flags = np.zeros(num_envs, dtype=bool)
         self._score, self._last = np.zeros(num_envs), np.zeros(num_envs)
-        self._observed = np.zeros((num_envs, len(self._seen)))
+        self._observed = np.zeros((num_envs, len(self._observed_entries)))
         self._needs_reset = "the environments are new"
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: Any) -> Step:  # type: ignore[override]  # Gymnasium has one type for numbers and flags.
         """Make a step in every environment, or reset it if its episode had ended.
 
         Args:
@@ -77,7 +80,7 @@ class CompiledVectorEnv(TestbedVectorEnv):
 
         Returns:
             Observations (num_envs, size), rewards, terminations, truncations, each (num_envs,), and {"quality": the
-            scores so far, "failure": why simulations have failed}.
+            quality of all samples so far, "failure": why simulations have failed}.
 
         Raises:
             ActionError: An action is not finite, or lies beyond the limits; nothing happened.
@@ -100,12 +103,11 @@ class CompiledVectorEnv(TestbedVectorEnv):
             self._begin(ended, None)
         self._done = terminated | truncated
         self._needs_reset = ""
-        infos |= {"quality": self._score.copy(), "_quality": np.ones(self.num_envs, dtype=bool)}
+        if isinstance(self.episodes.reward, Quality):
+            infos |= {"quality": self._score.copy(), "_quality": np.ones(self.num_envs, dtype=bool)}
         return self._observed.copy(), rewards, terminated, truncated, infos
 
-    def _reset(
-        self, seeds: Sequence[int | None], options: Mapping[str, Any] | None
-    ) -> tuple[Array, dict[str, Any]]:
+    def _reset(self, seeds: Sequence[int | None], options: Mapping[str, Any] | None) -> tuple[Array, dict[str, Any]]:
         for row, seed in enumerate(seeds):
             if seed is not None:
                 self._random[row], _ = seeding.np_random(seed)
@@ -115,7 +117,8 @@ class CompiledVectorEnv(TestbedVectorEnv):
         self._needs_reset = ""
         infos: dict[str, Any] = {}
         for row, of_row in enumerate(values):
-            infos = self._add_info(infos, {"values": of_row, "quality": float(self._score[row])}, row)
+            quality = {"quality": float(self._score[row])} if isinstance(self.episodes.reward, Quality) else {}
+            infos = self._add_info(infos, {"values": dict(of_row), **quality}, row)
         return self._observed.copy(), infos
 
     # -- how it is done
@@ -150,7 +153,7 @@ class CompiledVectorEnv(TestbedVectorEnv):
         columns = self._rollouts.columns[name]
         return np.arange(columns.start, columns.stop)
 
-    def _begin(self, rows: Array, options: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+    def _begin(self, rows: Rows, options: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
         """Begin an episode in some environments; return the values that were set."""
         variables, everywhere = self._testbed.variables(), seed_addresses(self._testbed.variables())
         drawn = []
@@ -173,13 +176,13 @@ class CompiledVectorEnv(TestbedVectorEnv):
         samples = self._samples(records, np.broadcast_to(self._times[0], (len(rows), 1)))
         first = samples[self.episodes.reward_index][:, 0]
         self._last[rows], self._score[rows] = first, first_score(self.episodes.reward, first)
-        self._observed[rows], self._steps[rows] = records[:, 0, self._seen], 0
+        self._observed[rows], self._steps[rows] = records[:, 0, self._observed_entries], 0
         return drawn
 
-    def _advance(self, rows: Array, actions: Array) -> tuple[Array, Flags, dict[int, str]]:
-        """Make a step of some environments; return rewards, terminations and, by environment, why a simulation fails."""
+    def _advance(self, rows: Rows, actions: Array) -> tuple[Array, Flags, dict[int, str]]:
+        """Make a step of some environments; return rewards, terminations and, by environment, why simulations fail."""
         z = self._z[rows]
-        z[:, self._acted] = actions
+        z[:, self._action_entries] = actions
         steps = self._steps[rows]
         after, records = self._segments.advance(z, steps)
         failures: dict[int, str] = {}
@@ -194,15 +197,15 @@ class CompiledVectorEnv(TestbedVectorEnv):
         samples = self._samples(records, self._times[steps[:, np.newaxis] * every + np.arange(1, every + 1)])
         before = self._score[rows]
         terminated, ends = self._add_up(rows, samples, steps)
-        rewards = sign_of(self.episodes.reward) * (self._score[rows] - before)
-        observed = records[np.arange(len(rows)), ends][:, self._seen]
+        rewards = step_reward(self.episodes.reward, before, self._score[rows], self._last[rows])
+        observed = records[np.arange(len(rows)), ends][:, self._observed_entries]
         for k in [k for k, row in enumerate(rows.tolist()) if row in failures]:
             rewards[k], terminated[k] = self.episodes.failure_reward or 0.0, True
             observed[k], self._score[rows[k]] = self._observed[rows[k]], before[k]
         self._z[rows], self._observed[rows], self._steps[rows] = after, observed, steps + 1
         return rewards, terminated, failures
 
-    def _add_up(self, rows: Array, samples: Sequence[Array], steps: Array) -> tuple[Flags, Array]:
+    def _add_up(self, rows: Rows, samples: Sequence[Array], steps: Rows) -> tuple[Flags, Rows]:
         """Add the samples of a step to the scores; return whether, and at which sample, episodes terminate."""
         score, last = self._score[rows], self._last[rows]
         terminated, ends = np.zeros(len(rows), dtype=bool), np.full(len(rows), self.episodes.every - 1)
@@ -234,7 +237,7 @@ class CompiledVectorEnv(TestbedVectorEnv):
         return samples
 
     def _accepted(self, records: Array) -> Flags:
-        """Return which rows have valid samples of all compiled measures."""
+        """Return a mask of the rows whose samples of all compiled measures are valid."""
         accepted = np.ones(len(records), dtype=bool)
         for k, measure in enumerate(self.episodes.measures):
             if (name := _measure_name(k)) in self._rollouts.columns:
@@ -258,7 +261,7 @@ class _StepInDrake:
         self,
         testbed: VirtualTestbed,
         rollouts: CompiledRollouts,
-        segments: Segments,
+        segments: SegmentedRollouts,
         episodes: Episodes,
         channels: Channels,
     ) -> None:
@@ -290,7 +293,7 @@ class _StepInDrake:
         return walker.read(self._runner.context), records
 
     def _record(self, time: float) -> Array:
-        """Return what is recorded of the present state; the last entry, the doubt, is 0."""
+        """Return the record of the present state; its last entry, the doubt, is 0."""
         assert self._runner is not None
         columns = self._rollouts.columns
         record = np.zeros(1 + max(entries.stop for entries in columns.values()))

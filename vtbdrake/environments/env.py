@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array
 from vtbdrake.environments.episodes import Episodes, FailedEpisodeError
-from vtbdrake.environments.rewards import first_score, next_score, sign_of
+from vtbdrake.environments.rewards import first_score, next_score, step_reward
 from vtbdrake.environments.spaces import (
     Channels,
     action_channels,
@@ -23,6 +23,7 @@ from vtbdrake.environments.spaces import (
     switch_values,
     writer_into,
 )
+from vtbdrake.rollout import Quality
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.start import Start
 from vtbdrake.state import Snapshot, SnapshotError
@@ -31,7 +32,7 @@ from vtbdrake.testbed import VirtualTestbed
 _NOTE = "episode"
 
 
-def box_of(channels: Channels) -> Box:
+def box_of(channels: Channels) -> Box[np.float64]:
     """Return the space of some channels: their limits, in double precision."""
     return Box(channels.lower, channels.upper, dtype=np.float64)
 
@@ -69,7 +70,6 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._write = writer_into(self.testbed, self._actions, self._runner.context)
         self._read = reader_into(self.testbed, observations, self._runner.context)
         self._reward, self._place = episodes.reward, episodes.reward_index
-        self._sign = sign_of(self._reward)
         self._can_terminate = len(episodes.measures) > 1 or episodes.task.threshold is not None
         self._samples: Iterator[float] = iter(())
         self._needs_reset = "the environment is new"
@@ -94,7 +94,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 which nothing but ``values`` is changed.
 
         Returns:
-            The observation, and {"values": what was set in s0, by address; "quality": that of the first sample}.
+            The observation, and {"values": what was set in s0, by address; "quality": the quality of the first sample}.
 
         Raises:
             ValueError: There is no such option, or it does not take the value.
@@ -102,15 +102,15 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         """
         super().reset(seed=seed)
         beginning = self.episodes.drawn(self.np_random, options, self.testbed.variables())
-        start, kept = (None, {}) if beginning.start is None else self._start_at(beginning.start)
+        start, begin_values = (None, {}) if beginning.start is None else self._start_at(beginning.start)
         self._needs_reset = "its reset has failed"
-        self._samples = self._runner.simulate({**kept, **beginning.values, **self._switches}, start=start)
+        self._samples = self._runner.simulate({**begin_values, **beginning.values, **self._switches}, start=start)
         self._take_first_sample()
         self._begun, self._step = self._runner.context.get_time(), 0
         self._last = self._runner.measured(0.0)[self._place]
         self._score = float(first_score(self._reward, self._last))
         self._needs_reset = ""
-        return self._observation(), {"values": dict(beginning.values), "quality": self._score}
+        return self._observation(), {"values": dict(beginning.values), **self._quality()}
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Set the action, and simulate until the end of the step.
@@ -121,7 +121,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         Returns:
             The observation; the reward; whether the episode has terminated (the threshold is exceeded, a constraint
             broken, a system ends the simulation, or it fails); whether it is truncated, at the horizon; and
-            {"quality": the score so far, "message": why it ended if a system says so, "failure": why it failed}.
+            {"quality": the quality of all samples so far, "message": why a system has ended the simulation, "failure":
+            why it has failed}.
 
         Raises:
             ActionError: The action has another shape, is not finite, or lies beyond the limits; nothing happened.
@@ -149,8 +150,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         truncated = not terminated and self._step == self.episodes.steps
         if terminated or truncated:
             self._needs_reset = f"the episode has {'terminated' if terminated else 'been truncated'}"
-        reward = self._sign * (self._score - score)
-        return self._observation(), reward, terminated, truncated, {"quality": self._score, **info}
+        reward = step_reward(self._reward, score, self._score, self._last)
+        return self._observation(), reward, terminated, truncated, {**self._quality(), **info}
 
     def state(self) -> Snapshot:
         """Return the state of the episode, from which `restore` goes on, also in another process.
@@ -175,7 +176,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             state: What `state` has returned, here or in another environment of the same problem.
 
         Returns:
-            The observation, and {"quality": the score so far}.
+            The observation, and {"quality": the quality of all samples so far}.
 
         Raises:
             SnapshotError: It is no state of an episode, or one of another scenario.
@@ -194,7 +195,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             setattr(self, f"_{name}", note[name])
         self.np_random.bit_generator.state = note["random"]
         self._needs_reset = ""
-        return self._observation(), {"quality": self._score}
+        return self._observation(), self._quality()
 
     # -- how it is done
 
@@ -221,6 +222,9 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._last, self._time = sample, time
         return self._can_terminate and bool(self.episodes.terminates(samples))
 
+    def _quality(self) -> dict[str, Any]:
+        return {"quality": self._score} if isinstance(self._reward, Quality) else {}
+
     def _observation(self) -> Array:
         self._observed = self._read()
         return self._observed
@@ -229,8 +233,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._needs_reset = "the simulation has failed"
         if self.episodes.failure_reward is None:
             raise FailedEpisodeError(
-                f"the simulation fails in step {self._step}, after the action {np.asarray(action).tolist()}: {failure}; "
-                "or say what that is worth, failure_reward=number, and the episode terminates"
+                f"the simulation fails in step {self._step}, after the action {np.asarray(action).tolist()}: {failure}"
+                "; or say what that is worth, failure_reward=number, and the episode terminates"
             ) from failure
-        info = {"quality": self._score, "failure": str(failure)}
+        info = {**self._quality(), "failure": str(failure)}
         return self._observed, self.episodes.failure_reward, True, False, info

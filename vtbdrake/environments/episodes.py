@@ -13,7 +13,7 @@ from vtbdrake.common.argument_checks import all_of, as_number
 from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.environments.rewards import Reward, violates
 from vtbdrake.environments.spaces import Action
-from vtbdrake.optimization import Parameter, Problem
+from vtbdrake.optimization import Problem
 from vtbdrake.optimization.parameter import Dimension
 from vtbdrake.rollout import Constraint, Quality, RolloutTask
 from vtbdrake.rollout.testbeds import FIELD, split
@@ -76,7 +76,7 @@ class Episodes:
 
     @property
     def measures(self) -> tuple[Quality | Reward | Constraint, ...]:
-        """Return what is sampled, in the order of `RolloutRunner.measured`."""
+        """Return the functions that are sampled, in the order of `RolloutRunner.measured`."""
         measures: Any = self.task.measures if self.task.quality is None else (self.task.quality, *self.task.measures)
         return tuple(measures)
 
@@ -135,15 +135,17 @@ class Episodes:
         values: dict[str, Any] = {address: seed for address in seed_addresses(variables)}
         values |= self.conditions[self._condition(options.get("condition", number))]
         values |= {parameter.address: parameter.from_unit(random.random()) for parameter in self.parameters}
-        given = options.get("values", {})
-        if not isinstance(given, Mapping):
-            raise ValueError(f"the option 'values' of reset is {{address: value, ...}}, not {given!r}")
+        set_values = options.get("values", {})
+        if not isinstance(set_values, Mapping):
+            raise ValueError(f"the option 'values' of reset is {{address: value, ...}}, not {set_values!r}")
         start = options.get("start")
         if start is not None and not isinstance(start, Snapshot):
-            raise ValueError(f"the option 'start' of reset is a Snapshot, such as testbed.snapshot(context), not {start!r}")
+            raise ValueError(
+                f"the option 'start' of reset is a Snapshot, such as testbed.snapshot(context), not {start!r}"
+            )
         if start is not None:
             values = {}  # The snapshot has them all.
-        for address, value in given.items():
+        for address, value in set_values.items():
             values[address] = variables[address].check(value)
         return Beginning(values, start)
 
@@ -170,7 +172,17 @@ def episodes_of(
     parameters: Sequence[Dimension],
     failure_reward: float | None,
 ) -> Episodes:
-    """Return the episodes of a problem, or of a scenario; see `gymnasium_env` for the arguments.
+    """Return the episodes of a problem, or of a scenario; see `gymnasium_env`.
+
+    Args:
+        problem: The problem or the scenario.
+        action: Names of the variables that the agent sets.
+        observation: Names of the variables and ports that it observes.
+        reward: The quality whose increase is the reward, or the reward; None: the problem's quality.
+        period: The time of a step, in s; None: the problem's sample period.
+        horizon: The duration of an episode of a scenario, in s.
+        parameters: The parameters that each reset of a scenario draws.
+        failure_reward: The reward of a step whose simulation fails; None: that is an error.
 
     Raises:
         ValueError: An argument is missing, of another type, or does not fit the others.
@@ -195,7 +207,9 @@ def episodes_of(
     else:
         raise ValueError(f"an environment is of a Problem or of a Scenario, not of {problem!r}")
     if not isinstance(reward, Quality | Reward):
-        raise ValueError(f"reward is a Quality, whose increase it is, or a Reward(f, of=[address, ...]), not {reward!r}")
+        raise ValueError(
+            f"reward is a Quality, whose increase it is, or a Reward(f, of=[address, ...]), not {reward!r}"
+        )
     every, steps = _steps(task, period)
     return Episodes(
         task=_sampling(task, reward, constraints),
@@ -238,9 +252,7 @@ def _sampling(task: RolloutTask, reward: Quality | Reward, constraints: tuple[Co
     return replace(task, quality=quality, measures=measures, motion=None, pruning=None)
 
 
-def _without_fields(
-    parameters: Sequence[Dimension], conditions: Sequence[Mapping[str, Any]]
-) -> tuple[Dimension, ...]:
+def _without_fields(parameters: Sequence[Dimension], conditions: Sequence[Mapping[str, Any]]) -> tuple[Dimension, ...]:
     checked: tuple[Dimension, ...] = all_of(
         Dimension, parameters, name="parameters", form="[Parameter(address, lower, upper), ...]"
     )

@@ -36,7 +36,7 @@ def gymnasium_env(
     parameters: Sequence[Dimension] = (),
     failure_reward: float | None = None,
 ) -> TestbedEnv:
-    """Return a testbed as an environment of Gymnasium (extra ``gymnasium``), to train a policy by reinforcement learning.
+    """Return a testbed as an environment of Gymnasium (extra ``gymnasium``), for reinforcement learning.
 
     Each reset draws one of the problem's conditions, each parameter within its range, and the seed of all sensors. The
     sum of the rewards of an episode is what the quality of the same rollout has gained since its first sample (of a

@@ -22,7 +22,7 @@ from vtbdrake.rollout.worker_processes import TIME_LIMIT
 
 
 class ProcessVectorEnv(TestbedVectorEnv):
-    """Environments on worker processes, each of which has a testbed and a share of them.
+    """Environments on worker processes. Each process builds a testbed, and steps its share of the environments.
 
     Args:
         episodes: What an episode is.
@@ -47,7 +47,7 @@ class ProcessVectorEnv(TestbedVectorEnv):
             child.wait_until_ready(None)
             self._connections.append(FrameConnection(child.connection))
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: Any) -> Step:  # type: ignore[override]  # Gymnasium has one type for numbers and flags.
         """Make a step in every environment, or reset it if its episode had ended.
 
         Args:
@@ -65,15 +65,13 @@ class ProcessVectorEnv(TestbedVectorEnv):
         checked = self._checked(actions)
         return self._merged(self._call([("step", checked[share]) for share in self._shares]))
 
-    def _reset(
-        self, seeds: Sequence[int | None], options: Mapping[str, Any] | None
-    ) -> tuple[Array, dict[str, Any]]:
+    def _reset(self, seeds: Sequence[int | None], options: Mapping[str, Any] | None) -> tuple[Array, dict[str, Any]]:
         calls = [("reset", (seeds[share], None if options is None else dict(options))) for share in self._shares]
         observations, *_, infos = self._merged(self._call(calls))
         return observations, infos
 
     def _merged(self, steps: Sequence[Any]) -> Step:
-        observations, rewards, terminated, truncated = (np.concatenate(parts) for parts in list(zip(*steps))[:4])
+        observations, rewards, terminated, truncated = (np.concatenate([step[k] for step in steps]) for k in range(4))
         infos: dict[str, Any] = {}
         for number, info in enumerate(info for step in steps for info in step[4]):
             infos = self._add_info(infos, info, number)
@@ -94,7 +92,7 @@ class ProcessVectorEnv(TestbedVectorEnv):
                 f"a worker process of environments was lost (exit codes {codes}, {error}): make new environments"
             ) from error
         for share, reply in zip(self._shares, replies, strict=True):
-            if isinstance(reply, _Raised):
+            if isinstance(reply, _EnvError):
                 reply.error.add_note(f"in environment {share.start + reply.number}")
                 raise reply.error
         return replies
@@ -109,7 +107,7 @@ class ProcessVectorEnv(TestbedVectorEnv):
 # -- in the worker process
 
 
-class _Raised:
+class _EnvError:
     """The error of one of a worker's environments."""
 
     def __init__(self, number: int, error: BaseException) -> None:
@@ -151,19 +149,21 @@ class _Served:
         try:
             rows = list(self._resets(*argument) if name == "reset" else self._steps(argument))
         except FAILURES as error:
-            return _Raised(self._number, error)
+            return _EnvError(self._number, error)
         observations, rewards, terminated, truncated, infos = zip(*rows, strict=True)
         self._done = np.array(terminated) | np.array(truncated)
         return np.array(observations), np.array(rewards), np.array(terminated), np.array(truncated), infos
 
     def _resets(self, seeds: Sequence[int | None], options: Mapping[str, Any] | None) -> Any:
-        for self._number, (env, seed) in enumerate(zip(self._envs, seeds, strict=True)):
+        for number, (env, seed) in enumerate(zip(self._envs, seeds, strict=True)):
+            self._number = number
             observation, info = env.reset(seed=seed, options=options)
             yield observation, 0.0, False, False, info
 
     def _steps(self, actions: Array) -> Any:
-        for self._number, (env, action) in enumerate(zip(self._envs, actions, strict=True)):
-            if self._done[self._number]:
+        for number, (env, action) in enumerate(zip(self._envs, actions, strict=True)):
+            self._number = number
+            if self._done[number]:
                 observation, info = env.reset()
                 yield observation, 0.0, False, False, info
             else:

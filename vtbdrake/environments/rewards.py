@@ -9,7 +9,7 @@ import numpy as np
 
 from vtbdrake.rollout.quality import Constraint, Measure, Quality
 
-# One sample, or those of many episodes: a float, or an array of shape (n,).
+# A sample: a float, or an array of shape (n,) for n episodes.
 Samples = Any
 
 
@@ -39,7 +39,7 @@ class Reward(Measure):
 
 
 def first_score(measure: Quality | Reward, sample: Samples) -> Samples:
-    """Return the score of an episode at its start: the reading of a quality over one sample, 0 for a `Reward`.
+    """Return the reading of a quality over its first sample; 0 for a `Reward`.
 
     Args:
         measure: The quality or the reward.
@@ -48,33 +48,45 @@ def first_score(measure: Quality | Reward, sample: Samples) -> Samples:
     return sample if isinstance(measure, Quality) and measure.reading != "integral" else 0.0 * sample
 
 
-def next_score(measure: Quality | Reward, score: Samples, last: Samples, sample: Samples, seconds: float) -> Samples:
-    """Return the score of an episode after one more sample: the reading of the quality over all samples so far.
+def next_score(measure: Quality | Reward, score: Samples, last: Samples, sample: Samples, seconds: Samples) -> Samples:
+    """Return the reading of a quality over one more sample; a `Reward` has none.
 
     Args:
-        measure: The quality; the score of a `Reward` is the sum of its samples.
-        score: The score before, a float or shape (n,).
+        measure: The quality or the reward.
+        score: The reading over all samples before, a float or shape (n,).
         last: The sample before, likewise.
         sample: The sample, likewise.
-        seconds: The time between the two samples.
+        seconds: The time between the two samples, likewise.
     """
-    if isinstance(measure, Reward):
-        return score + sample
-    match measure.reading:
+    match measure.reading if isinstance(measure, Quality) else "none":
         case "integral":
             return score + 0.5 * seconds * (last + sample)
         case "end":
             return sample
+        case "none":
+            return score
         case reading:
-            is_larger = (reading == "best") != measure.minimize
+            is_larger = (reading == "best") != (isinstance(measure, Quality) and measure.minimize)
             return (np.maximum if is_larger else np.minimum)(score, sample)
 
 
+def step_reward(measure: Quality | Reward, before: Samples, after: Samples, last: Samples) -> Samples:
+    """Return the reward of a step.
+
+    Args:
+        measure: The quality or the reward.
+        before: The reading of the quality before the step, a float or shape (n,).
+        after: The reading after it, likewise.
+        last: The sample at the end of the step, likewise, which is the reward if that is a `Reward`.
+    """
+    return measure.sign * (after - before) if isinstance(measure, Quality) else last
+
+
 def violates(constraint: Constraint, sample: Samples) -> Any:
-    """Return whether a sample, or which of several, breaks a constraint."""
+    """Return whether a sample breaks a constraint.
+
+    Args:
+        constraint: The constraint.
+        sample: The sample, a float or shape (n,).
+    """
     return (sample > constraint.at_most) | (sample < constraint.at_least)
-
-
-def sign_of(measure: Quality | Reward) -> float:
-    """Return 1, or -1 for a cost: the reward of a step is this times the increase of the score."""
-    return measure.sign if isinstance(measure, Quality) else 1.0

@@ -141,7 +141,7 @@ class Channels:
 
 
 def action_channels(testbed: VirtualTestbed, action: Action) -> Channels:
-    """Return what an agent acts on.
+    """Return the channels of an action.
 
     Args:
         testbed: The testbed.
@@ -164,12 +164,12 @@ def switch_values(testbed: VirtualTestbed, channels: Channels) -> dict[str, floa
         testbed: The testbed.
         channels: What the agent acts on.
     """
-    own = {signal.name for signal in testbed.interface.act if f"{T_ACT}{signal.name}.idle" in channels.addresses}
-    return {f"{T_ACT}{name}": float(Position.REAL.number) for name in own}
+    agents = {signal.name for signal in testbed.interface.act if f"{T_ACT}{signal.name}.idle" in channels.addresses}
+    return {f"{T_ACT}{name}": float(Position.REAL.number) for name in agents}
 
 
 def observation_channels(testbed: VirtualTestbed, observation: Sequence[str]) -> Channels:
-    """Return what an agent observes.
+    """Return the channels of an observation.
 
     Args:
         testbed: The testbed.

@@ -19,6 +19,7 @@ from vtbdrake.environments.spaces import action_channels, observation_channels
 from vtbdrake.testbed import VirtualTestbed
 
 Flags = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 Step = tuple[Array, Array, Flags, Flags, dict[str, Any]]
 
 
@@ -54,7 +55,7 @@ class TestbedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-    def reset(  # type: ignore[override]  # As in Gymnasium's own, each environment may have a seed.
+    def reset(  # As in Gymnasium's own, each environment may have a seed.
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Begin an episode in every environment.
@@ -75,9 +76,7 @@ class TestbedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
             raise ValueError(f"give one seed, or one for each of the {self.num_envs} environments, not {len(seeds)}")
         return self._reset(seeds, options)
 
-    def _reset(
-        self, seeds: Sequence[int | None], options: Mapping[str, Any] | None
-    ) -> tuple[Array, dict[str, Any]]:
+    def _reset(self, seeds: Sequence[int | None], options: Mapping[str, Any] | None) -> tuple[Array, dict[str, Any]]:
         raise NotImplementedError
 
     def _checked(self, actions: Any) -> Array:

@@ -371,7 +371,7 @@ class AddressedDiagram:
         raise AddressError(f"there is no variable and no port {address!r}{suggestion(address, self.addresses())}")
 
     def bound_reader(self, context: Context, address: str) -> Callable[[], Any]:
-        """Return a function that reads a variable or a port of one context, in less time than that of `reader`.
+        """Return a function that reads a variable or a port of one context, more quickly than a function of `reader`.
 
         Args:
             context: The root context, which is read at each call.

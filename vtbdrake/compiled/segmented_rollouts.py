@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.testbed.instants import sample_instants
 
 
-class Segments:
+class SegmentedRollouts:
     """A compiled rollout from t0 that stops at each k-th sample, as Drake's Simulator would at a boundary time.
 
     A segment begins with the updates of its first instant, which so see what was set there, and ends with the last
@@ -41,7 +42,7 @@ class Segments:
                 *instants[begin + 1 : end],
                 instants[end]._replace(updates=()),
             ]
-            for begin, end in zip(ends[:-1], ends[1:], strict=True)
+            for begin, end in pairwise(ends)
         ]
         self._program: Program = rollouts.program(max(self._parts, key=len))
         self._plans = np.array([self._program.plan(part) for part in self._parts])
@@ -93,7 +94,7 @@ class Segments:
         return [slice(k, k + self._program.most) for k in range(0, count, self._program.most)]
 
     def _noise(self, z: Array, segments: NDArray[np.intp]) -> Array | None:
-        """Return the random numbers of all rollouts in their segments, shape (n, count, noise); None: there are none."""
+        """Return the random numbers of all rollouts in their segments, shape (n, count, noise), if there are some."""
         if not self._walker.noise:
             return None
         noise = np.empty((len(z), self._program.count, self._walker.noise))
