@@ -33,6 +33,7 @@ ROBOTS = {
     "head": MODELS / "bare.urdf",
     "finger": MODELS / "finger.urdf",
     "fourbar": MODELS / "fourbar.sdf",
+    "torso": MODELS / "torso.urdf",
     "acrobot": EXAMPLES / "acrobot" / "Acrobot.urdf",
     "acrobot_no_collision": EXAMPLES / "acrobot" / "Acrobot_no_collision.urdf",
     "pendulum": EXAMPLES / "pendulum" / "Pendulum.urdf",
@@ -187,6 +188,24 @@ def test_a_robot_with_legs_stands_on_them(projects: Projects, monkeypatch: pytes
 def test_a_finger_moves_in_spite_of_its_damping(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
     tests = module_of_tests(projects, "finger", monkeypatch)
     tests["test_robot_moves_to_a_posture"](scenario_of(tests).build())
+
+
+@pytest.mark.one_python
+def test_a_weak_waist_bears_what_a_strong_arm_does(projects: Projects, monkeypatch: pytest.MonkeyPatch) -> None:
+    tests = module_of_tests(projects, "torso", monkeypatch)
+    tests["test_robot_moves_to_a_posture"](scenario_of(tests).build())
+
+
+@pytest.mark.one_python
+def test_long_names_have_channels_that_lcm_takes(tmp_path: Path) -> None:
+    names = [f"my_{'long_' * 12}{side}_arm" for side in ("left", "right")]
+    robot, channels = read_robot(SMALL_ARM), []
+    for name in names:
+        text = (write_project(tmp_path, name, robot) / name / "scenario.py").read_text()
+        channels.append({channel for channel in re.findall(r'"([A-Z_0-9]+)"', text) if "LONG" in channel})
+    assert len(channels[0]) == len(channels[1]) == 6
+    assert max(map(len, channels[0] | channels[1])) == 63  # with _EFFORT_MEASURED
+    assert not channels[0] & channels[1]
 
 
 @pytest.mark.one_python

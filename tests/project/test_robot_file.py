@@ -54,10 +54,32 @@ def test_a_joint_without_actuator_moves_freely() -> None:
 
 def test_all_joints_are_driven_where_the_file_has_no_actuators() -> None:
     robot = read_robot(MODELS / "bare.urdf")
-    assert robot.driven == ("pan", "tilt") and robot.adds_drives
+    assert robot.driven == robot.added_drives == ("pan", "tilt")
     for joint in robot.joints:
         assert joint.assumed == ("effort", "range", "speed")
         assert np.isfinite([joint.lower, joint.upper, joint.speed, joint.effort]).all() and joint.effort > 0.0
+
+
+@pytest.mark.parametrize(
+    "differential",
+    [
+        '<type>DifferentialTransmission</type><joint name="hinge"/><joint name="second"/><actuator name="a"/>',
+        '<flexJoint name="hinge"/><rollJoint name="second"/><passive_joint name="third"/>',
+    ],
+)
+def test_joints_of_a_differential_are_driven(tmp_path: Path, differential: str) -> None:
+    """Drake takes the <transmission> of the third joint alone."""
+    further = f'<transmission name="d" type="WristTransmission">{differential}</transmission>\n'
+    further += DRIVE.replace('"hinge"', '"third"')
+    for parent, child, name in (("arm", "hand", "second"), ("hand", "tip", "third")):
+        further += (
+            f'<link name="{child}">{INERTIA}</link><joint name="{name}" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{child}"/><axis xyz="1 0 0"/>{LIMIT}</joint>\n'
+        )
+    robot = read_robot(urdf(tmp_path, further=further))
+    assert (robot.driven, robot.added_drives) == (("third", "hinge", "second"), ("hinge", "second"))
+    assert [joint.effort for joint in robot.joints] == [5.0] * 3
+    assert any("robot.urdf:5: Drake leaves out the <transmission> of hinge, second" in note for note in robot.notes)
 
 
 DRIVE = '<transmission name="t"><type>SimpleTransmission</type><joint name="hinge"/><actuator name="a"/></transmission>'

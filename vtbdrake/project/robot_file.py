@@ -130,7 +130,7 @@ class ProjectRobot:
         packages: The packages to which the model refers, by name: their folders in ``models``.
         welded: The bodies that are free in the file, and where they are welded to the world.
         held: The joints of a base that would fall, which are held where they are.
-        adds_drives: Whether the file has no actuators, so that they are added.
+        added_drives: The joints without an actuator that Drake reads, which get one.
         servos: The names of actuators of the file with position or velocity controllers, which are left out.
         without_drive: The names of actuators of the file that are left out, with their joints' drives.
         sets_efforts: Whether the effort limits of some actuators differ from the file's.
@@ -153,7 +153,7 @@ class ProjectRobot:
     packages: dict[str, Path] = field(default_factory=dict)
     welded: dict[str, RigidTransform] = field(default_factory=dict)
     held: tuple[str, ...] = ()
-    adds_drives: bool = False
+    added_drives: tuple[str, ...] = ()
     servos: tuple[str, ...] = ()
     without_drive: tuple[str, ...] = ()
     sets_efforts: bool = False
@@ -246,7 +246,7 @@ class _ModelReader:
         robot.welded = self._free_bodies(plant)
         robot.couplings = self._couplings(joints)
         self._choose_drives(plant, joints, robot)
-        plant, scene_graph, diagram = self._as_in_project(robot, [joint.name() for joint in joints])
+        plant, scene_graph, diagram = self._as_in_project(robot)
         self._read_limits(plant, joints, robot)
         self._find_legs(robot)
         if robot.standing is None:
@@ -438,6 +438,7 @@ class _ModelReader:
         Such a base moves in a plane, as simulated walkers' do; it is held, as free bases without a stance are welded.
         """
         drives = {plant.get_joint_actuator(index).joint().name() for index in plant.GetJointActuatorIndices()}
+        drives.update(self._transmitted(joints))
         context = plant.CreateDefaultContext()
         weights = plant.CalcGravityGeneralizedForces(context)
         by_parent: dict[int, list[Joint]] = {}
@@ -462,6 +463,17 @@ class _ModelReader:
         names = {joint.name() for joint in joints}
         return tuple(c for c in _mimics(self._copy.xml) if c.joint in names and c.leader in names)
 
+    def _transmitted(self, joints: list[Joint]) -> list[str]:
+        """Return the joints that the transmissions of a URDF name, also those of types that Drake leaves out.
+
+        A differential has two joints, and some types have tags of their own, such as ``<flexJoint>``.
+        """
+        xml, moving = self._copy.xml, {joint.name() for joint in joints}
+        transmissions = xml.root.iter("transmission") if xml is not None and xml.root.tag == URDF else ()
+        tags = [part for transmission in transmissions for part in transmission.iter()]
+        names = [tag.get("name") for tag in tags if re.search("^(?!passive).*joint$", tag.tag, re.IGNORECASE)]
+        return [name for name in dict.fromkeys(names) if name in moving]
+
     def _choose_drives(self, plant: MultibodyPlant, joints: list[Joint], robot: ProjectRobot) -> None:
         followers = {coupling.joint for coupling in robot.couplings}
         drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
@@ -472,13 +484,21 @@ class _ModelReader:
                 f"{self._place(robot.servos[0])}: the actuators {_listed(robot.servos)} control positions or "
                 "velocities; the DPS commands torques or forces instead"
             )
-        if not drives:
+        driven_by_drake = {drive.joint().name() for drive in drives}
+        transmitted = [name for name in self._transmitted(joints) if name not in followers | driven_by_drake]
+        robot.added_drives = tuple(transmitted)
+        if transmitted:
+            self._notes.append(
+                f"{self._place(transmitted[0])}: Drake leaves out the <transmission> of {_listed(transmitted)}, which "
+                "has several joints or a type of its own: each of them gets a drive of its own"
+            )
+        if not drives and not transmitted:
             self._notes.append(
                 f"{self._shown} has no actuators (a <transmission> in URDF, an <effort> in SDF, a <motor> in MJCF): "
                 "every joint gets one (take those that move freely out of DRIVEN in robot.py)"
             )
-            robot.adds_drives = True
-        joints_with_drive = [drive.joint().name() for drive in drives] or [joint.name() for joint in joints]
+            robot.added_drives = tuple(joint.name() for joint in joints if joint.name() not in followers)
+        joints_with_drive = [drive.joint().name() for drive in drives] + [*robot.added_drives]
         robot.without_drive = tuple(drive.name() for drive in drives if drive.joint().name() in followers)
         driven = [name for name in joints_with_drive if name not in followers]
         if twins := sorted({name for name in driven if driven.count(name) > 1}):
@@ -497,14 +517,12 @@ class _ModelReader:
                 "controlled. Give it an actuator in the file if it has a drive"
             )
 
-    def _as_in_project(self, robot: ProjectRobot, joint_names: list[str]) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
+    def _as_in_project(self, robot: ProjectRobot) -> tuple[MultibodyPlant, SceneGraph, Diagram]:
         """Return the plant of the project's world: as the file has it, with the changes that ``robot`` lists."""
         plant, scene_graph, builder = self._load()
         self._change(plant, robot)
-        followers = {coupling.joint for coupling in robot.couplings}
-        for name in joint_names if robot.adds_drives else ():
-            if name not in followers:
-                plant.AddJointActuator(name, plant.GetJointByName(name))
+        for name in robot.added_drives:
+            plant.AddJointActuator(name, plant.GetJointByName(name))
         drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         robot.driven = tuple(drive.joint().name() for drive in drives)
         robot.has_constraints = plant.num_constraints() > 0
@@ -546,7 +564,7 @@ class _ModelReader:
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         self._parse(plant)
         self._change(plant, robot)
-        for name in robot.driven if robot.adds_drives else ():
+        for name in robot.added_drives:
             plant.AddJointActuator(name, plant.GetJointByName(name))
         self._finalize(plant)
         index_of = {joint.name: k for k, joint in enumerate(robot.joints)}
@@ -699,13 +717,13 @@ class _ModelReader:
             if not math.isfinite(limit) and name in stated:
                 # Drake takes over a URDF's limit for the joint of a <transmission> only, and none of a joint in MJCF.
                 limit = stated[name]
-                robot.sets_efforts |= not robot.adds_drives
+                robot.sets_efforts |= name not in robot.added_drives
             if not math.isfinite(limit):
                 k = names.index(name)
                 acceleration = _speed(joints[k]) / _TIME_TO_SPEED
                 limit = _rounded_up(_WEIGHTS * weights[:, k].max() + acceleration * M[k, k])
                 assumed[name].append("effort")
-                robot.sets_efforts |= not robot.adds_drives
+                robot.sets_efforts |= name not in robot.added_drives
             efforts[name] = limit
         return efforts
 

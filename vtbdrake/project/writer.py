@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,8 @@ _STATION = {
     **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("dps", "scenario", "optimize")},
 }
 _LONGEST_LINE = 120
+# What a channel's name begins with: LCM's longest name, without that of the longest signal, _EFFORT_MEASURED.
+_LONGEST_CHANNEL = 63 - 16
 
 
 class ProjectError(ValueError):
@@ -107,7 +110,7 @@ def write_project(folder: Path, name: str, source: ProjectRobot | StationFile) -
         templates, values, kind = _STATION, _station_values(source), "Station"
     values |= {
         "name": name,
-        "NAME": name.upper(),
+        "CHANNEL": _channel(name),
         "Class": "".join(part[:1].upper() + part[1:] for part in name.split("_")) + kind,
         "notes": _section("About the model file", source.notes),
     }
@@ -127,6 +130,15 @@ def write_project(folder: Path, name: str, source: ProjectRobot | StationFile) -
                 file.write_bytes(original)
         project.rename(folder / name)
     return folder / name
+
+
+def _channel(name: str) -> str:
+    """Return what the names of a project's LCM channels begin with; they have 63 bytes at most.
+
+    A long name is cut, and a checksum keeps it from being another long one's.
+    """
+    begin = name.upper()
+    return begin if len(begin) <= _LONGEST_CHANNEL else f"{begin[: _LONGEST_CHANNEL - 9]}_{crc32(name.encode()):08X}"
 
 
 def _section(title: str, items: Sequence[str]) -> str:
@@ -364,12 +376,14 @@ def _add_robot(robot: ProjectRobot) -> list[str]:
             f"for name in [{', '.join(json.dumps(name) for name in robot.servos)}]:",
             "    replace_servo(plant, name)  # The DPS commands torques or forces, not positions or velocities.",
         ]
-    if robot.adds_drives:
+    if robot.added_drives:
+        is_all = robot.added_drives == robot.driven
+        names = "DRIVEN" if is_all else _list("for name in :    ", [json.dumps(name) for name in robot.added_drives])
         lines += [
-            "for name in DRIVEN:",
+            *f"for name in {names}:".splitlines(),
             "    plant.AddJointActuator(name, plant.GetJointByName(name), JOINTS[name].effort)",
         ]
-    elif robot.sets_efforts:
+    if robot.sets_efforts:
         lines += [
             "for index in plant.GetJointActuatorIndices():",
             "    drive = plant.get_joint_actuator(index)",
