@@ -204,7 +204,7 @@ def _make_impl(
         **control_law.state,
     }
     if led_by_hand:
-        state |= leading.STATE | {"tip_pose": (leading.pose_matrix(model), "1, m")}
+        state |= leading.STATE | {"tip_pose": (leading.pose_matrix(model), leading.TIP_POSE_UNIT)}
     x = _symbols(state)
     hand = casadi.SX.sym("hand", HAND_SIZE) if led_by_hand else None
     r = reference(command, q, x, p, period=period, hand=hand, model=model)

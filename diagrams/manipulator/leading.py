@@ -46,10 +46,13 @@ GAINS: dict[str, tuple[object, str, tuple[float, float]]] = {
 }
 """Value, unit and bounds of the parameters; with less acceleration, a tip that is let go would go on for long."""
 
+TIP_POSE_UNIT = ", ".join(["1, 1, 1, m"] * 3)
+"""Units of the rows of a pose [R | p]."""
+
 STATE: dict[str, tuple[object, str]] = {
     "lead_twist": ((0.0,) * 6, "rad/s, m/s"),
     "lead_velocity": ((0.0,) * JOINTS, "rad/s"),
-    "tip_pose": ((0.0,) * 12, "1, m"),
+    "tip_pose": ((0.0,) * 12, TIP_POSE_UNIT),
 }
 """Initial value and unit of what is remembered: V, v_r, and the rows of [R_r | p_r]."""
 

@@ -145,7 +145,15 @@ class ManipulatorScenario(Scenario):
         if not self.led_by_hand:
             return [motion]
         reach = np.array([1.0, 1.0, 1.0, 1.0, 1.0, *(3 * [HAND_REACH])])
-        hand = Signal("hand", size=HAND_SIZE, lower=-reach, upper=reach, default=leading.REST, max_age=HAND_MAX_AGE)
+        hand = Signal(
+            "hand",
+            size=HAND_SIZE,
+            unit="1, 1, 1, 1, 1, m, m, m",
+            lower=-reach,
+            upper=reach,
+            default=leading.REST,
+            max_age=HAND_MAX_AGE,
+        )
         return [motion, hand]
 
     def hand_command(self) -> HandCommand | None:

@@ -53,7 +53,7 @@ class PoseSensor(SampledSensor):
             "target_pose",
             default=self._relative(q0),
             period=period,
-            unit="1, m",
+            unit="1, 1, 1, 1, m, m, m",
             noise={"orientation_noise": (4, "1"), "position_noise": (3, "m")},
             errors=errors,
         )
@@ -104,7 +104,7 @@ class PoseReader(AddressedSystem):
         self._pose = self.DeclareVectorInputPort("target_pose", 7)
         self._history = self.DeclareVectorInputPort("history", HISTORY * POSE)
         self._last = self.declare_discrete_state(
-            last_pose=Quantity(np.zeros(7), "1, m"),
+            last_pose=Quantity(np.zeros(7), "1, 1, 1, 1, m, m, m"),
             last_time=Quantity(0.0, "s"),
             waiting=Quantity(0.0, bounds=(0.0, 1.0)),
         )

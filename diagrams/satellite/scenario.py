@@ -152,7 +152,7 @@ class SatelliteScenario(Scenario):
                     max_age=age,
                 ),
                 Signal("imu", size=6, unit="rad/s, m/s^2", lower=-10.0, upper=10.0, max_age=age),
-                Signal("target_pose", size=7, unit="1, m", lower=-100.0, upper=100.0),
+                Signal("target_pose", size=7, unit="1, 1, 1, 1, m, m, m", lower=-100.0, upper=100.0),
                 *self._abstract_signals(),
             ],
             act=act,

@@ -114,7 +114,7 @@ def test_rotor_inertia_is_that_of_drakes_actuator(world):
         (BallRpyJoint, [], "rad", "rad/s"),
         (PlanarJoint, [[0, 0, 0]], "m, m, rad", "m/s, m/s, rad/s"),
         (RpyFloatingJoint, [], "rad, m", "rad/s, m/s"),
-        (QuaternionFloatingJoint, [], "1, m", "rad/s, m/s"),  # a quaternion has no unit
+        (QuaternionFloatingJoint, [], "1, 1, 1, 1, m, m, m", "rad/s, m/s"),  # a quaternion has no unit
     ],
 )
 def test_positions_and_velocities_have_the_units_of_their_joint(joint, axis, position, velocity):

@@ -29,6 +29,7 @@ from vtbdrake.state import (
     snapshot,
 )
 from vtbdrake.state.declarations import CONTINUOUS, PARAMETER, Element
+from vtbdrake.state.variables import entry_units
 
 
 @pytest.fixture
@@ -288,6 +289,21 @@ def test_an_entry_has_the_unit_and_the_bounds_of_its_place(unit, units):
     with pytest.raises(VariableError) as refused:
         variables.write(context, {"arm.goal": [0.5, 0.7]})
     assert str(refused.value) == f"arm.goal[1] must lie in [0, 0.6] {units[1]}, but the value given is 0.7"
+
+
+@pytest.mark.parametrize(
+    ("unit", "shape", "units"),
+    [
+        ("1, 1, 1, 1, m, m, m", (7,), ["1"] * 4 + ["m"] * 3),  # a quaternion and a position
+        ("rad/s, m/s", (6,), ["rad/s"] * 3 + ["m/s"] * 3),
+        ("1, 1, 1, m", (3, 4), ["1", "1", "1", "m"] * 3),  # [R | p]
+        ("1, m", (7,), ["1, m"] * 7),
+        ("m", (), ["m"]),
+        ("m", (0,), []),
+    ],
+)
+def test_entries_have_the_units_of_their_groups(unit, shape, units):
+    assert list(entry_units(unit, shape)) == units
 
 
 def test_a_declaration_beyond_the_group_is_refused():

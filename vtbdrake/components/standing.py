@@ -156,7 +156,7 @@ class StandingController(AddressedSystem):
         self._memory = self.declare_discrete_state(
             shift=Quantity(0.0, "m"),
             solved=Quantity(float(solved), "1", (0.0, 1.0)),
-            base_pose=Quantity(self.model.rest.pose, "1, m"),
+            base_pose=Quantity(self.model.rest.pose, "1, 1, 1, 1, m, m, m"),
             base_twist=Quantity(np.zeros(6), "rad/s, m/s"),
             imu=Quantity(np.zeros(6), "rad/s, m/s^2"),
             joint_position=Quantity(self.model.rest.position, "rad, m"),

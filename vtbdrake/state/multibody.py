@@ -43,7 +43,7 @@ _JOINT_UNITS = {
     "prismatic": ("m", "m/s", "N s/m"),
     "planar": ("m, m, rad", "m/s, m/s, rad/s", "N s/m, N s/m, N m s/rad"),
     # A unit quaternion, which has no unit, and a position.
-    "quaternion_floating": ("1, m", "rad/s, m/s", "N m s/rad, N s/m"),
+    "quaternion_floating": ("1, 1, 1, 1, m, m, m", "rad/s, m/s", "N m s/rad, N s/m"),
 }
 _MIXED_UNITS = ("rad, m", "rad/s, m/s", "N m s/rad, N s/m")
 # What is derived from the pose of a body, with its units: the entries of [x, y, z, roll, pitch, yaw].

@@ -311,7 +311,7 @@ def _camera_pose(path: str, camera: RgbdSensor) -> Iterator[Variable]:
         camera.SetX_PB(camera.GetMyMutableContextFromRoot(root), pose_from_array(value))
 
     yield Variable(f"{path}.pose", A, (6,), POSE_UNIT, read, write, carried_by=matrix, entry_names=POSE_NAMES)
-    yield Variable(matrix, A, (3, 4), "1, m", read_matrix, write_matrix, carried_by=matrix)
+    yield Variable(matrix, A, (3, 4), "1, 1, 1, m", read_matrix, write_matrix, carried_by=matrix)
 
 
 def is_python(system: System) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -52,7 +53,7 @@ class Variable:
         address: Dotted path, such as ``sim.sys.payload.mass``.
         kind: ``"x"`` (dynamic part: may change while time runs) or ``"a"`` (static part).
         shape: The shape of its value; ``()`` is a scalar.
-        unit: SI unit; ``"1"`` if it has none.
+        unit: SI unit; ``"1"`` if it has none. Entries of several kinds have a list, see `entry_units`.
         read: Reads the value from a context of the Diagram.
         write: Writes a checked value into a context; None marks a derived quantity, which is read only.
         bounds: Closed interval, for all entries or of the variable's shape.
@@ -147,6 +148,25 @@ class Variable:
         array = self.check(value)
         assert self.write is not None
         self.write(context, array)
+
+
+def entry_units(unit: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the unit of each entry of an array, row by row.
+
+    A unit such as ``"rad/s, m/s"`` lists those of equal groups of the entries of a row: one of each entry at most, as
+    in ``"1, 1, 1, 1, m, m, m"`` of a pose whose orientation is a quaternion. If the groups are not equal, the list is
+    the unit of every entry.
+
+    Args:
+        unit: The unit of the array.
+        shape: The shape of the array; ``()`` of a number.
+    """
+    *rows, width = shape or (1,)
+    units = [unit] if "(" in unit else unit.split(", ")
+    if not width or width % len(units):
+        units = [unit]
+    row = [name for name in units for _ in range(width // len(units))]
+    return tuple(row * math.prod(rows))
 
 
 def with_unit(amount: str, unit: str) -> str:
@@ -367,13 +387,11 @@ def _entry(variable: Variable, index: int) -> Variable:
     def bound(which: int) -> float:
         return float(np.broadcast_to(np.asarray(variable.bounds[which], dtype=float), variable.shape).flat[index])
 
-    units = variable.unit.split(", ")  # one for each entry, such as "rad, m"; else one for all
-    separate = len(units) == size and "(" not in variable.unit
     return replace(
         variable,
         address=f"{variable.address}[{index}]",
         shape=(),
-        unit=units[index] if separate else variable.unit,
+        unit=entry_units(variable.unit, variable.shape)[index],
         read=read,
         write=None if variable.derived else write,
         bounds=(bound(0), bound(1)),

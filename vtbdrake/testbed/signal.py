@@ -29,7 +29,8 @@ class Signal:
         size: Number of entries of a vector signal; None for an abstract one.
         model_value: A value of an abstract signal's type (an image, a pose, any object); None for a vector signal. All
             images have the size of the model image; a model image of size zero allows any.
-        unit: SI unit of all entries; ``"1"`` for numbers without a unit.
+        unit: SI unit of all entries; ``"1"`` for numbers without a unit. Entries of several kinds have a list of the
+            units of equal groups, such as ``"rad/s, m/s"``, or of each, such as ``"1, 1, 1, 1, m, m, m"``.
         lower, upper: Limits of the entries, scalars or arrays of shape (size,).
         entry_names: Short names of the entries of a vector signal, such as joints' names; empty if they have none.
         values: The values that an entry can have, if it is one of an enumeration: numbers, or an ``IntEnum``, whose

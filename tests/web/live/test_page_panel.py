@@ -24,6 +24,7 @@ READY = "body[data-session=open][data-frame]"
 MOTION = "u.motion"
 JOINT = "sim.sys.arm.joint_2.position"
 TOOL = "dps.env.tool_center"
+STIFFNESS = "dps.impl.stiffness"
 TORQUE = "sim.act.drives.torque"
 
 # What can be used: controls that are shown and not in a dialog.
@@ -106,6 +107,9 @@ def test_vector_has_names_and_units_and_refuses_what_is_out_of_bounds(page: Page
     watch(page, TORQUE)
     labels = page.locator(f"{section(TORQUE)} .vtb-label").all_inner_texts()
     assert labels == [f"joint_{joint} N m" for joint in range(1, 8)]
+    watch(page, STIFFNESS)
+    units = page.locator(f"{section(STIFFNESS)} .vtb-label small").all_inner_texts()
+    assert units == ["N m/rad"] * 3 + ["N/m"] * 3
     watch(page, TOOL)
     assert "±1 m" in page.inner_text(f"{section(TOOL)} header")
     before = value(running, TOOL)

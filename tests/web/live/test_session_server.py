@@ -17,6 +17,8 @@ from urllib.parse import urlsplit
 import msgpack
 import pytest
 import uvicorn
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
@@ -26,7 +28,9 @@ from websockets.uri import parse_uri
 
 from tests.web.live.test_drive import LimitedPendulumScenario, problem
 from tests.web.serving.entrance import entered
+from vtbdrake.state.multibody import multibody_variables
 from vtbdrake.web import View, view
+from vtbdrake.web.live.watching import describe
 from vtbdrake.web.serving.host import Host, PortError
 from vtbdrake.web.serving.relay import Newest, relay
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
@@ -132,11 +136,21 @@ def test_port_in_use_is_an_error(running: View) -> None:
         view(CartPoleScenario(), port=urlsplit(running.url).port or 0)
 
 
+def test_entries_of_a_pose_have_units_of_their_own() -> None:
+    plant = MultibodyPlant(0.01)
+    plant.AddRigidBody("stone", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.Finalize()
+    position = next(v for v in multibody_variables(plant) if v.shape == (7,))
+    described = describe(position)
+    assert (described["unit"], described["units"]) == ("1, m", ["1"] * 4 + ["m"] * 3)
+    assert described["entries"] == ["qw", "qx", "qy", "qz", "x", "y", "z"]
+
+
 def test_page_watches_and_steers(running: View) -> None:
     with page(running) as socket:
         hello = receive(socket, "hello")
         assert hello["variables"][ANGLE] == {
-            "kind": "x", "shape": [], "unit": "rad", "bounds": [[None], [None]], "settable": True,
+            "kind": "x", "shape": [], "unit": "rad", "units": [], "bounds": [[None], [None]], "settable": True,
             "entries": [], "choices": [],
         }  # fmt: skip
         assert hello["variables"]["u.plan"]["entries"][:2] == ["start", "force 1"]

@@ -60,7 +60,7 @@ class BasePoseSensor(StateSensor):
             range(start, start + 7),
             default=plant.GetDefaultPositions()[start : start + 7],
             period=period,
-            unit="1, m",
+            unit="1, 1, 1, 1, m, m, m",
             noise={"orientation_noise": (4, "1"), "position_noise": (3, "m")},
             stream=stream,
             errors=errors,

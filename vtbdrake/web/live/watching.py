@@ -9,7 +9,7 @@ import numpy as np
 
 from vtbdrake.common.failures import FAILURES
 from vtbdrake.common.json_data import plain
-from vtbdrake.state.variables import X
+from vtbdrake.state.variables import X, entry_units
 from vtbdrake.testbed.switch import COMMAND
 
 # What a page opens with, at most; of a model file, whose joints are commands, it shows all.
@@ -96,11 +96,16 @@ class Watching:
 
 
 def describe(variable: Variable) -> dict[str, Any]:
-    """Return the description of a variable for a page, for JSON."""
+    """Return the description of a variable for a page, for JSON.
+
+    ``unit`` has the units of its entries once each; ``units`` has one for each entry, where they differ.
+    """
+    units = entry_units(variable.unit, variable.shape)
     return {
         "kind": variable.kind,
         "shape": list(variable.shape),
-        "unit": variable.unit,
+        "unit": ", ".join(dict.fromkeys(units)),
+        "units": list(units) if len(set(units)) > 1 else [],
         "bounds": [page_value(np.broadcast_to(bound, variable.shape)) for bound in variable.bounds],
         "settable": not variable.derived,
         "entries": list(variable.entry_names),

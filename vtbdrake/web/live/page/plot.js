@@ -26,12 +26,13 @@ export class Plot {
 
   /**
    * @param {string} name of what is plotted
-   * @param {string} unit empty for numbers without one
+   * @param {string[]} units of the series, empty for numbers without one
    * @param {string[]} labels of the series
    */
-  constructor(name, unit, labels) {
+  constructor(name, units, labels) {
     this.name = name;
-    this.unit = unit;
+    this.units = units;
+    this.unit = [...new Set(units)].filter(Boolean).join(", ");
     this.labels = labels;
     /** @type {(number | null)[][]} */
     this.data = [[], ...labels.map(() => [])];
@@ -161,9 +162,9 @@ export class Plot {
 
   /** @returns {string} the values as a table with a head */
   table() {
-    const unit = this.unit ? ` [${this.unit}]` : "";
+    const unit = (/** @type {number} */ index) => (this.units[index] ? ` [${this.units[index]}]` : "");
     const quoted = (/** @type {string} */ text) => `"${text.replaceAll('"', '""')}"`;
-    const head = ["t [s]", ...this.labels.map((label) => `${label}${unit}`)].map(quoted).join(",");
+    const head = ["t [s]", ...this.labels.map((label, index) => `${label}${unit(index)}`)].map(quoted).join(",");
     const rows = this.data[0].map((_, row) => this.data.map((series) => series[row] ?? "").join(","));
     return [head, ...rows].join("\n") + "\n";
   }

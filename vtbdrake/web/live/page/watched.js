@@ -10,8 +10,11 @@ const ENTRIES = 12; // entries of an array that are shown
 /**
  * A variable as the session describes it.
  *
- * @typedef {{ kind: string, shape: number[], unit: string, bounds: [(number | null)[], (number | null)[]],
- *   settable: boolean, entries: string[], choices: { value: number, name: string }[] }} Variable
+ * `units` are those of its entries, where they differ.
+ *
+ * @typedef {{ kind: string, shape: number[], unit: string, units: string[],
+ *   bounds: [(number | null)[], (number | null)[]], settable: boolean, entries: string[],
+ *   choices: { value: number, name: string }[] }} Variable
  */
 
 /**
@@ -20,18 +23,6 @@ const ENTRIES = 12; // entries of an array that are shown
  * @typedef {{ text: any, slider?: any, choice?: any, row: any, lower: number | null, upper: number | null,
  *   ranged: boolean }} Entry
  */
-
-/**
- * @param {string} unit of a variable; one of entries of several kinds lists the units of their groups, "rad/s, m/s"
- * @param {number} size
- * @returns {string[]} the unit of each entry; empty texts where groups are not of one size
- */
-export function unitsOfEntries(unit, size) {
-  const units = unit.startsWith("(") ? [unit] : unit.split(", ");
-  if (units.length === 1) return Array(size).fill(shownUnit(unit));
-  if (size % units.length) return Array(size).fill("");
-  return Array.from({ length: size }, (_, index) => shownUnit(units[Math.floor((index * units.length) / size)]));
-}
 
 /**
  * @param {number | null | undefined} lower
@@ -67,7 +58,8 @@ export class Watched {
     this.variable = variable;
     const size = variable.shape.reduce((product, n) => product * n, 1);
     this.size = Math.min(size, ENTRIES);
-    this.units = unitsOfEntries(variable.unit, size);
+    const units = variable.units.length ? variable.units : Array(size).fill(variable.unit);
+    this.units = units.map(shownUnit);
     this.entries = Array.from({ length: this.size }, (_, index) => this.#entry(index));
     this.draggables = variable.choices.length ? [] : draggables(this);
     this.plotButton = element("button", {
@@ -125,7 +117,7 @@ export class Watched {
   // Unit and range, as far as they hold for all entries.
   #summary() {
     const units = new Set(this.units);
-    const unit = units.size > 1 ? "" : this.units[0] || shownUnit(this.variable.unit);
+    const unit = units.size > 1 ? "" : this.units[0];
     const ranges = new Set(this.entries.map(({ lower, upper }) => rangeText(lower, upper)));
     this.hasOneRange = ranges.size === 1;
     const range = this.hasOneRange && !this.variable.choices.length ? [...ranges][0] : "";
@@ -312,9 +304,8 @@ export class Watched {
     this.plot = null;
     this.plotButton.setAttribute("aria-pressed", String(plots));
     if (plots) {
-      const unit = new Set(this.units).size === 1 ? this.units[0] : this.variable.unit;
       const names = this.entries.map((_, index) => this.label(index) || this.address.split(".").slice(-2).join("."));
-      this.plot = new Plot(this.address, unit, names);
+      this.plot = new Plot(this.address, this.units, names);
       this.root.append(this.plot.root);
       this.plot.begin();
     }
