@@ -189,6 +189,12 @@ def test_a_range_of_positions_is_no_limit_of_the_torque(tmp_path: Path) -> None:
     path.write_text(text.format(' forcerange="-7 7"'))
     (joint,) = read_robot(path).joints
     assert (joint.effort, joint.assumed) == (7.0, ("speed",))
+    begin, end = text.index("<actuator>"), text.index("</mujoco>")
+    included = text[begin:end].format(' forcerange="-8 8"')
+    (tmp_path / "drives.xml").write_text(f"<mujocoinclude>{included}</mujocoinclude>")
+    path.write_text(f'{text[:begin]}<include file="drives.xml"/></mujoco>')
+    (joint,) = read_robot(path).joints
+    assert (joint.effort, joint.assumed) == (8.0, ("speed",))
 
 
 def test_bodies_that_touch_at_home_are_listed() -> None:

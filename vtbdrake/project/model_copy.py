@@ -45,6 +45,7 @@ class ModelCopy:
         packages: The folders of the packages that the files name, in the folder.
         original_folder: The folder that the folder of the copy stands for.
         xml: The text of the model file as it is in the copy; None if it is no XML.
+        included: The texts of the model files that it includes.
         missing: The packages that were not found, each with the sentence that says what to do.
         assumptions: What the file does not give, each with the values that are assumed instead.
         notes: What was changed, each with file and line.
@@ -55,6 +56,7 @@ class ModelCopy:
     packages: dict[str, Path] = field(default_factory=dict)
     original_folder: Path = Path()
     xml: XmlText | None = None
+    included: tuple[XmlText, ...] = ()
     missing: dict[str, str] = field(default_factory=dict)
     assumptions: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -117,6 +119,7 @@ class _Copier:
             folders,
             original_folder=top,
             xml=self._texts.get(self._path),
+            included=tuple(xml for source, xml in self._texts.items() if source != self._path),
             missing=self._missing,
             assumptions=self._assumptions(),
             notes=self._notes,

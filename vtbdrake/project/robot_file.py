@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 from vtbdrake.common.failures import one_line
 from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
 from vtbdrake.components.standing import WholeBodyModel
-from vtbdrake.project.model_copy import MJCF, URDF, copy_model
+from vtbdrake.project.model_copy import MJCF, URDF, ModelCopy, copy_model
 from vtbdrake.project.rotors import FlyingRobot, flying_robot
 from vtbdrake.project.stance import StanceError, StanceFinder, StandingRobot, named_postures, with_shift
 from vtbdrake.project.xml_text import XmlText
@@ -701,8 +701,8 @@ class _ModelReader:
         weights = self._weights(plant, context, ranges, names)
         M = plant.CalcMassMatrix(context)
         efforts = {name: 0.0 for name in names}
-        stated = _stated_efforts(self._copy.xml)
-        forces = {name: force for name, force in _forces(self._copy.xml).items() if name in robot.servos}
+        stated = _stated_efforts(self._copy.xml, self._copy.included)
+        forces = {name: force for name, force in _forces(self._copy).items() if name in robot.servos}
         for index in plant.GetJointActuatorIndices():
             drive = plant.get_joint_actuator(index)
             name, limit = drive.joint().name(), drive.effort_limit()
@@ -991,28 +991,30 @@ def _away(joint: RobotJoint) -> float:
     return float(f"{joint.home + math.copysign(step, end - joint.home):.4g}")
 
 
-def _stated_efforts(xml: XmlText | None) -> dict[str, float]:
+def _stated_efforts(xml: XmlText | None, included: Collection[XmlText]) -> dict[str, float]:
     """Return the effort limits (N m or N) by joint that Drake leaves out; 0 is what exporters write for unknown ones.
 
     These are <limit effort> in a URDF, and actuatorfrcrange in MJCF.
     """
-    efforts = {}
-    for joint in xml.root.iter("joint") if xml is not None else ():
+    efforts: dict[str, float] = {}
+    if xml is None or xml.root.tag not in (URDF, MJCF):
+        return efforts
+    for joint in [joint for text in (xml, *included) for joint in text.root.iter("joint")]:
         limit = joint.find("limit")
         text = limit.get("effort") if limit is not None else joint.get("actuatorfrcrange")
         effort = max((abs(float(number)) for number in text.split()), default=0.0)
-        if effort > 0.0 and xml is not None and xml.root.tag in (URDF, MJCF):
+        if effort > 0.0:
             efforts[joint.get("name")] = effort
     return efforts
 
 
-def _forces(xml: XmlText | None) -> dict[str, float]:
+def _forces(copy: ModelCopy) -> dict[str, float]:
     """Return the largest force or torque of each actuator in MJCF by its forcerange, infinite where it has none."""
     forces: dict[str, float] = {}
-    if xml is None:
-        return forces
-    defaults = [child for part in xml.root.iter("default") for child in part.children if child.get("forcerange")]
-    for actuator in [child for part in xml.root.iter("actuator") for child in part.children]:
+    texts = [xml for xml in (copy.xml, *copy.included) if xml is not None]
+    defaults = [child for xml in texts for part in xml.root.iter("default") for child in part.children]
+    defaults = [child for child in defaults if child.get("forcerange")]
+    for actuator in [child for xml in texts for part in xml.root.iter("actuator") for child in part.children]:
         of_class = next((default.get("forcerange") for default in defaults if default.tag == actuator.tag), "")
         numbers = (actuator.get("forcerange") or of_class).split()
         forces[actuator.get("name")] = max((abs(float(number)) for number in numbers), default=math.inf)
