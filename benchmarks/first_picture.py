@@ -1,4 +1,4 @@
-"""This benchmark measures the first minutes of a new user: from a bare machine to the moving robot in the browser."""
+"""The first picture of the live page, and the first minutes of a new user: from a bare machine to that picture."""
 
 from __future__ import annotations
 
@@ -8,19 +8,115 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.measure import LOWER, Benchmark
+import numpy as np
+from playwright.sync_api import Browser, Page
+
+from benchmarks.measure import LOWER, Benchmark, interleaved_values, ratio, spread
 from tests.chromium import running_browser
+from vtbdrake.web import view
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 ROOT = Path(__file__).resolve().parents[1]
 GOAL = 90.0  # s, as long as one waits for something that one only wants to see
 OUR_GOAL = 5.0  # s
+PICTURE_GOAL = 1.2  # what our server and our panel may add to Meshcat's own page
 # An element that the page has when it shows the state of the testbed.
 _DRAWN = "body[data-session=open][data-frame]"
+
+_PATIENCE = 120_000  # ms
+# Notes when the scene has got its last mesh, and has been drawn: the page's clock begins with its address.
+_WATCH = """{
+  const draw = window.requestAnimationFrame.bind(window);
+  window.drawn = { meshes: 0, at: 0 };
+  const count = () => {
+    let meshes = 0;
+    if (typeof viewer !== "undefined") viewer.scene.traverse((object) => (meshes += object.isMesh ? 1 : 0));
+    if (meshes !== window.drawn.meshes) {
+      window.drawn.meshes = meshes;
+      draw(() => draw(() => (window.drawn.at = Date.now())));
+    }
+    draw(count);
+  };
+  draw(count);
+}
+"""
+
+
+def first_picture(repeats: int = 5) -> list[Benchmark]:
+    """Time from the address of a live page to the picture of its robot in Chromium, over that of Meshcat's own page.
+
+    Both show the same Meshcat, in turns, without anything in a cache. Our page exchanges its ticket for a session
+    first, and has the panel beside the scene. Printed beside it: until the panel shows the session's state, too.
+    """
+    with view(SpaceClimberScenario()) as viewed, running_browser() as browser:
+        meshes = _meshes(browser, viewed.session.meshcat_url)
+        panels = []
+
+        def bare() -> float:
+            return _opened(browser, viewed.session.meshcat_url, meshes)[0]
+
+        def ours() -> float:
+            picture, panel = _opened(browser, viewed.url, meshes, until=_DRAWN)
+            panels.append(panel)
+            return picture
+
+        ours_s, bare_s = interleaved_values(ours, bare, repeats=repeats)
+    shown = np.array(panels[1:])
+    note = f"{spread(ours_s)}, Meshcat's {spread(bare_s)}, Chromium with a software renderer"
+    return [
+        Benchmark(
+            name="first_picture",
+            value=ratio(ours_s, bare_s),
+            unit="1",
+            goal=PICTURE_GOAL,
+            better=LOWER,
+            against="Meshcat's own page of the same scene",
+            note=note,
+        ),
+        Benchmark(
+            name="first_picture_panel",
+            value=ratio(shown, bare_s),
+            unit="1",
+            goal=None,
+            better=LOWER,
+            against="Meshcat's own page of the same scene",
+            note=f"until the panel has values, too: {spread(shown)}",
+        ),
+    ]
+
+
+@contextmanager
+def _page(browser: Browser) -> Iterator[Page]:
+    """Yield a page of a browser that has seen nothing yet."""
+    with closing(browser.new_context(viewport={"width": 1280, "height": 800})) as nobody:
+        page = nobody.new_page()
+        page.add_init_script(_WATCH)
+        yield page
+
+
+def _meshes(browser: Browser, url: str) -> int:
+    """Return the number of meshes of a scene, when no more come."""
+    with _page(browser) as page:
+        page.goto(url)
+        page.wait_for_function("window.drawn.at && Date.now() - window.drawn.at > 1000", timeout=_PATIENCE)
+        meshes: int = page.evaluate("window.drawn.meshes")
+        return meshes
+
+
+def _opened(browser: Browser, url: str, meshes: int, *, until: str = "body") -> tuple[float, float]:
+    """Return the seconds until a page shows a scene with a number of meshes, and until it has an element, too."""
+    with _page(browser) as page:
+        begin = time.time()
+        page.goto(url, wait_until="commit")
+        page.wait_for_function(f"window.drawn.meshes === {meshes} && window.drawn.at", timeout=_PATIENCE)
+        picture = page.evaluate("window.drawn.at") / 1e3
+        page.wait_for_selector(until, state="attached", timeout=_PATIENCE)
+        return picture - begin, max(picture, time.time()) - begin
 
 
 def bare_to_browser() -> list[Benchmark]:

@@ -83,6 +83,7 @@ BENCHMARKS: Registry = {
     "growth_log_open": "benchmarks.growth:growth_log_open",
     "growth_testbed_systems": "benchmarks.growth:growth_testbed_systems",
     "growth_campaign": "benchmarks.growth:growth_campaign",
+    "first_picture": "benchmarks.first_picture:first_picture",
     "bare_to_browser": "benchmarks.first_picture:bare_to_browser",
 }
 

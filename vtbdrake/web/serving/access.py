@@ -8,13 +8,13 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vtbdrake.lcm.hub.tcpq import user_of
@@ -134,9 +134,8 @@ class Access:
     def _entrance(self, scope: Scope) -> Callable[[Request], Any] | None:
         """Return the function that answers a request without a session; None if there is none."""
         answers: Mapping[tuple[str, str], Callable[[Request], Any]] = {
-            ("GET", ""): partial(_file, "enter.html"),
-            ("GET", "/"): partial(_file, "enter.html"),
-            ("GET", "/enter.js"): partial(_file, "enter.js"),
+            ("GET", ""): _entrance_page,
+            ("GET", "/"): _entrance_page,
             ("POST", "/enter"): self._enter,
         }
         return answers.get((scope["method"], scope["path"]))
@@ -205,5 +204,13 @@ async def _refuse(reason: str, scope: Scope, receive: Receive, send: Send) -> No
         await PlainTextResponse(f"{reason}\n", status_code=403)(scope, receive, send)
 
 
-async def _file(name: str, _: Request) -> Response:
-    return FileResponse(_ENTRANCE / name)
+async def _entrance_page(_: Request) -> Response:
+    return HTMLResponse(_entrance_text())
+
+
+@cache
+def _entrance_text() -> str:
+    """Return the page at ``/`` with its script in it, which a browser would otherwise ask for."""
+    text = (_ENTRANCE / "enter.html").read_text("utf-8")
+    tag, script = '<script type="module" src="enter.js"></script>', (_ENTRANCE / "enter.js").read_text("utf-8")
+    return text.replace(tag, f'<script type="module">\n{script}</script>')

@@ -29,6 +29,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.web.serving.access import Access
+from vtbdrake.web.serving.preloads import preloads
 from vtbdrake.web.serving.relay import moves_camera, relay
 from vtbdrake.web.serving.tls import Tls
 from vtbdrake.web.serving.web_page import check_host
@@ -82,8 +83,10 @@ class Host:
         tls: Tls | None = None,
     ) -> None:
         self._meshcat_url, self._serve = meshcat_url, serve
-        # Behind the last script of Meshcat's page, whose viewer it uses.
-        self._script = f'<script type="module" src="page/{script}"></script>\n' if script else ""
+        folders = (__package__, *packages)
+        # Behind the last script of Meshcat's page, whose viewer it uses. Meshcat's scripts are asked for first.
+        module = f'<script type="module" src="page/{script}"></script>\n'
+        self._script = f"{preloads(script, folders)}{module}" if script else ""
         for name in hosts:
             check_host(name)
         self._socket = _listen(port, *(tls.address() if tls else (socket.AF_INET, "127.0.0.1")))
@@ -93,7 +96,7 @@ class Host:
                 *([WebSocketRoute("/session", until_closed(self._serve_socket))] if serve else []),
                 WebSocketRoute("/", until_closed(self._relay_meshcat)),
                 *routes,
-                Mount("/page", StaticFiles(packages=[(name, "page") for name in (__package__, *packages)])),
+                Mount("/page", StaticFiles(packages=[(name, "page") for name in folders])),
                 Route("/", self._index),
                 Route("/{path:path}", self._asset),
             ]
