@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import re
 import socket as socketlib
 import urllib.error
 import urllib.request
@@ -135,21 +134,6 @@ def test_page_that_answers_no_ping_stays_connected(path: str, monkeypatch: pytes
 def test_port_in_use_is_an_error(running: View) -> None:
     with pytest.raises(PortError, match=r"port \d+ cannot be used .*: give another one"):
         view(CartPoleScenario(), port=urlsplit(running.url).port or 0)
-
-
-def test_browser_is_told_at_once_what_the_page_loads(running: View) -> None:
-    address = entered(running.url)
-    _, html, _ = ask(address)
-    links = re.findall(r'<link rel="(modulepreload|preload" as="(?:style|script))" href="page/([^"]+)">', html)
-    names = [name for _, name in links]
-    assert len(set(names)) == len(names)
-    assert html.index("cas-v1/") < html.index("<link rel=")  # Meshcat's script is asked for first.
-    for kind, name in links:
-        status, text, _ = ask(f"{address}page/{name}")
-        assert status == 200
-        imported = [part.split('"')[1] for part in text.split("from ")[1:] if part.startswith('"./')]
-        assert kind != "modulepreload" or {path.removeprefix("./") for path in imported} <= set(names)
-    assert {"view.js", "plot.js", "view.css", "vendor/uPlot.min.css", "vendor/uPlot.iife.min.js"} <= set(names)
 
 
 def test_entries_of_a_pose_have_units_of_their_own() -> None:

@@ -29,7 +29,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.web.serving.access import Access
-from vtbdrake.web.serving.preloads import preloads
 from vtbdrake.web.serving.relay import moves_camera, relay
 from vtbdrake.web.serving.tls import Tls
 from vtbdrake.web.serving.web_page import check_host
@@ -83,10 +82,9 @@ class Host:
         tls: Tls | None = None,
     ) -> None:
         self._meshcat_url, self._serve = meshcat_url, serve
-        folders = (__package__, *packages)
-        # Behind the last script of Meshcat's page, whose viewer it uses. Meshcat's scripts are asked for first.
-        module = f'<script type="module" src="page/{script}"></script>\n'
-        self._script = f"{preloads(script, folders)}{module}" if script else ""
+        # Behind the last script of Meshcat's page, whose viewer it uses. Links that ask for what it imports at once
+        # (modulepreload) make the panel no earlier, and the first picture later.
+        self._script = f'<script type="module" src="page/{script}"></script>\n' if script else ""
         for name in hosts:
             check_host(name)
         self._socket = _listen(port, *(tls.address() if tls else (socket.AF_INET, "127.0.0.1")))
@@ -96,7 +94,7 @@ class Host:
                 *([WebSocketRoute("/session", until_closed(self._serve_socket))] if serve else []),
                 WebSocketRoute("/", until_closed(self._relay_meshcat)),
                 *routes,
-                Mount("/page", StaticFiles(packages=[(name, "page") for name in folders])),
+                Mount("/page", StaticFiles(packages=[(name, "page") for name in (__package__, *packages)])),
                 Route("/", self._index),
                 Route("/{path:path}", self._asset),
             ]
