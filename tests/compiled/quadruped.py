@@ -19,13 +19,23 @@ from pydrake.multibody.plant import (
     MultibodyPlant,
     MultibodyPlantConfig,
 )
-from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, RigidBody, RotationalInertia, SpatialInertia
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    PdControllerGains,
+    RevoluteJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+)
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import AffineSystem
+from pydrake.systems.primitives import AffineSystem, ConstantVectorSource
 
 LEGS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 POSTURE = {"hip": 0.0, "thigh": 0.7, "knee": -1.4}
 HEIGHT = 0.33
+STIFFNESS = 60.0  # N m/rad
+DAMPING = 2.0  # N m s/rad
+EFFORT_LIMIT = 12.0  # N m
 
 
 def inertia(mass: float, z: float, moments: tuple[float, float, float]) -> SpatialInertia:
@@ -44,7 +54,12 @@ def surface(
 
 
 def quadruped(
-    approximation: str, *, time_step: float = 0.005, playground: bool = False
+    approximation: str,
+    *,
+    time_step: float = 0.005,
+    playground: bool = False,
+    stops: bool = False,
+    drives: bool = False,
 ) -> tuple[Diagram, MultibodyPlant]:
     """Return a Diagram: four legs held by joint PD, a trot's length above the ground.
 
@@ -52,6 +67,8 @@ def quadruped(
         approximation: Drake's name of the contact approximation.
         time_step: The time step of the plant, and the period of the controller, in s.
         playground: The ground is a slope, feet touch each other, there are a box and two balls, and materials differ.
+        stops: The joints have stops.
+        drives: The actuators have the joint PD, with effort limits, instead of the DPS; there is a feed-forward.
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
@@ -65,7 +82,7 @@ def quadruped(
     feet = GeometrySet()
     for number, (front, left) in enumerate(LEGS):
         material = surface(0.8, 3e4 + 1e3 * number, 0.05, 0.3) if playground else surface(0.8)
-        shank = _leg(plant, trunk, str(number), front, left)
+        shank = _leg(plant, trunk, str(number), front, left, stops=stops, drives=drives)
         feet.Add(
             plant.RegisterCollisionGeometry(
                 shank, RigidTransform([0, 0, -0.2]), Sphere(0.02), f"foot_{number}", material
@@ -87,13 +104,23 @@ def quadruped(
     plant.Finalize()
     if not playground:
         scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(feet))
-    controller = builder.AddSystem(_joint_pd(plant, stiffness=60.0, damping=2.0, period=time_step))
-    builder.Connect(plant.get_state_output_port(), controller.get_input_port())
-    builder.Connect(controller.get_output_port(), plant.get_actuation_input_port())
+    if drives:
+        angles = [
+            POSTURE[plant.get_joint_actuator(i).name().partition("_")[0]] for i in plant.GetJointActuatorIndices()
+        ]
+        desired = builder.AddNamedSystem("desired", ConstantVectorSource([*angles, *[0.1] * len(angles)]))
+        builder.Connect(desired.get_output_port(), plant.GetInputPort("DefaultModelInstance_desired_state"))
+        law = builder.AddNamedSystem("feed_forward", ConstantVectorSource(np.linspace(-1.0, 1.0, len(angles))))
+    else:
+        law = builder.AddSystem(_joint_pd(plant, stiffness=STIFFNESS, damping=DAMPING, period=time_step))
+        builder.Connect(plant.get_state_output_port(), law.get_input_port())
+    builder.Connect(law.get_output_port(), plant.get_actuation_input_port())
     return builder.Build(), plant
 
 
-def _leg(plant: MultibodyPlant, trunk: RigidBody, name: str, front: int, left: int) -> RigidBody:
+def _leg(
+    plant: MultibodyPlant, trunk: RigidBody, name: str, front: int, left: int, *, stops: bool, drives: bool
+) -> RigidBody:
     """Add a leg; return its shank, at whose end, 0.2 m below the knee, is the foot."""
     parts = (
         ("hip", [0.18 * front, 0.05 * left, 0.0], [1, 0, 0], inertia(0.7, 0.0, (0.0005,) * 3)),
@@ -108,7 +135,14 @@ def _leg(plant: MultibodyPlant, trunk: RigidBody, name: str, front: int, left: i
         )
         joint = plant.AddJoint(RevoluteJoint(f"{kind}_{name}", frame, body.body_frame(), axis, 0.1))
         joint.set_default_angle(POSTURE[kind])
-        plant.AddJointActuator(f"{kind}_{name}", joint).set_default_rotor_inertia(0.01)
+        if stops:
+            joint.set_position_limits([POSTURE[kind] - 0.4], [POSTURE[kind] + 0.5])
+        actuator = plant.AddJointActuator(f"{kind}_{name}", joint, EFFORT_LIMIT if drives else np.inf)
+        actuator.set_default_rotor_inertia(0.01)
+        if drives:
+            # The thighs have gains that the step does not resolve.
+            stiffness, damping = (1e5, 1e3) if kind == "thigh" else (STIFFNESS, DAMPING)
+            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
         parent = body
     return parent
 

@@ -12,7 +12,11 @@ from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddRigidHydroelasticProperties,
     Box,
+    Capsule,
+    Convex,
+    Cylinder,
     HalfSpace,
+    Mesh,
     ProximityProperties,
     Shape,
     Sphere,
@@ -27,6 +31,7 @@ from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, inertia, quadruped, 
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
+from vtbdrake.components.compiled_plant.sap import Drive, SapSolver, stops
 from vtbdrake.state.systems import collect
 from vtbdrake_diagrams.manipulator import ManipulatorScenario
 
@@ -49,11 +54,14 @@ class Steps:
         plant = self.plant
         self.root = self.diagram.CreateDefaultContext()
         self.context: Context = plant.GetMyMutableContextFromRoot(self.root)
-        model = PlantDynamics(plant, plant.CreateDefaultContext())
+        model = PlantDynamics(plant, plant.CreateDefaultContext(), controllers=True)
         self.contact = PointContact(plant, model, contact_pairs(plant, self.context))
+        drives = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+        self.drives = [Drive.of(actuator) for actuator in drives if actuator.has_controller()]
+        solver = SapSolver(plant, model, self.contact, self.drives)
         q, v, u = model.symbols()
         tau = model.actuation(u)
-        step = self.contact.step(q, v, tau)
+        step = solver.step(q, v, tau, desired=self._desired(), feed_forward=u if self.drives else None)
         touching = [self.contact.touch(pair, q) for pair in self.contact.pairs]
         balance = model.momentum_balance(q, v, tau, plant.time_step())
         parts = [
@@ -80,6 +88,17 @@ class Steps:
         speed = random.choice([0.01, 1.0, 3.0])
         plant.SetVelocities(self.context, speed * random.standard_normal(plant.num_velocities()))
 
+    def put(self, name: str, pose: RigidTransform, depth: float) -> None:
+        """Set the pose of a body whose only contact is with the world, moved along the normal until it is that deep."""
+        body = self.plant.GetBodyByName(name)
+        into_other = 1.0 if self.contact.pairs[0].first.body == int(body.index()) else -1.0
+        for _ in range(4):
+            self.plant.SetFreeBodyPose(self.context, body, pose)
+            _, _, _, normals, distances = self._parts(*self._arguments())
+            shift = into_other * (float(distances[0]) + depth) * normals.full()[:, 0]
+            pose = RigidTransform(pose.rotation(), pose.translation() + shift)
+        self.plant.SetFreeBodyPose(self.context, body, pose)
+
     def drake(self) -> np.ndarray:
         """Return the velocities after Drake's step."""
         state = self.plant.get_state_output_port().Eval(self.context)
@@ -89,8 +108,17 @@ class Steps:
 
     def compiled(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the velocities after the compiled step, the contact forces, and the doubt."""
-        v, forces, doubt = self._step(*self._arguments())
+        v, forces, _, doubt = self._step(*self._arguments())
         return v.full().ravel(), forces.full().T, float(doubt)
+
+    def efforts(self) -> np.ndarray:
+        """Return the actuation of the drives in the compiled step."""
+        return np.array(self._step(*self._arguments())[2]).ravel()
+
+    def _desired(self) -> np.ndarray:
+        """Return the desired positions and velocities, shape (nu, 2)."""
+        port = self.plant.GetInputPort("DefaultModelInstance_desired_state")
+        return port.Eval(self.context).reshape(2, -1).T if self.drives else np.zeros((0, 2))
 
     def residual(self, v: np.ndarray) -> float:
         """Return how far velocities are from a solution, relative to the momentum, as Drake measures it."""
@@ -105,6 +133,13 @@ class Steps:
                 law = lagged_impulse if self.is_lagged else sap_impulse
                 frame = normals[:, i], distances[i, 0], estimate, self.plant.time_step()
                 impulses += J_i.T @ law(J_i @ v, J_i @ v0, *frame, *material)
+        dt, v_star = self.plant.time_step(), np.linalg.solve(A, p_star).ravel()
+        for stop in stops(self.plant):
+            speed = max(abs(v0[stop.v]), abs(v_star[stop.v]))
+            impulses[stop.v] += stop_impulse(v[stop.v], q[stop.q], speed, scale[stop.v] ** 2, dt, stop)
+        for drive, (q_d, v_d), u_ff in zip(self.drives, self._desired(), u, strict=False):
+            errors = q[drive.q] - q_d, v[drive.v] - v_d
+            impulses[drive.v] += drive_impulse(v[drive.v], *errors, u_ff, scale[drive.v] ** 2, dt, drive)
         momentum = max(np.linalg.norm(scale * (A @ v)), np.linalg.norm(scale * impulses))
         return float(np.linalg.norm(scale * (A @ v - p_star.ravel() - impulses)) / momentum)
 
@@ -141,14 +176,35 @@ def lagged_impulse(v_c, v_c0, n, distance, w, dt, stiffness, dissipation, fricti
     return g_n * n - friction * before * slip / np.hypot(np.linalg.norm(slip), max(1e-4, friction * 1e-3 * w * before))
 
 
+def stop_impulse(v, q, speed, w, dt, stop):
+    """Return the impulse of Drake's SapLimitConstraint on a velocity, where the stop is within reach of a step."""
+    total = 0.0
+    for sign, distance in ((1.0, q - stop.lower), (-1.0, stop.upper - q)):
+        if distance <= 2.0 * dt * speed:
+            R = max(0.1**2 / (4.0 * np.pi**2) * w, 1.0 / (dt * 1e12 * 2.0 * dt))
+            total += sign * max(0.0, (-distance / (2.0 * dt) - sign * v) / R)
+    return total
+
+
+def drive_impulse(v, q_error, v_error, u_ff, w, dt, drive):
+    """Return the impulse of Drake's SapPdControllerConstraint, with its gains in the near-rigid regime."""
+    p, d, R_near = drive.p, drive.d, 0.1**2 / (4.0 * np.pi**2) * w
+    if 1.0 / (dt * (dt * p + d)) < R_near:
+        p, d = p / (dt * (dt * p + d) * R_near), d / (dt * (dt * p + d) * R_near)
+    return dt * np.clip(-p * (q_error + dt * v) - d * v_error + u_ff, -drive.effort_limit, drive.effort_limit)
+
+
 @lru_cache
-def steps_of(approximation: str) -> Steps:
-    return Steps(*quadruped(approximation, playground=True), approximation == "lagged")
+def steps_of(approximation: str, *, driven: bool = False) -> Steps:
+    diagram, plant = quadruped(approximation, playground=True, stops=driven, drives=driven)
+    return Steps(diagram, plant, approximation == "lagged")
 
 
+@pytest.mark.parametrize("driven", [False, True], ids=["", "stops and drives"])
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
-def test_steps_are_drakes_on_a_playground(approximation: str) -> None:
-    steps, random = steps_of(approximation), np.random.default_rng(0)
+def test_steps_are_drakes_on_a_playground(approximation: str, driven: bool) -> None:
+    """Contact, joint stops, and PD controllers, some at their effort limits, some stiffer than a step resolves."""
+    steps, random = steps_of(approximation, driven=driven), np.random.default_rng(0)
     touching = 0
     for _ in range(100):
         steps.randomize(random)
@@ -160,6 +216,9 @@ def test_steps_are_drakes_on_a_playground(approximation: str) -> None:
         assert steps.residual(expected) < 1.1e-6
         assert steps.residual(v) < 2e-9
         np.testing.assert_allclose(v, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
+        if driven:
+            efforts = steps.plant.get_net_actuation_output_port().Eval(steps.context)
+            np.testing.assert_allclose(steps.efforts(), efforts, atol=1e-3)
     assert touching > 200
 
 
@@ -240,10 +299,56 @@ def test_a_ball_sinks_into_a_box_by_the_nearest_face() -> None:
         np.testing.assert_allclose(v, expected, atol=1e-8)
 
 
+@pytest.fixture(scope="module")
+def wedge(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the file of a mesh whose convex hull has six vertices."""
+    file = tmp_path_factory.mktemp("meshes") / "wedge.obj"
+    corners = [(x, y, z) for x, z in ((-0.1, -0.05), (0.1, -0.04), (0.02, 0.12)) for y in (-0.08, 0.07)]
+    faces = [(0, 2, 4), (1, 5, 3), (0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4), (4, 5, 1), (4, 1, 0)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    file.write_text("\n".join(lines), encoding="utf-8")
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (Sphere(0.1), Cylinder(0.2, 0.3)),
+        (Sphere(0.1), Capsule(0.2, 0.3)),
+        (Capsule(0.05, 0.2), Sphere(0.1)),
+        (Box(0.1, 0.2, 0.3), HalfSpace()),
+        (Capsule(0.05, 0.2), HalfSpace()),
+        (Cylinder(0.05, 0.2), HalfSpace()),
+        ("convex", HalfSpace()),
+        ("mesh", HalfSpace()),
+    ],
+    ids=lambda shape: shape if isinstance(shape, str) else type(shape).__name__,
+)
+def test_other_shapes_touch_as_in_drake(one: Shape | str, other: Shape, wedge: str) -> None:
+    """Steps from random poses in contact are Drake's, and from poses in which a shape lies or stands almost flat."""
+    if isinstance(one, str):
+        one = (Convex if one == "convex" else Mesh)(wedge, 1.5)
+    steps, random = Steps(*ball_on(other, of_ball=one), False), np.random.default_rng(0)
+    touching = 0
+    for trial in range(60):
+        angles = random.uniform(-np.pi, np.pi, 3)
+        if trial < 20:
+            angles = np.pi / 2 * random.integers(0, 4, 3) + 10.0 ** random.uniform(-9, -3) * random.uniform(-1, 1, 3)
+        steps.put(
+            "ball", RigidTransform(RollPitchYaw(angles), random.uniform(-0.3, 0.3, 3)), random.uniform(0.001, 0.02)
+        )
+        steps.plant.SetVelocities(steps.context, random.standard_normal(6))
+        expected, (v, forces, doubt) = steps.drake(), steps.compiled()
+        assert doubt == 0.0
+        touching += np.any(forces)
+        np.testing.assert_allclose(v, expected, atol=1e-5 * max(1.0, np.abs(expected).max()))
+    assert touching > 40
+
+
 def test_other_shapes_are_refused_by_name() -> None:
-    refusal = r"contact of .*ball of ball \(Box\) and .*ground of world \(HalfSpace\) is not compiled: let a Sphere"
+    refusal = r"contact of .*ball of ball \(Box\) and .*ground of world \(Box\) is not compiled: let a Sphere"
     with pytest.raises(UnsupportedTestbedError, match=refusal):
-        compiled(ball_on(HalfSpace(), of_ball=Box(0.1, 0.1, 0.1))[0])
+        compiled(ball_on(Box(1.0, 1.0, 1.0), of_ball=Box(0.1, 0.1, 0.1))[0])
 
 
 def test_an_arm_presses_on_a_wall() -> None:
@@ -272,9 +377,17 @@ def test_without_a_compiler_contact_is_refused(monkeypatch: pytest.MonkeyPatch) 
         compiled(ball_on(HalfSpace(), "sap")[0])
 
 
-def test_a_state_that_is_not_finite_is_never_valid() -> None:
+def test_a_step_that_does_not_converge_ends_its_rollout_with_reason_and_time() -> None:
     diagram, _ = ball_on(HalfSpace())
     rollouts = compiled(diagram)
-    z = np.tile(rollouts.walker.read(diagram.CreateDefaultContext()), (2, 1))
+    z = np.tile(rollouts.walker.read(diagram.CreateDefaultContext()), (4, 1))
+    z[:, 6] = 0.05
     z[1, 6] = np.nan
-    assert rollouts.from_z(z, 0.0).valid.tolist() == [True, False]
+    z[2, 12] = 1e200  # Its square is infinite.
+    z[3, 6] = 10.0  # It flies.
+    z[3, 12] = np.inf
+    batch = rollouts.from_z(z, 0.5)
+    assert batch.valid.tolist() == [True, False, False, False]
+    solver = "plant: the solver of contact, stops and controllers did not converge at t = 0.5 s"
+    infinite = "the state of plant is not finite at t = 0.5 s"
+    assert batch.reasons == ("", infinite, solver, infinite)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import casadi
 import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia, WeldJoint
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    PdControllerGains,
+    PrismaticJoint,
+    RevoluteJoint,
+    SpatialInertia,
+    WeldJoint,
+)
 from pydrake.symbolic import Variable, exp, sin
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
@@ -23,6 +33,7 @@ from pydrake.systems.primitives import (
 
 from vtbdrake.compiled import EQUATIONS, At, CompiledRollouts, Equations, UnsupportedTestbedError
 from vtbdrake.compiled.agreement import compare
+from vtbdrake.state.declarations import DISCRETE
 from vtbdrake.state.systems import collect
 
 BOX = SpatialInertia.SolidBoxWithMass(1.5, 0.2, 0.3, 0.4)
@@ -47,12 +58,20 @@ def rollouts_of(
     )
 
 
-def two_carts(plant: MultibodyPlant, *, stop: float = np.inf) -> None:
+def two_carts(
+    plant: MultibodyPlant,
+    *,
+    stop: float = np.inf,
+    effort_limit: float = np.inf,
+    gains: PdControllerGains | None = None,
+) -> None:
     for name, axis in (("left", [1, 0, 0]), ("right", [0, 1, 0])):
         instance = plant.AddModelInstance(name)
         body = plant.AddRigidBody("cart", instance, BOX)
         joint = PrismaticJoint(f"{name}_slider", plant.world_frame(), body.body_frame(), axis, -stop, stop)
-        plant.AddJointActuator(f"{name}_motor", plant.AddJoint(joint))
+        motor = plant.AddJointActuator(f"{name}_motor", plant.AddJoint(joint), effort_limit)
+        if gains is not None:
+            motor.set_controller_gains(gains)
     plant.Finalize()
 
 
@@ -152,15 +171,84 @@ def test_poses_of_bodies_are_recorded() -> None:
     assert np.ptp(recorded["plant.base.yaw"]) > 5.0 and np.ptp(recorded["plant.arm.pitch"]) > 1.0
 
 
-def test_a_rollout_that_reaches_a_stop_is_not_valid() -> None:
+def carts_with_stops() -> Diagram:
     builder = DiagramBuilder()
     plant = MultibodyPlant(0.01)
     two_carts(plant, stop=0.05)
     builder.AddNamedSystem("plant", plant)
     source = builder.AddNamedSystem("force", ConstantVectorSource([5.0, 0.0]))
     builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
-    batch = rollouts_of(builder.Build())({"force.value": [[0.1, 0.0], [5.0, 0.0]]})
+    return builder.Build()
+
+
+def test_a_rollout_that_reaches_a_stop_is_drakes() -> None:
+    diagram = carts_with_stops()
+    rollouts = rollouts_of(diagram)
+    batch = rollouts({"force.value": [[0.1, 0.0], [5.0, 0.0]]})
+    assert batch.valid.all() and batch.reasons == ("", "")
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.3)
+    expected = rollouts.walker.read(simulator.get_context())
+    state = rollouts.walker.blocks["plant", DISCRETE, 0].entries
+    np.testing.assert_allclose(batch.final[1][state], expected[state], atol=1e-9)
+    np.testing.assert_allclose(expected[state][0], 0.05, atol=1e-4)  # It rests on its stop.
+
+
+def test_without_a_compiler_a_rollout_that_reaches_a_stop_is_not_valid(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    batch = rollouts_of(carts_with_stops())({"force.value": [[0.1, 0.0], [5.0, 0.0]]})
     assert batch.valid.tolist() == [True, False]
+    # 0.05 m are reached after 0.173 s at 3.33 m/s^2; a stop is felt two steps ahead.
+    assert batch.reasons == (
+        "",
+        "plant: a joint reaches a stop, which is compiled only where there is a C compiler at t = 0.15 s",
+    )
+
+
+def servos(*desired: str) -> Diagram:
+    """Return two carts with PD controllers and effort limits; those that are named have a desired state."""
+    builder = DiagramBuilder()
+    plant = MultibodyPlant(0.01)
+    plant.SetUseSampledOutputPorts(False)
+    two_carts(plant, stop=0.22, effort_limit=20.0, gains=PdControllerGains(p=200.0, d=3.0))
+    builder.AddNamedSystem("plant", plant)
+    feed_forward = builder.AddNamedSystem("feed_forward", ConstantVectorSource([1.0, 2.0]))
+    builder.Connect(feed_forward.get_output_port(), plant.get_actuation_input_port())
+    target = builder.AddNamedSystem("target", ConstantVectorSource([0.25, 0.1]))
+    for name in desired:
+        builder.Connect(target.get_output_port(), plant.GetInputPort(f"{name}_desired_state"))
+    return builder.Build()
+
+
+@pytest.mark.parametrize("desired", [(), ("left",), ("left", "right")])
+def test_controllers_of_actuators(desired: tuple[str, ...]) -> None:
+    """They are saturated at first, and run into a stop; those without a desired state are limp."""
+    # Drake aborts if the net actuation is asked for where some controllers have a desired state and others have none.
+    ports = ("plant.net_actuation", "plant.right_net_actuation") if len(desired) != 1 else ()
+    rollouts = rollouts_of(servos(*desired), ("plant.state", *ports), left_slider=-0.2)
+    compare(rollouts, rollouts.walker.context)
+    moved = rollouts().outputs
+    if ports:
+        np.testing.assert_array_equal(moved["plant.net_actuation"][..., 1:], moved["plant.right_net_actuation"])
+        assert moved["plant.net_actuation"][0, 0, 0] == (20.0 if desired else 1.0)
+    assert [bool(np.ptp(moved["plant.state"][0, :, k])) for k in range(2)] == [
+        name in desired for name in ("left", "right")
+    ]
+    assert (np.max(moved["plant.state"][0, :, 0]) > 0.219) == bool(desired)
+
+
+def test_derivatives_through_stops_and_controllers() -> None:
+    rollouts = rollouts_of(servos("left"), ("plant.state",), left_slider=0.1)
+
+    def end(target: Any) -> Any:
+        return rollouts.expressions({"target.value": target})["plant.state"][:, -1]
+
+    target = casadi.MX.sym("target", 2)
+    jacobian = casadi.Function("jacobian", [target], [casadi.jacobian(end(target), target)])
+    for at in ([0.28, 0.0], [0.2, 0.1], [0.5, 0.0]):
+        steps = [rollouts({"target.value": [np.add(at, h), np.subtract(at, h)]}) for h in 1e-6 * np.eye(2)]
+        differences = [np.subtract(*batch.outputs["plant.state"][:, -1]) / 2e-6 for batch in steps]
+        np.testing.assert_allclose(jacobian(at).full(), np.transpose(differences), atol=1e-6)
 
 
 class Weigh(LeafSystem):
@@ -221,8 +309,12 @@ def test_reaction_of_a_joint_whose_parent_hangs_on_its_child(hanging: str) -> No
     np.testing.assert_allclose(rollouts().outputs["weigh.force"][0], -1.5 * 9.81, rtol=1e-12)
 
 
+@pytest.mark.parametrize("compiler", [None, "no-such-compiler"])
 @pytest.mark.usefixtures("weigh")
-def test_a_stop_that_is_felt_in_the_last_step_makes_the_forces_invalid() -> None:
+def test_a_stop_that_is_felt_in_the_last_step_counts(monkeypatch: pytest.MonkeyPatch, compiler: str | None) -> None:
+    """With a C compiler its force is recorded, without one the rollout is not valid."""
+    if compiler is not None:
+        monkeypatch.setenv("CC", compiler)
     plant = MultibodyPlant(0.01)
     plant.SetUseSampledOutputPorts(False)
     body = plant.AddRigidBody("box", BOX)
@@ -250,11 +342,12 @@ def test_a_stop_that_is_felt_in_the_last_step_makes_the_forces_invalid() -> None
         feels = port.Eval(diagram.GetSubsystemByName("weigh").GetMyContextFromRoot(simulator.get_context()))[0]
         batch = rollouts()
         assert (abs(feels - batch.outputs["weigh.force"][0, -1, 0]) < 1e-9) == batch.valid[0]
+        assert (abs(feels) > 1e-9) == (height < 9.0 * 9.81e-4)
         return bool(batch.valid[0])
 
     # Two steps fall by 3 g T^2, and a stop is felt 2 T ahead: in the third step, 3 g T^2 + 2 * 3 g T^2 below the begin.
     assert falls(9.1 * 9.81e-4)
-    assert not falls(8.9 * 9.81e-4)
+    assert falls(8.9 * 9.81e-4) == (compiler is None)
 
 
 def test_a_state_that_is_infinite_for_a_while_makes_the_rollout_invalid() -> None:

@@ -27,6 +27,7 @@ from tests.verification.worlds import (
     Ball,
     Block,
     Bounce,
+    Carts,
     ConicalPendulum,
     DoublePendulum,
     FourBar,
@@ -38,6 +39,7 @@ from tests.verification.worlds import (
     Pendulum,
     RollingTest,
     Run,
+    Servo,
     body_rates,
     continuous,
     discrete,
@@ -273,6 +275,51 @@ def test_step_of_an_impedance_law(verify: Verify, ratio: float, published: float
     )
     verify("overshoot at 2 ms", coarse, overshoot(1.5 * T), tolerance=(2.0 * 1.5 * T) ** 2)
     verify("extrapolated", 2 * fine - coarse, overshoot(0.0), tolerance=(2.0 * T) ** 2)
+
+
+SOLVERS = ["sap", "lagged", "sap, compiled", "lagged, compiled"]
+
+
+@pytest.mark.parametrize("settings", SOLVERS)
+def test_load_hits_a_stop(verify: Verify, settings: str) -> None:
+    """Stop of a joint: a load of 1 kg slides at 1 m/s on a resting cart of 2 kg, and hits a stop of its joint.
+
+        m_load v = (m_cart + m_load) v',   and the load stays at the stop: it rebounds by less than e^-2 in a step
+
+    Drake's stops are near-rigid and dissipate within a time step. Reference: the plastic impact: v' = 1/3 m/s.
+    Tolerance: rounding for the momentum; for the velocity of the load against the cart, 1e-3 m/s, 0.2 s after the hit.
+    """
+    run = Run(_with_contact(Carts, settings), {"load_slider.velocity": 1.0}).to(0.3)
+    cart, load = float(run["cart_slider.velocity"]), float(run["load_slider.velocity"])
+    verify("momentum", 2.0 * cart + (cart + load), 1.0, tolerance=1e-12, unit="N s")
+    verify("velocity of the cart", cart, 1.0 / 3.0, tolerance=1e-3, unit="m/s")
+    verify("position of the load", float(run["load_slider.position"]), 0.1, tolerance=1e-3, unit="m")
+
+
+@pytest.mark.parametrize("settings", SOLVERS)
+def test_servo_at_its_effort_limit(verify: Verify, settings: str) -> None:
+    """Effort limit: a PD controller far from its desired state pushes 1 kg with its limit of 2 N.
+
+        x = F t^2 / 2,   and in steps of h   x = F t (t + h) / 2
+
+    Reference: the closed form in steps, after 0.5 s with h = 0.5 ms. Tolerance: rounding.
+    """
+    run = Run(_with_contact(Servo, settings), {"u.force": [10.0, 0.0]}).to(0.5)
+    verify("position", float(run["slider.position"]), 2.0 * 0.5 * (0.5 + STEP) / 2, tolerance=1e-12, unit="m")
+    verify("velocity", float(run["slider.velocity"]), 2.0 * 0.5, tolerance=1e-12, unit="m/s")
+
+
+@pytest.mark.parametrize("settings", SOLVERS)
+def test_servo_holds_a_weight(verify: Verify, settings: str) -> None:
+    """Implicit PD controller: critically damped, it holds a weight of 1 N, which pulls it away from its desired state.
+
+        x = x_d + (F / K) (1 - (1 + w t) e^(-w t)),   w = sqrt(K / m) = 10 rad/s
+
+    Reference: this closed form, after 0.2 s. Tolerance: (F / K) w h, the first order of implicit Euler, h = 0.5 ms.
+    """
+    run = Run(_with_contact(Servo, settings, pull=1.0), {"u.force": [0.0, 0.0]}).to(0.2)
+    expected = 0.01 * (1.0 - (1.0 + 2.0) * exp(-2.0))
+    verify("position", float(run["slider.position"]), expected, tolerance=0.01 * 10.0 * STEP, unit="m")
 
 
 # -- contact

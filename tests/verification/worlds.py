@@ -24,6 +24,7 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant, MultibodyPl
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     ModelInstanceIndex,
+    PdControllerGains,
     PrismaticJoint,
     PrismaticSpring,
     RevoluteJoint,
@@ -511,6 +512,51 @@ class Impedance(World):
         joints = [builder.plant.GetJointByName("slider")]
         builder.add_sensor("position", JointEncoders(builder.plant, joints, period=self.period))
         builder.add_sensor("velocity", JointTachometers(builder.plant, joints, period=self.period))
+
+
+@dataclass
+class Carts(World):
+    """A cart of 2 kg that rolls freely, and on it a load of 1 kg that slides up to a stop 0.1 m ahead."""
+
+    plant_config: MultibodyPlantConfig = field(default_factory=lambda: discrete(1e-3))
+
+    def add_bodies(self, plant: MultibodyPlant, instance: ModelInstanceIndex) -> None:
+        cart, load = (
+            plant.AddRigidBody(name, instance, SpatialInertia.SolidSphereWithMass(mass, 0.1))
+            for name, mass in (("cart", 2.0), ("load", 1.0))
+        )
+        plant.AddJoint(PrismaticJoint("cart_slider", plant.world_frame(), cart.body_frame(), [1, 0, 0]))
+        stops = -np.inf, 0.1
+        plant.AddJoint(PrismaticJoint("load_slider", cart.body_frame(), load.body_frame(), [1, 0, 0], *stops))
+
+
+@dataclass
+class Servo(World):
+    """A slider of 1 kg whose actuator has a PD controller and an effort limit of 2 N; u.force is its desired state.
+
+    It falls on a slope on which its weight pulls with ``pull``.
+    """
+
+    plant_config: MultibodyPlantConfig = field(default_factory=lambda: discrete(1e-3))
+    stiffness: float = 100.0
+    damping: float = 20.0
+    pull: float = 0.0
+
+    forces: ClassVar[int] = 2
+
+    def add_bodies(self, plant: MultibodyPlant, instance: ModelInstanceIndex) -> None:
+        plant.mutable_gravity_field().set_gravity_vector([self.pull, 0, 0])
+        body = plant.AddRigidBody("body", instance, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        slider = plant.AddJoint(PrismaticJoint("slider", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+        motor = plant.AddJointActuator("motor", slider, 2.0)
+        motor.set_controller_gains(PdControllerGains(p=self.stiffness, d=self.damping))
+
+    def add_world(self, builder: VirtualTestbedBuilder) -> None:
+        plant, _ = builder.add_plant(self.plant_config)
+        instance = plant.AddModelInstance("model")
+        self.add_bodies(plant, instance)
+        plant.Finalize()
+        builder.sim_actuator("force", plant.get_desired_state_input_port(instance))
 
 
 # -- with contact

@@ -53,14 +53,16 @@ class CompiledBatch:
         times: The sample times from the begin, shape (m,), in seconds.
         outputs: The recorded values by address, each of shape (n, m, ...).
         final: The vectors z of state and parameters at the end, shape (n, nz).
-        valid: Mask of the rollouts that equal the Diagram's, shape (n,): all state is finite all the time, and no joint
-            reaches a stop, which the compiled plant does not have, also in what is recorded at the samples.
+        valid: Mask of the rollouts that equal the Diagram's, shape (n,): all state is finite all the time, and each
+            step of a plant has converged, also in what is recorded at the samples.
+        reasons: Why and at which time a rollout ceased to equal the Diagram's; empty for those that are valid.
     """
 
     times: Array
     outputs: Mapping[str, Array]
     final: Array
     valid: NDArray[np.bool_]
+    reasons: tuple[str, ...]
 
 
 class CompiledRollouts:
@@ -249,12 +251,16 @@ class CompiledRollouts:
         else:
             with ThreadPoolExecutor(self._workers) as pool:
                 list(pool.map(run, chunks))
-        valid: NDArray[np.bool_] = np.all(recorded[:, :, -1] <= 0.0, axis=1)
+        # A doubt stays, and a sample sees more than the updates: the first one tells.
+        doubted: NDArray[np.bool_] = ~(recorded[:, :, -1] <= 0.0)
+        first = recorded[np.arange(len(z)), doubted.argmax(axis=1)]
+        reasons = tuple(self.walker.reason(doubt, time) for time, doubt in first[:, -2:].tolist())
         outputs = {
             name: recorded[:, :, columns].reshape(*recorded.shape[:2], *self.shapes[name])
             for name, columns in self.columns.items()
         }
-        return CompiledBatch(self.times, outputs, final, valid)
+        valid: NDArray[np.bool_] = np.all(~doubted, axis=1)
+        return CompiledBatch(self.times, outputs, final, valid, reasons)
 
     def expressions(self, values: Mapping[str, Any]) -> dict[str, casadi.MX]:
         """Return the outputs of one rollout as expressions, for CasADi's solvers and its derivatives.
@@ -329,7 +335,7 @@ class CompiledRollouts:
 
         It is interpreted, and has derivatives. z is made by `filled`, its entries are told by ``walker.place``; the
         other arguments are returned by `arguments`. The recorded values have a column per instant; the last one is
-        positive where z or they differ from the Diagram's.
+        positive where z or they differ from the Diagram's, since the time in the last but one.
         """
         return self.program(self.schedule_at(self.walker.context.get_time())).function
 

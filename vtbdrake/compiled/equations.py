@@ -132,11 +132,13 @@ class Equations(ABC):
             with their sizes; they are among those that vary.
         draws: The random numbers of an update, and other data, by the name under which `At.draw` returns them.
         may_be_infinite: Whether its discrete state may be infinite or NaN in a valid rollout.
+        doubtful: What is wrong where `doubt` is positive, as a sentence.
         agreement: The largest difference from the system's own state after one step, relative to the largest entry of
             its state, or to 1: what rounding makes, or where an iteration ends.
     """
 
     may_be_infinite = False
+    doubtful = "its equations do not hold"
     agreement = 1e-11
     extras: dict[str, int]
     draws: dict[str, Draw]

@@ -17,17 +17,21 @@ from vtbdrake.components.casadi_system.compiler import CompilerError
 from vtbdrake.components.casadi_system.rotations import roll_pitch_yaw_angles
 from vtbdrake.components.compiled_plant import AppliedForce, PlantDynamics, UnsupportedPlantError
 from vtbdrake.components.compiled_plant.contact import PointContact, contact_pairs
+from vtbdrake.components.compiled_plant.sap import Drive, SapSolver, stops
 from vtbdrake.state.multibody import POSE_ENTRIES, bodies, element_address, multibody_variables
 from vtbdrake.state.variables import A, Variable
 
 # What may act on a plant beside its actuation.
 _ACTING = ("applied_generalized_force", "applied_spatial_force")
 _NOT_ACTING = ("geometry_query",)
+# How the names of ports end that the plant and its model instances have.
+_TAKEN = ("actuation", "_desired_state")
 
 # The name of the present step, which several outputs share with the update.
 _STEP = "step"
 # Drake ends its iteration at an error of 1e-6 of the momentum, in which some velocities weigh little.
 _AGREEMENT_IN_CONTACT = 1e-4
+_AGREEMENT_OF_SOLVER = 1e-6  # Stops and drives make the problem linear in pieces: iterations end near its solution.
 
 
 class _Step(NamedTuple):
@@ -38,20 +42,28 @@ class _Step(NamedTuple):
         v: Velocities before it.
         vdot: The accelerations.
         v_next: Velocities after it.
-        forces: The contact forces, see `PointContact.step`; None without contact.
-        doubt: Positive where contact has not converged.
+        forces: The contact forces, see `SapSolver.step`.
+        efforts: The actuation of the drives.
+        doubt: Positive where the solver has not converged.
     """
 
     q: Expression
     v: Expression
     vdot: Expression
     v_next: Expression
-    forces: Expression | None
+    forces: Expression
+    efforts: Expression
     doubt: Expression
 
 
 class PlantEquations(Equations):
-    """A discrete plant that SAP steps, with point contact, and with its ports of state and reaction forces."""
+    """A discrete plant that SAP steps, with point contact, joint stops and PD controllers of actuators.
+
+    The state, the reaction forces and the net actuation are output. Without a C compiler, a step that feels a stop
+    counts as doubtful.
+    """
+
+    doubtful = "the solver of contact, stops and controllers did not converge"
 
     def __init__(self, system: MultibodyPlant, context: Context, varied: frozenset[str]) -> None:
         super().__init__(system, context, varied)
@@ -66,20 +78,32 @@ class PlantEquations(Equations):
         self._inputs = {v.address: int(np.prod(v.shape)) for v in _inputs(system)}
         reasons: list[str] = []
         with _noted(reasons):
-            self._model = PlantDynamics(system, bare, inputs=sorted(varied & self._inputs.keys()))
+            self._model = PlantDynamics(system, bare, inputs=sorted(varied & self._inputs.keys()), controllers=True)
         with _noted(reasons):
             pairs = contact_pairs(system, context)
         if reasons:
             raise refusal(system, f"is refused: {'; '.join(reasons)}")
-        self._contact: PointContact | None = None
-        if pairs:
-            self.agreement = _AGREEMENT_IN_CONTACT
-            try:
-                self._contact = PointContact(system, self._model, pairs)
-            except CompilerError as error:
-                raise refusal(system, f"has contact, whose solver is written in C: {error}") from None
+        self._contact = PointContact(system, self._model, pairs)
+        self._drives = _drives(system, context)
+        self._solver = self._new_solver()
         self.timing = Timing(system.time_step(), unrestricted=system.has_sampled_output_ports())
         self.extras = {address: self._inputs[address] for address in self._model.inputs}
+
+    def _new_solver(self) -> SapSolver | None:
+        """Return the solver, or None if the plant has nothing that needs it, or stops alone but no C compiler."""
+        pairs, drives = self._contact.pairs, self._drives
+        if not (pairs or drives or stops(self._plant)):
+            return None
+        try:
+            solver = SapSolver(self._plant, self._model, self._contact, list(drives.values()))
+        except CompilerError as error:
+            if pairs or drives:
+                part = "contact" if pairs else "PD controllers of actuators"
+                raise refusal(self._plant, f"has {part}, whose solver is written in C: {error}") from None
+            self.doubtful = "a joint reaches a stop, which is compiled only where there is a C compiler"
+            return None
+        self.agreement = _AGREEMENT_IN_CONTACT if pairs else _AGREEMENT_OF_SOLVER
+        return solver
 
     def output(self, port: str, at: At) -> Expression:
         x = at.state(0)
@@ -90,6 +114,8 @@ class PlantEquations(Equations):
                 return _part_of_state(self._plant, instance, x)
         if port == "reaction_forces" and not self._plant.has_sampled_output_ports():
             return self._reactions(at)
+        if port.endswith("net_actuation") and not self._plant.has_sampled_output_ports():
+            return self._net_actuation(port, at)
         raise refusal(
             self._plant, f"has the output port {port}, which is not compiled: use its state, or keep it in Drake"
         )
@@ -116,6 +142,17 @@ class PlantEquations(Equations):
 
         return at_place
 
+    def _net_actuation(self, port: str, at: At) -> Expression:
+        """Return the actuation within effort limits of the present step: the plant's, or a model instance's."""
+        u = self._model.limited(self._actuation(at))
+        u[[drive.u for drive in self._drives.values()]] = self._step(at).efforts
+        (u,) = self._substituted([u], at)
+        for instance in _instances(self._plant):
+            if port == f"{self._plant.GetModelInstanceName(instance)}_net_actuation":
+                indices = self._plant.GetJointActuatorIndices(instance)
+                return u[[self._plant.get_joint_actuator(index).input_start() for index in indices]]
+        return u
+
     def _step(self, at: At) -> _Step:
         """Return the present step, in terms of the model's inputs."""
         return at.shared(_STEP, lambda: self._new_step(at))
@@ -124,12 +161,16 @@ class PlantEquations(Equations):
         model, period = self._model, self._plant.time_step()
         # Columns, also of a plant without positions.
         q, v = casadi.vertsplit(at.state(0), [0, model.nq, model.nq + model.nv])
-        tau = self._torque(at)
-        if self._contact is None:
+        u = self._actuation(at)
+        tau = self._torque(at, u)
+        if self._solver is None:
             vdot = model.acceleration(q, v, tau, period=period)
-            return _Step(q, v, vdot, v + period * vdot, None, casadi.SX(-1))
-        v_next, forces, doubt = self._contact.step(q, v, tau)
-        return _Step(q, v, (v_next - v) / period, v_next, forces, doubt)
+            v_next = v + period * vdot
+            overrun = casadi.SX(model.overrun(q, v_next, period))
+            return _Step(q, v, vdot, v_next, casadi.SX(3, 0), casadi.SX(0, 1), overrun)
+        places = [drive.u for drive in self._drives.values()]
+        solution = self._solver.step(q, v, tau, desired=self._desired(at), feed_forward=u[places])
+        return _Step(q, v, (solution.v_next - v) / period, *solution)
 
     def update(self, at: At) -> dict[int, Expression]:
         step = self._step(at)
@@ -138,15 +179,13 @@ class PlantEquations(Equations):
         return {0: x_next}
 
     def doubt(self, at: At) -> Expression | None:
-        """Return a positive number if the present step counts and its contact does not converge, or a stop is felt.
+        """Return a positive number if the present step counts and its solver does not converge.
 
-        Joints' stops are not compiled: it is the overrun.
+        Without a solver, it is the overrun of the joints' stops.
         """
         if not at.is_shared(_STEP):
             return None
-        step = self._step(at)
-        overrun = self._model.overrun(step.q, step.v_next, self._plant.time_step())
-        (doubt,) = self._substituted([casadi.SX(casadi.fmax(overrun, step.doubt))], at)
+        (doubt,) = self._substituted([self._step(at).doubt], at)
         return doubt
 
     def compiled_in(self, context: Context) -> bytes:
@@ -169,23 +208,30 @@ class PlantEquations(Equations):
 
     def _touching(self, step: _Step) -> Iterator[AppliedForce]:
         """Yield the contact forces on bodies."""
-        if self._contact is not None:
-            for body in bodies(self._plant):
-                R, p = self._model.pose(body, step.q)
-                for point, force in self._contact.forces_on(int(body.index()), step.forces, step.q):
-                    yield AppliedForce(int(body.index()), R.T @ (point - p), casadi.vertcat(casadi.SX(3, 1), force))
+        for body in bodies(self._plant):
+            R, p = self._model.pose(body, step.q)
+            for point, force in self._contact.forces_on(int(body.index()), step.forces, step.q):
+                yield AppliedForce(int(body.index()), R.T @ (point - p), casadi.vertcat(casadi.SX(3, 1), force))
 
-    def _torque(self, at: At) -> Expression:
-        """Return the generalized force of everything that is connected to the plant."""
-        tau = self._model.actuation(self._actuation(at))
+    def _torque(self, at: At, u: Expression) -> Expression:
+        """Return the generalized force of everything that is connected to the plant, without what the drives make."""
+        tau = self._model.actuation(u)
         if at.is_connected("applied_generalized_force"):
             tau += at.input("applied_generalized_force")
         tau += self._model.generalized(at.state(0)[: self._model.nq], self._applied(at))
         for i in range(self._plant.num_input_ports()):
             name = self._plant.get_input_port(i).get_name()
-            if at.is_connected(name) and not (name.endswith("actuation") or name in (*_ACTING, *_NOT_ACTING)):
+            if at.is_connected(name) and not (name.endswith(_TAKEN) or name in (*_ACTING, *_NOT_ACTING)):
                 raise refusal(self._plant, f"has the input port {name} connected, which is not compiled")
         return tau
+
+    def _desired(self, at: At) -> Expression:
+        """Return the desired positions and velocities of the drives, shape (m, 2)."""
+        rows = []
+        for port, number in self._drives:
+            states = at.input(port)
+            rows.append(casadi.horzcat(states[number], states[states.numel() // 2 + number]))
+        return casadi.vertcat(casadi.SX(0, 2), *rows)
 
     def _actuation(self, at: At) -> Expression:
         """Return the actuation: the ports of the plant and of its model instances add up."""
@@ -220,6 +266,19 @@ def _inputs(plant: MultibodyPlant) -> Iterator[Variable]:
     for variable in multibody_variables(plant):
         if variable.kind == A and not variable.hidden:
             yield variable
+
+
+def _drives(plant: MultibodyPlant, context: Context) -> dict[tuple[str, int], Drive]:
+    """Return the actuators with a controller that has a desired state, by input port, and place among its actuators."""
+    drives = {}
+    for instance in _instances(plant):
+        port = f"{plant.GetModelInstanceName(instance)}_desired_state"
+        actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices(instance)]
+        if actuators and plant.GetInputPort(port).HasValue(context):
+            for number, actuator in enumerate(actuators):
+                if actuator.has_controller():
+                    drives[port, number] = Drive.of(actuator)
+    return drives
 
 
 def _instances(plant: MultibodyPlant) -> Iterator[ModelInstanceIndex]:

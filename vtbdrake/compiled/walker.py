@@ -72,7 +72,8 @@ class Walker:
     """A Diagram as expressions of z, the vector of all its discrete state and parameters, and of the time.
 
     The last entry of z is the doubt: it becomes positive when the rollout departs from the Diagram's, because a state
-    is not finite, or by `Equations.doubt`, and stays so.
+    is not finite, or by `Equations.doubt`, and stays so. It is then the number of a reason, and the entry before it is
+    the time.
 
     Attributes:
         diagram: The Diagram.
@@ -114,15 +115,17 @@ class Walker:
         self.timings = tuple(dict.fromkeys(when for each in self.equations.values() for when, _ in each.updates()))
         self.blocks = {(block.path, block.kind, block.name): block for block in self._layout()}
         self._extras = {self._address(b): b.entries for b in self.blocks.values() if b.kind == EXTRA}
-        self.size = max((block.entries.stop for block in self.blocks.values()), default=0) + 1
+        self.size = max((block.entries.stop for block in self.blocks.values()), default=0) + 2
         self.draws = tuple(self._reserved())
         self.noise = self.draws[-1][-1].stop if self.draws else 0
         self.fixed = tuple(self._fixed())
-        self._state = _indices(
-            block.entries
-            for block in self.blocks.values()
-            if block.kind == DISCRETE and not self.equations[block.path].may_be_infinite
-        )
+        self._states = {
+            path: _indices(b.entries for b in self.blocks.values() if b.kind == DISCRETE and b.path == path)
+            for path, equations in self.equations.items()
+            if not equations.may_be_infinite
+        }
+        self._reasons = [f"the state of {path} is not finite" for path in self.equations]
+        self._reasons += [f"{path}: {equations.doubtful}" for path, equations in self.equations.items()]
         self._all_fixed = _indices(entries for entries, _, _ in self.fixed)
         self._compiled_in = self._read_compiled_in(context)
 
@@ -302,8 +305,7 @@ class Walker:
                     if entries.start < entries.stop:
                         places.append(entries)
                         following[entries] = value
-        changed = following[np.intersect1d(_indices(places), self._state).tolist()]
-        following[-1] = casadi.fmax(z[-1], casadi.fmax(self._doubt(at), _doubt_about(changed)))
+        following[-2:] = self._doubt(at, z, following, _indices(places))
         return casadi.densify(following)
 
     def record(self, addresses: Sequence[str], at: InstantOutputs) -> tuple[dict[str, Expression], Expression]:
@@ -312,14 +314,41 @@ class Walker:
         Args:
             addresses: Addresses of the variables or of the output ports, or ``time``.
             at: The outputs at the instant.
+
+        Returns:
+            The values by address; and the time of the doubt and the doubt, shape (2, 1).
         """
         values = {address: self._value(address, at) for address in addresses}
-        return values, casadi.fmax(self._doubt(at), _doubt_about(at.z[self._state.tolist()]))
+        return values, self._doubt(at, at.z, at.z, np.arange(self.size))
 
-    def _doubt(self, at: InstantOutputs) -> Expression:
-        """Return the doubt at an instant; all that counts there has been written."""
-        doubts = [equations.doubt(at.of(path)) for path, equations in self.equations.items()]
-        return casadi.mmax(casadi.vertcat(at.z[-1], *(doubt for doubt in doubts if doubt is not None)))
+    def reason(self, doubt: float, time: float) -> str:
+        """Return the reason that a rollout is not the Diagram's, or an empty text if it is.
+
+        Args:
+            doubt: The number of the reason.
+            time: When it was noticed, in s.
+        """
+        return f"{self._reasons[round(doubt) - 1]} at t = {time:.9g} s" if doubt > 0.0 else ""
+
+    def _doubt(self, at: InstantOutputs, earlier: Expression, following: Expression, entries: Array) -> Expression:
+        """Return the time of the doubt and the doubt, shape (2, 1); all that counts at the instant has been written.
+
+        Args:
+            at: The outputs at the instant.
+            earlier: The vector z with a doubt that there may be already.
+            following: The vector z with the entries that are checked.
+            entries: The places of these entries.
+        """
+        doubt = casadi.SX(0)
+        for number, (path, equations) in enumerate(self.equations.items(), 1):
+            checked = np.intersect1d(entries, self._states.get(path, np.arange(0))).tolist()
+            total = casadi.sum1(following[checked])
+            doubt = casadi.if_else(casadi.fabs(total) < np.inf, doubt, number)
+            about = equations.doubt(at.of(path))
+            if about is not None:
+                doubt = casadi.if_else(about <= 0, doubt, number + len(self.equations))
+        is_new = casadi.logic_and(earlier[-1] <= 0, doubt > 0)
+        return casadi.if_else(is_new, casadi.vertcat(at.time, doubt), earlier[-2:])
 
     def _value(self, address: str, at: InstantOutputs) -> Expression:
         if address == "time":
@@ -656,11 +685,6 @@ class _Reading(At):
         if isinstance(port, int):
             return port
         return int(self._evaluation.walker.equations[self._path].system.GetInputPort(port).get_index())
-
-
-def _doubt_about(state: Expression) -> Expression:
-    """Return infinity if an entry of the state is not finite, else 0."""
-    return casadi.if_else(casadi.fabs(casadi.sum1(casadi.vec(state))) < np.inf, 0.0, np.inf)
 
 
 def _indices(places: Iterable[slice]) -> Array:

@@ -42,8 +42,8 @@ class CompiledExecutor(Executor):
 
     The testbed is compiled for a task at the first rollout, and compared with Drake's then; machine code is kept for
     the next time. Qualities that work with CasADi's numbers (sums, products, numpy's functions; no branches) are
-    compiled, too; others get the recorded samples. A rollout that the compiled testbed cannot make (a joint reaches its
-    stop, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was made.
+    compiled, too; others get the recorded samples. A rollout that the compiled testbed cannot make (contact does not
+    converge, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was made.
     Several threads may call it at once, if that is true of ``drake``.
 
     Args:
@@ -338,6 +338,8 @@ class _CompiledTask:
         """Yield (row, result) of the rollouts of a batch, except those that Drake makes: invalid, or f fails."""
         task, valid, samples = self._task, batch.valid.copy(), []
         counts = np.full(len(points), len(batch.times))
+        for row in np.flatnonzero(~valid).tolist():
+            _log.info("a rollout is simulated in Drake: %s", batch.reasons[row])
         for k, measure in enumerate(self._measures):
             samples.append(self._samples(k, measure, batch.outputs, counts, valid))
             if k == 0 and task.threshold is not None and not task.run_on:

@@ -123,6 +123,8 @@ class PlantDynamics:
     Args:
         plant: The finalized plant.
         context: Its own Context, with the values that are compiled in.
+        controllers: Whether actuators may have PD controllers, whose actuation is then left to a solver, with their
+            feed-forward.
 
     Attributes:
         nq: Number of positions.
@@ -132,9 +134,11 @@ class PlantDynamics:
         values: What the Context held for them, by address, flat.
     """
 
-    def __init__(self, plant: MultibodyPlant, context: Context, *, inputs: Sequence[str] = ()) -> None:
+    def __init__(
+        self, plant: MultibodyPlant, context: Context, *, inputs: Sequence[str] = (), controllers: bool = False
+    ) -> None:
         """Read the plant through its own Context; see `plant_dynamics` for arguments and errors."""
-        tree = read_links(plant, context, inputs)
+        tree = read_links(plant, context, inputs, controllers=controllers)
         self._links = tree.links
         self._symbols = tree.symbols
         self._mounts = tree.mounts
@@ -146,6 +150,7 @@ class PlantDynamics:
         self._actuation = constant(plant.MakeActuationMatrix())
         actuators = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
         self._effort = {actuator.input_start(): actuator.effort_limit() for actuator in actuators}
+        self._controlled = {actuator.input_start() for actuator in actuators if actuator.has_controller()}
         self._stops = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         self.nq, self.nv, self.nu = plant.num_positions(), plant.num_velocities(), plant.num_actuated_dofs()
         self.inputs = tuple(tree.symbols)
@@ -343,10 +348,16 @@ class PlantDynamics:
         return casadi.mmax(casadi.vertcat(-np.inf, *beyond))
 
     def actuation(self, u: Expression) -> Expression:
-        """Return tau of the actuation u, which is held within the actuators' effort limits, as Drake does."""
+        """Return tau of the actuation u, in which actuators with PD controllers do nothing; see `limited`."""
+        limited = casadi.vertsplit(self.limited(u))
+        uncontrolled = [casadi.SX(1, 1) if i in self._controlled else limited[i] for i in range(self.nu)]
+        return self._actuation @ casadi.vertcat(casadi.SX(0, 1), *uncontrolled)
+
+    def limited(self, u: Expression) -> Expression:
+        """Return the actuation u held within the actuators' effort limits, as Drake does, shape (nu, 1)."""
         limits = [self._effort[i] for i in range(self.nu)]
         limited = [clamp(u[i], -limit, limit) if np.isfinite(limit) else u[i] for i, limit in enumerate(limits)]
-        return self._actuation @ casadi.vertcat(casadi.SX(0, 1), *limited)
+        return casadi.vertcat(casadi.SX(0, 1), *limited)
 
     # -- kinematics
 

@@ -101,7 +101,9 @@ class LinkTree:
     rounding: float
 
 
-def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = ()) -> LinkTree:
+def read_links(
+    plant: MultibodyPlant, context: Context, inputs: Sequence[str] = (), *, controllers: bool = False
+) -> LinkTree:
     """Return the links of a finalized plant.
 
     Args:
@@ -110,12 +112,13 @@ def read_links(plant: MultibodyPlant, context: Context, inputs: Sequence[str] = 
         inputs: Addresses within the plant of the values that become symbols: ``mass``, ``center_of_mass``
             and ``inertia`` of a body, ``damping`` of a joint, ``pose`` of a frame that carries a joint, and
             ``rotor_inertia`` of an actuator, as in `multibody_variables`.
+        controllers: Whether actuators may have PD controllers.
 
     Raises:
         UnsupportedPlantError: The plant has contact, loops, springs, joints of other types, and so on.
         ValueError: An input is not among the addresses, or given twice.
     """
-    reasons = list(_unsupported(plant, context))
+    reasons = list(_unsupported(plant, context, controllers=controllers))
     if reasons:
         raise UnsupportedPlantError(f"the plant cannot be compiled: {'; '.join(reasons)}.")
     return _LinkReader(plant, context, inputs).tree()
@@ -282,7 +285,7 @@ class _LinkReader:
         return element_address(self._plant, element)
 
 
-def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
+def _unsupported(plant: MultibodyPlant, context: Context, *, controllers: bool) -> Iterator[str]:
     """Yield the parts of the plant that cannot be compiled."""
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -293,7 +296,7 @@ def _unsupported(plant: MultibodyPlant, context: Context) -> Iterator[str]:
     drives: dict[JointIndex, list[str]] = {}
     for index in plant.GetJointActuatorIndices():
         actuator = plant.get_joint_actuator(index)
-        if actuator.has_controller():
+        if actuator.has_controller() and not controllers:
             yield f"the actuator {actuator.name()} has a PD controller"
         # By index: joints of two model instances may have one name.
         drives.setdefault(actuator.joint().index(), []).append(actuator.name())

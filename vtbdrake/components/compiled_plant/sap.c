@@ -1,8 +1,8 @@
-/* One step of a plant with point contact, by the SAP solver of Drake (Castro, Permenter, Han 2022, arXiv:2110.10107).
+/* One step of a discrete plant, by the SAP solver of Drake (Castro, Permenter, Han 2022, arXiv:2110.10107).
 
 The velocities v after the step minimize
 
-    1/2 (v - v*)' A (v - v*) + sum over contacts l(J v),
+    1/2 (v - v*)' A (v - v*) + sum over contacts l(J v) + sum over axes l(v_i),
 
 by Newton's method with an exact line search. A = M + dt D is factored as L' L along the tree of velocities
 (Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: PARENT tells the velocity next to each on the way to the
@@ -13,22 +13,34 @@ root, and each contact moves with velocities of one way. Contact models are thos
 
 The frame of a contact has its z along the normal, from body 1 into body 2; velocities are those of 2 against 1.
 
-The text before this one defines NAME; NV, NC: the numbers of velocities and contacts; LAGGED: 0 or 1; DT: the time step
-(s); BETA: the near-rigid threshold; VS: the stiction tolerance (m/s); PARENT[NV]; COUNT[NC] and COLUMNS[NC][NV]: the
-velocities that move a contact.
+An axis is an impulse on one velocity that falls linearly with it, between two bounds. Stops of joints (Drake's
+SapLimitConstraint) and PD controllers of actuators with their effort limits (SapPdControllerConstraint) are axes.
+
+The text before this one defines NAME; NV, NC, NS, ND: the numbers of velocities, contacts, joints with stops and
+actuators with a controller; LAGGED: 0 or 1; DT: the time step (s); BETA: the near-rigid threshold; VS: the stiction
+tolerance (m/s); PARENT[NV]; COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; STOP[NS]: the velocity of
+a joint with stops, LOWER[NS] and UPPER[NS] (rad or m); DRIVE[ND]: the velocity of an actuator, KP[ND], KD[ND] and
+EFFORT[ND] (N m or N). Tables have a row more, because C has no empty ones.
 
 Arguments, by columns: A (NV, NV), p* = A v* (NV), the velocities before the step (NV), J (3 NC, NV) in the world, normals
 (3, NC), distances (NC, m, below 0 in contact), stiffness (NC, N/m), dissipation (NC: SAP's time in s, or LAGGED's in s/m),
-friction (NC).
-Results: v (NV), forces on bodies 2 in the world (3, NC, N), and a doubt: 1 where the iteration did not converge, else 0. */
+friction (NC); the positions of the joints with stops (NS); of the controllers KP (q_d - q) + KD v_d (ND), with the
+position before the step, and the feed-forward actuation (ND).
+Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of the controllers (ND, N m or N); and a doubt:
+1 where the iteration did not converge, else 0. */
 
 #include <math.h>
 #include <string.h>
 
+#define ARGUMENTS 12
 #define MOST_ITERATIONS 100
 #define MOST_STEPS 60
 #define TOLERANCE 1e-9
+#define DRAKES_TOLERANCE 1e-6
 #define SIGMA 1e-3
+/* Of stops and controllers, in Drake: the near-rigid threshold, and the stiffness of a stop (N/m or N m/rad). */
+#define NEAR_RIGID (0.1 * 0.1 / (4.0 * M_PI * M_PI))
+#define STOP_STIFFNESS 1e12
 
 typedef struct {
     int at;                     /* its number among all */
@@ -38,6 +50,22 @@ typedef struct {
     double Rt, Rn, vn_hat;      /* SAP */
     double n0, eps;             /* LAGGED */
 } Contact;
+
+typedef struct {
+    int v;                      /* the velocity that it acts on */
+    double at_rest, slope;      /* the impulse is at_rest - slope v_v, */
+    double low, high;           /* but within these */
+    int is_near_rigid;          /* whether the impulse grows with A_vv, */
+    double feed_forward;        /* but for this part */
+    int number;                 /* of the joint with stops, or of the controller */
+} Axis;
+
+typedef struct {
+    double A[NV][NV], v_star[NV], scale[NV]; /* scale is 1 / diag A */
+    Contact contacts[NC + 1];
+    Axis axes[2 * NS + ND + 1];
+    int contact_count, axis_count;
+} Problem;
 
 /* Factor H = L' L in place, along the tree. Return 0 if H is not positive definite. */
 static int factor(double (*H)[NV]) {
@@ -143,7 +171,17 @@ static void impulse(const Contact *c, const double *vc, double *g, double (*G)[3
 #endif
 }
 
-/* What does not change in the iteration; scale is 1 / diag A, v0 the velocities before the step. */
+/* The impulse of an axis at its velocity v, and the slope with which it falls. */
+static double axis_impulse(const Axis *a, double v, double *slope) {
+    double g = a->at_rest - a->slope * v;
+    *slope = 0.0;
+    if (g <= a->low) return a->low;
+    if (g >= a->high) return a->high;
+    *slope = a->slope;
+    return g;
+}
+
+/* What does not change in the iteration; v0 are the velocities before the step. */
 static void prepare(Contact *c, const double *scale, const double *v0) {
     const int *columns = COLUMNS[c->at], count = COUNT[c->at];
     double square = 0.0;
@@ -171,15 +209,58 @@ static void prepare(Contact *c, const double *scale, const double *v0) {
 #endif
 }
 
-/* The gradient of the cost at v, and its Hessian along the tree; the scale of the momentum's parts. */
-static double gradient(double (*A)[NV], const double *v, const double *v_star, const double *scale, const Contact *contacts,
-                       int n, double *grad, double (*H)[NV]) {
+static void add_contacts(Problem *p, const double *const *in, const double *v0) {
+    for (int at = 0; at < NC; ++at) {
+        if (!(in[5][at] < 0.0)) continue;
+        Contact *c = p->contacts + p->contact_count++;
+        *c = (Contact){.at = at, .phi = in[5][at], .k = in[6][at], .d = in[7][at], .mu = in[8][at]};
+        frame(in[4] + 3 * at, c->R_WC);
+        for (int m = 0; m < COUNT[at]; ++m) {
+            int i = COLUMNS[at][m];
+            const double *J = in[3] + 3 * at + 3 * NC * i;
+            for (int r = 0; r < 3; ++r) c->J[r][i] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
+        }
+        prepare(c, p->scale, v0);
+    }
+}
+
+/* Add the stops that lie within twice the motion of a step, as Drake does; its dissipation time is the step. */
+static void add_stops(Problem *p, const double *v0, const double *q) {
+    for (int s = 0; s < NS; ++s) {
+        int i = STOP[s];
+        double reach = 2.0 * DT * fmax(fabs(v0[i]), fabs(p->v_star[i]));
+        double near_rigid = NEAR_RIGID * p->scale[i], R = fmax(near_rigid, 1.0 / (DT * STOP_STIFFNESS * (2.0 * DT)));
+        Axis stop = {.v = i, .slope = 1.0 / R, .is_near_rigid = R == near_rigid, .number = s};
+        if (LOWER[s] >= q[s] - reach) {
+            stop.at_rest = (LOWER[s] - q[s]) / (2.0 * DT) / R, stop.low = 0.0, stop.high = INFINITY;
+            p->axes[p->axis_count++] = stop;
+        }
+        if (UPPER[s] <= q[s] + reach) {
+            stop.at_rest = (UPPER[s] - q[s]) / (2.0 * DT) / R, stop.low = -INFINITY, stop.high = 0.0;
+            p->axes[p->axis_count++] = stop;
+        }
+    }
+}
+
+/* Add the controllers; gains that the step does not resolve are scaled down to near-rigid ones, as in Drake. */
+static void add_drives(Problem *p, const double *pull, const double *feed_forward) {
+    for (int d = 0; d < ND; ++d) {
+        int i = DRIVE[d];
+        double gain = DT * (DT * KP[d] + KD[d]), share = fmin(1.0, 1.0 / (gain * NEAR_RIGID * p->scale[i]));
+        p->axes[p->axis_count++] = (Axis){
+            .v = i, .at_rest = DT * (share * pull[d] + feed_forward[d]), .slope = share * gain, .low = -DT * EFFORT[d],
+            .high = DT * EFFORT[d], .is_near_rigid = share < 1.0, .feed_forward = DT * feed_forward[d], .number = d};
+    }
+}
+
+/* The gradient of the cost at v, and its Hessian along the tree; return the square of the impulses' norm. */
+static double gradient(Problem *p, const double *v, double *grad, double (*H)[NV]) {
     double d[NV], impulses[NV] = {0.0}, square = 0.0;
-    for (int i = 0; i < NV; ++i) d[i] = v[i] - v_star[i];
-    multiply(A, d, grad);
-    memcpy(H, A, NV * NV * sizeof(double));
-    for (int a = 0; a < n; ++a) {
-        const Contact *c = contacts + a;
+    for (int i = 0; i < NV; ++i) d[i] = v[i] - p->v_star[i];
+    multiply(p->A, d, grad);
+    memcpy(H, p->A, sizeof p->A);
+    for (int a = 0; a < p->contact_count; ++a) {
+        const Contact *c = p->contacts + a;
         const int *columns = COLUMNS[c->at], count = COUNT[c->at];
         double vc[3], g[3], G[3][3], W[3][NV];
         contact_velocity(c, v, vc);
@@ -195,35 +276,46 @@ static double gradient(double (*A)[NV], const double *v, const double *v_star, c
                 H[i][columns[l]] += c->J[0][i] * W[0][l] + c->J[1][i] * W[1][l] + c->J[2][i] * W[2][l];
             }
     }
+    for (int a = 0; a < p->axis_count; ++a) {
+        int i = p->axes[a].v;
+        double slope;
+        impulses[i] += axis_impulse(p->axes + a, v[i], &slope);
+        H[i][i] += slope;
+    }
     for (int i = 0; i < NV; ++i) {
         grad[i] -= impulses[i];
-        square += impulses[i] * impulses[i] * scale[i];
+        square += impulses[i] * impulses[i] * p->scale[i];
     }
     return square;
 }
 
-/* The step along p at which the cost is least: Newton's method within a bracket. */
-static double line_search(double (*A)[NV], const double *v, const double *v_star, const double *p, const double *grad,
-                          const Contact *contacts, int n) {
-    double Ap[NV], d[NV], begin[NC][3], along[NC][3];
-    multiply(A, p, Ap);
-    for (int i = 0; i < NV; ++i) d[i] = v[i] - v_star[i];
-    for (int a = 0; a < n; ++a) {
-        contact_velocity(contacts + a, v, begin[a]);
-        contact_velocity(contacts + a, p, along[a]);
+/* The step along a direction at which the cost is least: Newton's method within a bracket. */
+static double line_search(Problem *p, const double *v, const double *direction, const double *grad) {
+    double Ap[NV], d[NV], begin[NC + 1][3], along[NC + 1][3];
+    multiply(p->A, direction, Ap);
+    for (int i = 0; i < NV; ++i) d[i] = v[i] - p->v_star[i];
+    for (int a = 0; a < p->contact_count; ++a) {
+        contact_velocity(p->contacts + a, v, begin[a]);
+        contact_velocity(p->contacts + a, direction, along[a]);
     }
-    double pAp = dot(p, Ap), dAp = dot(d, Ap), slope0 = fabs(dot(grad, p));
+    double pAp = dot(direction, Ap), dAp = dot(d, Ap), slope0 = fabs(dot(grad, direction));
     double step = 1.0, low = 0.0, high = INFINITY;
     for (int k = 0; k < MOST_STEPS; ++k) {
         double slope = dAp + step * pAp, curvature = pAp;
-        for (int a = 0; a < n; ++a) {
+        for (int a = 0; a < p->contact_count; ++a) {
             double vc[3], g[3], G[3][3];
             for (int r = 0; r < 3; ++r) vc[r] = begin[a][r] + step * along[a][r];
-            impulse(contacts + a, vc, g, G);
+            impulse(p->contacts + a, vc, g, G);
             for (int r = 0; r < 3; ++r) {
                 slope -= g[r] * along[a][r];
                 for (int s = 0; s < 3; ++s) curvature += along[a][r] * G[r][s] * along[a][s];
             }
+        }
+        for (int a = 0; a < p->axis_count; ++a) {
+            int i = p->axes[a].v;
+            double falls;
+            slope -= axis_impulse(p->axes + a, v[i] + step * direction[i], &falls) * direction[i];
+            curvature += falls * direction[i] * direction[i];
         }
         if (fabs(slope) <= 1e-8 * slope0) break;
         if (slope > 0.0) high = step;
@@ -236,75 +328,80 @@ static double line_search(double (*A)[NV], const double *v, const double *v_star
     return step;
 }
 
+/* Iterate from v; return whether it converges. */
+static int minimize(Problem *p, double *v) {
+    double H[NV][NV], grad[NV], direction[NV], A_v[NV];
+    int stalled = 0;
+    for (int k = 0; k < MOST_ITERATIONS; ++k) {
+        double impulses = gradient(p, v, grad, H), residual = 0.0, momentum = 0.0;
+        multiply(p->A, v, A_v);
+        for (int i = 0; i < NV; ++i) {
+            residual += grad[i] * grad[i] * p->scale[i];
+            momentum += A_v[i] * A_v[i] * p->scale[i];
+        }
+        if (!isfinite(momentum + impulses)) return 0;
+        double tolerance = stalled ? DRAKES_TOLERANCE : TOLERANCE;
+        if (sqrt(residual) <= 1e-14 + tolerance * sqrt(fmax(momentum, impulses))) return 1;
+        if (stalled || !factor(H)) return 0;
+        for (int i = 0; i < NV; ++i) direction[i] = -grad[i];
+        solve(H, direction);
+        double step = line_search(p, v, direction, grad), change = 0.0, size = 0.0;
+        for (int i = 0; i < NV; ++i) {
+            v[i] += step * direction[i];
+            change += step * direction[i] * step * direction[i] * p->A[i][i];
+            size += v[i] * v[i] * p->A[i][i];
+        }
+        stalled = change <= 1e-28 * size; /* as near as rounding allows */
+    }
+    return 0;
+}
+
+static void write_forces(const Problem *p, const double *v, double *forces) {
+    memset(forces, 0, 3 * NC * sizeof *forces);
+    for (int a = 0; a < p->contact_count; ++a) {
+        const Contact *c = p->contacts + a;
+        double vc[3], g[3], G[3][3];
+        contact_velocity(c, v, vc);
+        impulse(c, vc, g, G);
+        for (int r = 0; r < 3; ++r)
+            forces[3 * c->at + r] = (c->R_WC[r][0] * g[0] + c->R_WC[r][1] * g[1] + c->R_WC[r][2] * g[2]) / DT;
+    }
+}
+
+/* Set up the problem of one step from the arguments, and solve it; return whether that worked. */
+static int take_step(const double **arg, Problem *p, double *v) {
+    static const double none[3 * NC * NV + NV * NV + NS + ND + 1] = {0.0};
+    const double *in[ARGUMENTS];
+    for (int i = 0; i < ARGUMENTS; ++i) in[i] = arg[i] ? arg[i] : none; /* CasADi's way to say that all are zero */
+    double L[NV][NV];
+    p->contact_count = p->axis_count = 0;
+    for (int i = 0; i < NV; ++i) {
+        for (int j = 0; j < NV; ++j) p->A[i][j] = in[0][i + NV * j];
+        p->scale[i] = 1.0 / p->A[i][i];
+    }
+    memcpy(L, p->A, sizeof L);
+    memcpy(p->v_star, in[1], sizeof p->v_star);
+    memcpy(v, in[2], sizeof p->v_star);
+    if (!factor(L)) return 0;
+    solve(L, p->v_star);
+    add_contacts(p, in, in[2]);
+    add_stops(p, in[2], in[9]);
+    add_drives(p, in[10], in[11]);
+    if (p->contact_count + p->axis_count) return minimize(p, v); /* from the velocities before the step, as Drake */
+    memcpy(v, p->v_star, sizeof p->v_star);
+    return 1;
+}
+
 int NAME(const double **arg, double **res, long long int *iw, double *w, int mem) {
     (void)iw, (void)w, (void)mem;
-    static const double one = 1.0, zero = 0.0;
-    double A[NV][NV], L[NV][NV], H[NV][NV], v_star[NV], v[NV], scale[NV], grad[NV], p[NV], A_v[NV];
-    static const double none[3 * NC * NV + NV * NV] = {0.0};
-    const double *in[9];
-    for (int i = 0; i < 9; ++i) in[i] = arg[i] ? arg[i] : none; /* CasADi's way to say that all are zero */
-    for (int i = 0; i < NV; ++i) {
-        for (int j = 0; j < NV; ++j) A[i][j] = in[0][i + NV * j];
-        scale[i] = 1.0 / A[i][i];
-    }
-    memcpy(L, A, sizeof L);
-    memcpy(v_star, in[1], sizeof v_star);
-    int good = factor(L);
-    if (good) solve(L, v_star);
-    memcpy(v, v_star, sizeof v);
-
-    Contact contacts[NC];
-    int n = 0;
-    for (int at = 0; at < NC; ++at) {
-        if (!(in[5][at] < 0.0)) continue;
-        Contact *c = contacts + n++;
-        *c = (Contact){.at = at, .phi = in[5][at], .k = in[6][at], .d = in[7][at], .mu = in[8][at]};
-        frame(in[4] + 3 * at, c->R_WC);
-        for (int m = 0; m < COUNT[at]; ++m) {
-            int i = COLUMNS[at][m];
-            const double *J = in[3] + 3 * at + 3 * NC * i;
-            for (int r = 0; r < 3; ++r) c->J[r][i] = c->R_WC[0][r] * J[0] + c->R_WC[1][r] * J[1] + c->R_WC[2][r] * J[2];
-        }
-        prepare(c, scale, in[2]);
-    }
-    int converged = good && n == 0;
-    if (good && n) {
-        memcpy(v, in[2], sizeof v); /* where Drake begins */
-        for (int k = 0; k < MOST_ITERATIONS; ++k) {
-            double impulses = gradient(A, v, v_star, scale, contacts, n, grad, H), residual = 0.0, momentum = 0.0;
-            multiply(A, v, A_v);
-            for (int i = 0; i < NV; ++i) {
-                residual += grad[i] * grad[i] * scale[i];
-                momentum += A_v[i] * A_v[i] * scale[i];
-            }
-            converged = sqrt(residual) <= 1e-14 + TOLERANCE * sqrt(fmax(momentum, impulses));
-            if (converged || !factor(H)) break;
-            for (int i = 0; i < NV; ++i) p[i] = -grad[i];
-            solve(H, p);
-            double step = line_search(A, v, v_star, p, grad, contacts, n), change = 0.0, size = 0.0;
-            for (int i = 0; i < NV; ++i) {
-                v[i] += step * p[i];
-                change += step * p[i] * step * p[i] * A[i][i];
-                size += v[i] * v[i] * A[i][i];
-            }
-            if (change <= 1e-28 * size) { /* as near as rounding allows */
-                converged = 1;
-                break;
-            }
-        }
-    }
+    Problem p;
+    double v[NV], slope;
+    int converged = take_step(arg, &p, v);
     if (res[0]) memcpy(res[0], v, sizeof v);
-    if (res[1]) {
-        memset(res[1], 0, 3 * NC * sizeof(double));
-        for (int a = 0; a < n; ++a) {
-            const Contact *c = contacts + a;
-            double vc[3], g[3], G[3][3];
-            contact_velocity(c, v, vc);
-            impulse(c, vc, g, G);
-            for (int r = 0; r < 3; ++r)
-                res[1][3 * c->at + r] = (c->R_WC[r][0] * g[0] + c->R_WC[r][1] * g[1] + c->R_WC[r][2] * g[2]) / DT;
-        }
-    }
-    if (res[2]) *res[2] = converged ? zero : one;
+    if (res[1]) write_forces(&p, v, res[1]);
+    const Axis *drives = p.axes + p.axis_count - ND; /* the last axes */
+    for (int d = 0; res[2] && d < ND; ++d)
+        res[2][d] = p.axis_count ? axis_impulse(drives + d, v[drives[d].v], &slope) / DT : 0.0;
+    if (res[3]) *res[3] = converged ? 0.0 : 1.0;
     return 0;
 }
