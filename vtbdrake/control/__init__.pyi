@@ -16,6 +16,8 @@ from .fallback import Zero as Zero
 from .fallback import gravity_compensation as gravity_compensation
 from .guards import Guards as Guards
 from .guards import LoopCondition as LoopCondition
+from .inbox import Inbox as Inbox
+from .limits import Bounds as Bounds
 from .realtime import RealTime as RealTime
 from .realtime import RealTimeError as RealTimeError
 from .realtime import RunawayError as RunawayError

@@ -15,13 +15,14 @@ from typing import Any
 
 from vtbdrake.common.failures import FAILURES
 from vtbdrake.control.bridge import Bridge, Reports
+from vtbdrake.control.inbox import Inbox
 from vtbdrake.control.limits import Bounds
+from vtbdrake.control.message_order import CommandOrder, MachineOrder
 from vtbdrake.control.received_signal import ReceivedSignal
 from vtbdrake.control.robot_mode import RobotMode
 from vtbdrake.lcm.connections import Handler, LcmLink
 from vtbdrake.lcm.hub import KEEP_PREFIX, STATUS_CHANNEL, TAKE_PREFIX, HubStatistics
 from vtbdrake.lcm.maps import LcmMap
-from vtbdrake.lcm.message_order import CommandOrder, MachineOrder, MessageOrder
 from vtbdrake.lcm.messages import MalformedError
 from vtbdrake.testbed import Interface, Signal
 
@@ -345,21 +346,18 @@ class ChannelReader:
         self._map = map
         self._names_sender = several_senders and map.sender is not None
         self._decode = map.decoder(signals)
-        self._signals = [(signal.name, received[signal.name], Bounds(signal)) for signal in signals]
-        for _, received_signal, bounds in self._signals:
-            received_signal.bounds = bounds
         order = CommandOrder if several_senders else MachineOrder
-        self._order: MessageOrder = order(reorder_window)
+        self._inbox = Inbox(signals, received, order(reorder_window))
         self._rejected = rejected
 
     @property
     def clock_jumps(self) -> int:
         """Return the number of accepted jumps of a sender's time, back or ahead."""
-        return self._order.clock_jumps
+        return self._inbox.order.clock_jumps
 
     def expect_gap(self) -> None:
         """Accept the next message however far ahead it is: after a loss of the bus, messages are missing."""
-        self._order.expect_gap()
+        self._inbox.order.expect_gap()
 
     def receive(self, channel: str, data: bytes) -> None:
         """Handle one message.
@@ -368,28 +366,17 @@ class ChannelReader:
             channel: Name of the channel, which is always the reader's.
             data: The bytes of the message.
         """
-        now, sender, problem = self._clock(), "", ""
+        now, sender = self._clock(), ""
         try:
             sent, values = self._decode(data)
             if self._names_sender:
                 sender = self._map.sender_of(data)
-            problem = self._order.problem(sent, now, sender)
         except MalformedError as error:
-            problem = error.reason
+            reasons = self._inbox.reject(error.reason)
         except FAILURES:
-            problem = "decode"
-        reasons: dict[str, str] = {}
-        accepted = False
-        for name, received, bounds in self._signals:
-            if reason := problem or (bounds.violation(values[name]) if name in values else "missing"):
-                beyond = not problem and reason in ("limits", "not finite")
-                received.reject(reason, values[name] if beyond else None)
-                reasons[name] = reason
-            else:
-                received.accept(values[name], now, sent)
-                accepted = True
-        if accepted:
-            self._order.note(sent, now, sender)
+            reasons = self._inbox.reject("decode")
+        else:
+            reasons = self._inbox.take(values, sent=sent, now=now, sender=sender)
         if reasons and self._rejected is not None:
             self._rejected(sender, reasons)
 

@@ -8,6 +8,9 @@ from .assertions import assert_replays as assert_replays
 from .assertions import assert_same_motion as assert_same_motion
 from .assertions import assert_settles as assert_settles
 from .assertions import assert_succeeds as assert_succeeds
+from .bridge_check import BridgeCheckError as BridgeCheckError
+from .bridge_check import MachineEnd as MachineEnd
+from .bridge_check import check_bridge as check_bridge
 from .lock_step import LockStep as LockStep
 from .lock_step import MachineBridge as MachineBridge
 from .mutants import Mutant as Mutant

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from vtbdrake.lcm.message_order import LATEST_TIME, MAX_SENDERS, CommandOrder, MachineOrder, MessageOrder
+from vtbdrake.control.message_order import LATEST_TIME, MAX_SENDERS, CommandOrder, MachineOrder, MessageOrder
 
 WINDOW = 0.1
 
