@@ -7,9 +7,9 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vtbdrake.control.message_order import LONGEST_SENDER
 from vtbdrake.lcm.lcm_types.lcmt_vtb_command import lcmt_vtb_command
 from vtbdrake.lcm.maps import VectorMap, vector_map
-from vtbdrake.control.message_order import LONGEST_SENDER
 
 # The time of day minus the time of the monotonic clock, in microseconds: a clock that is set does not change the order.
 _EPOCH = (time.time_ns() - time.monotonic_ns()) // 1000

@@ -1,5 +1,8 @@
 """The public names about logs; `replay` and `export` are modules."""
 
+from .lerobot_writer import LeRobotEpisode as LeRobotEpisode
+from .lerobot_writer import episode_times as episode_times
+from .lerobot_writer import write_lerobot as write_lerobot
 from .log import Log as Log
 from .log import Series as Series
 from .log_format import LogError as LogError

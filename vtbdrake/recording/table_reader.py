@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from math import pi
 from pathlib import Path
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
-from vtbdrake.common.extras import extra_module
+from vtbdrake.recording.lerobot_format import INFO
+from vtbdrake.recording.lerobot_reader import LeRobotTable
 from vtbdrake.recording.log import Log, Series, checked_series
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.message_reader import BagTable, McapTable, MessageTable
+from vtbdrake.recording.parquet_reader import ParquetTable
 from vtbdrake.recording.text_reader import read_text
 
 Table = Mapping[str, Any]
@@ -57,9 +59,10 @@ def read_table(
         source: A file: text (.csv, .dat, .txt; separated by commas, semicolons, tabs or blanks), .npz, .parquet; or a
             recording of messages: .mcap (JSON, protobuf or ROS 2), or a bag of ROS (the folder of a rosbag2, .db3,
             .bag), whose columns are ``topic.field``, ``topic.field.field[2]`` and ``topic.log_time``: only the topics
-            that are asked for are decoded. For any other format, the columns themselves. Without a line of names, the
-            columns of a text are "0", "1", ... With pyarrow (the extra ``recording``), a text is read ten times as
-            fast.
+            that are asked for are decoded; or the folder of a data set of LeRobot (v3.0), whose columns are ``time``,
+            its features, and their entries by name (``observation.state.elbow``). For any other format, the columns
+            themselves. Without a line of names, the columns of a text are "0", "1", ... With pyarrow (the extra
+            ``recording``), a text is read ten times as fast.
         sense: For each sensor signal, its column, or the columns of its entries. ``name[2]`` is the third entry of a
             column that has several.
         act: The same for the actuator signals.
@@ -109,7 +112,7 @@ def read_table(
         return series
 
     read_sense, read_act = read(sense), read(act)
-    if isinstance(table, MessageTable):
+    if isinstance(table, MessageTable | LeRobotTable):
         remarks += table.remarks
     return Log(name, read_sense, read_act, remarks)
 
@@ -184,8 +187,13 @@ def _time_column(table: Table, name: str, column: str) -> str:
 def _read_file(path: Path) -> Table:
     if (path / "metadata.yaml").is_file():
         return BagTable(path)
+    if (path / INFO).is_file():
+        return LeRobotTable(path)
     if path.is_dir():
-        raise LogError(f"{path} is a folder, not a file, and no rosbag2, which has a metadata.yaml")
+        raise LogError(
+            f"{path} is a folder, not a file, and no rosbag2, which has a metadata.yaml, nor a data set of LeRobot, "
+            f"which has a {INFO}"
+        )
     suffix = path.suffix.lower()
     if suffix not in READERS:
         raise LogError(
@@ -203,40 +211,10 @@ def _read_npz(path: Path) -> Table:
         raise LogError(f"{path} is not an .npz of arrays without pickles: {error}") from error
 
 
-class _ParquetTable(Mapping[str, Any]):
-    """The columns of a Parquet file, read when they are asked for: numbers (n,), or lists of k numbers each (n, k)."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file = extra_module("pyarrow.parquet", purpose="Parquet", extra="recording").ParquetFile(path)
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        if name not in self:
-            raise KeyError(name)
-        column: Any = self._file.read(columns=[name])[name]
-        if not str(column.type).startswith(("list", "fixed_size_list", "large_list")):
-            return np.asarray(column.to_numpy())
-        column = column.combine_chunks()
-        compute = extra_module("pyarrow.compute", purpose="Parquet", extra="recording")
-        if len(lengths := compute.unique(compute.list_value_length(column))) > 1 or column.null_count:
-            raise LogError(f"{self._path}: the lists of the column {name} have several lengths")
-        values = column.flatten().to_numpy(zero_copy_only=False)
-        return np.reshape(values, (len(column), lengths[0].as_py() if len(lengths) else 0))
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._file.schema_arrow.names
-
-    def __iter__(self) -> Iterator[str]:
-        yield from self._file.schema_arrow.names
-
-    def __len__(self) -> int:
-        return len(self._file.schema_arrow.names)
-
-
 READERS: Mapping[str, Callable[[Path], Table]] = {
     **dict.fromkeys((".csv", ".dat", ".txt"), read_text),
     ".npz": _read_npz,
-    ".parquet": _ParquetTable,
+    ".parquet": ParquetTable,
     ".mcap": McapTable,
     ".db3": BagTable,
     ".bag": BagTable,
