@@ -40,6 +40,7 @@ BELOW: dict[str, set[str]] = {
     "station": {"state", "testbed", "components", "control", "lcm", "monitoring", "deployment"},
     "components": {"state"},
     "compiled": {"state", "testbed", "components"},
+    "fmi": {"state", "testbed", "components", "compiled"},
     "calibration": {
         "state",
         "testbed",

@@ -8,6 +8,8 @@ from .deployment.deployment import Deployment as Deployment
 from .environments.make import gymnasium_env as gymnasium_env
 from .environments.make import gymnasium_vector_env as gymnasium_vector_env
 from .environments.rewards import Reward as Reward
+from .fmi import FmuSystem as FmuSystem
+from .fmi import export_fmu as export_fmu
 from .lcm.hub import Hub as Hub
 from .lcm.protocol import Protocol as Protocol
 from .machine import MachineProcess as MachineProcess

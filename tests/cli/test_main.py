@@ -60,7 +60,7 @@ def test_current_directory_is_searched_last(tmp_path: Path, command: list[str]) 
 def test_commands_stand_in_groups_each_once() -> None:
     text = run("--help").stdout
     groups = re.findall(r"^(\w+):\n((?:  +\w.*\n)+)", text, re.MULTILINE)
-    names = {heading: re.findall(r"^  (\w+)  ", lines, re.MULTILINE) for heading, lines in groups}
+    names = {heading: re.findall(r"^  ([\w-]+)  ", lines, re.MULTILINE) for heading, lines in groups}
     listed = [name for heading in ("Look", "Optimize", "Machine", "Project") for name in names[heading]]
     assert sorted(listed) == main.list_commands(click.Context(main))
     assert {"view", "rollout"} <= {*names["Look"]} and {"run", "hub"} <= {*names["Machine"]}

@@ -52,6 +52,7 @@ _GROUPS = {
         "reset": "live:reset",
         "replay": "log:replay",
         "export": "log:export",
+        "export-fmu": "fmu:export_fmu",
     },
     "Project": {
         "new": "new:new",

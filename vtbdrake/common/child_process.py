@@ -109,7 +109,7 @@ class ChildProcess:
             call.write(dumps((function, arguments)))
             call.seek(0)
             files = [child_end.fileno(), call.fileno(), *(each.fileno() for each in sockets)]
-            program = _BOOTSTRAP.format(path=_search_path(), files=files, grace=grace)
+            program = _BOOTSTRAP.format(path=search_path(), files=files, grace=grace)
             # Blocked, signals wait until the child is ready to ignore them.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _GROUP_SIGNALS)
             try:
@@ -316,7 +316,7 @@ def report_ready(connection: socket.socket) -> None:
     connection.sendall(b"\n")
 
 
-def _search_path() -> list[str]:
+def search_path() -> list[str]:
     """Return sys.path with absolute entries only, so that the first vtbdrake in it is the one of this process."""
     directories = (_FIRST_DIRECTORY, _current_directory())
     entries = [entry for entry in sys.path if isinstance(entry, str)]  # Imports ignore all others.

@@ -79,6 +79,10 @@ class CompiledRollouts:
         timings: (period, offset) of all periodic events, in seconds.
         columns: Where each output lies among the recorded values of an instant; the doubt is the last of these.
         shapes: The shape of each output.
+        updates: The function (before, z, time, w) -> z of the updates of each timing of the walker, where ``before`` is
+            z before all updates of its kind, which are unrestricted or not, and w holds the random numbers.
+        record: The function (z, time, w) of what is recorded at an instant: the outputs by ``columns``, the
+            time of the doubt and the doubt, see `Walker.reason`.
     """
 
     def __init__(
@@ -134,8 +138,8 @@ class CompiledRollouts:
             ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self.shapes.values())]).tolist()
             self.columns = {name: slice(*ends[k : k + 2]) for k, name in enumerate(self.shapes)}
             result = casadi.densify(casadi.vertcat(*recorded.values(), doubt))
-            self._record = casadi.Function("record", [self._z, self._time, self._w], [result], {"cse": True})
-            self._updates = [self._update(timing) for timing in self.walker.timings]
+            self.record = casadi.Function("record", [self._z, self._time, self._w], [result], {"cse": True})
+            self.updates = [self._update(k, timing) for k, timing in enumerate(self.walker.timings)]
         for address in parameters:
             self.walker.place(address)
         _refuse_many_instants(horizon, sample_period, [timing.period for timing in self.walker.timings])
@@ -239,7 +243,7 @@ class CompiledRollouts:
         chunks = [slice(k, k + program.most) for k in range(0, len(z), program.most)]
         # Every chunk writes into its rows: to put them together at the end would take the memory twice.
         final = np.empty_like(z)
-        recorded = np.empty((len(z), len(self.times), self._record.numel_out(0)))
+        recorded = np.empty((len(z), len(self.times), self.record.numel_out(0)))
 
         def run(chunk: slice) -> None:
             noise = self._noise(z[chunk], instants, program.count)
@@ -307,7 +311,7 @@ class CompiledRollouts:
             before = z
             for k in instant.updates:
                 if self.walker.timings[k].unrestricted == unrestricted:
-                    z = self._updates[k](before, z, instant.time, w).full().ravel()
+                    z = self.updates[k](before, z, instant.time, w).full().ravel()
         return z
 
     def recorded(self, z: Array, instant: Instant) -> tuple[dict[str, Array], float]:
@@ -317,7 +321,7 @@ class CompiledRollouts:
             z: State and parameters, shape (nz,).
             instant: The instant.
         """
-        values = self._record(z, instant.time, self._noise_at(z, instant)).full().ravel()
+        values = self.record(z, instant.time, self._noise_at(z, instant)).full().ravel()
         return {name: values[columns] for name, columns in self.columns.items()}, values[-1]
 
     def read(self, address: str, context: Context) -> Any:
@@ -373,14 +377,14 @@ class CompiledRollouts:
             recorded[name] = casadi.densify(function(*(values[address] for address in of)))
         return recorded, doubt
 
-    def _update(self, timing: Timing) -> casadi.Function:
+    def _update(self, number: int, timing: Timing) -> casadi.Function:
         """Return the function (before, z, time, w) -> z of the updates of a timing.
 
         ``before`` is the z before all updates of its kind, which are unrestricted or not.
         """
         z = casadi.SX.sym("z", self.walker.size)
         following = self.walker.update(timing, self._outputs_at_instant(), z)
-        return casadi.Function("update", [self._z, z, self._time, self._w], [following], {"cse": True})
+        return casadi.Function(f"update_{number}", [self._z, z, self._time, self._w], [following], {"cse": True})
 
     def schedule_at(self, t0: float) -> list[Instant]:
         """Return the instants of a rollout that begins at t0 (s)."""
@@ -401,7 +405,7 @@ class CompiledRollouts:
             # Rollouts of this length that begin at other times may have some more.
             count = needed + len(self.walker.timings)
             unrestricted = [timing.unrestricted for timing in self.walker.timings]
-            function = _rollout(self._updates, unrestricted, self._record, count)
+            function = _rollout(self.updates, unrestricted, self.record, count)
             program = Program(function, count, self._translate)
             self._programs.add(count, program)
             return program

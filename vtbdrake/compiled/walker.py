@@ -86,6 +86,7 @@ class Walker:
         draws: The random numbers of the updates, and other data, with their entries in w: (path, name, draw, entries).
         noise: The number of entries of w.
         fixed: Entries of z whose values are compiled in, with the address and the reason: (entries, path, reason).
+        reasons: The reasons of a doubt, by its number from 1 on.
     """
 
     def __init__(self, diagram: Diagram, context: Context, variables: Variables, varied: Sequence[str]) -> None:
@@ -124,8 +125,8 @@ class Walker:
             for path, equations in self.equations.items()
             if not equations.may_be_infinite
         }
-        self._reasons = [f"the state of {path} is not finite" for path in self.equations]
-        self._reasons += [f"{path}: {equations.doubtful}" for path, equations in self.equations.items()]
+        self.reasons = [f"the state of {path} is not finite" for path in self.equations]
+        self.reasons += [f"{path}: {equations.doubtful}" for path, equations in self.equations.items()]
         self._all_fixed = _indices(entries for entries, _, _ in self.fixed)
         self._compiled_in = self._read_compiled_in(context)
 
@@ -328,7 +329,7 @@ class Walker:
             doubt: The number of the reason.
             time: When it was noticed, in s.
         """
-        return f"{self._reasons[round(doubt) - 1]} at t = {time:.9g} s" if doubt > 0.0 else ""
+        return f"{self.reasons[round(doubt) - 1]} at t = {time:.9g} s" if doubt > 0.0 else ""
 
     def _doubt(self, at: InstantOutputs, earlier: Expression, following: Expression, entries: Array) -> Expression:
         """Return the time of the doubt and the doubt, shape (2, 1); all that counts at the instant has been written.

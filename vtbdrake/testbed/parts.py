@@ -58,7 +58,7 @@ class DpsAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=interface,
-            simulator_config=_unpaced(scenario.simulator_config, has_plant=False),
+            simulator_config=unpaced(scenario.simulator_config, has_plant=False),
             scenario=scenario,
             extra=commands.variables(interface.commands),
         )
@@ -103,8 +103,13 @@ class DpsAlone(AddressedDiagram):
         self.write(context, {a: snapshot[a] for a in commands if a in snapshot.values})
 
 
-def _unpaced(config: SimulatorConfig, *, has_plant: bool = True) -> SimulatorConfig:
-    """Return a config for a loop that sets the pace itself."""
+def unpaced(config: SimulatorConfig, *, has_plant: bool = True) -> SimulatorConfig:
+    """Return a config for a loop that sets the pace itself.
+
+    Args:
+        config: The config of a testbed.
+        has_plant: Whether the Diagram has a plant, as CENIC needs it.
+    """
     unpaced = copy.deepcopy(config)
     unpaced.target_realtime_rate = 0.0
     # CENIC integrates a MultibodyPlant.
@@ -147,7 +152,7 @@ class WorldAlone(AddressedDiagram):
         super().__init__(
             diagram=diagram,
             interface=parts.interface,
-            simulator_config=_unpaced(scenario_copy.simulator_config),
+            simulator_config=unpaced(scenario_copy.simulator_config),
             scenario=scenario_copy,
             plant_roles=parts.plant_roles(),
         )

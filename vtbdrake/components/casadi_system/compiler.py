@@ -29,7 +29,7 @@ LONGEST_COMPILATION = 600.0
 """s. The time that a compiler gets for one function; an arm's testbed takes some seconds."""
 _ONE_AT_A_TIME = threading.Lock()
 _DIGEST_SIZE = hashlib.sha256().digest_size
-_KERNELS: dict[str, Path] = {}  # Functions that are written in C -> their libraries.
+_KERNELS: dict[str, tuple[Path, str]] = {}  # Functions that are written in C -> their libraries and their sources.
 
 
 class CompilerError(RuntimeError):
@@ -73,14 +73,23 @@ def compiled_kernel(name: str, source: str) -> casadi.Function:
     """
     library = _library(name, source, ())
     function = _loaded(name, source, library, ())
-    _KERNELS[name] = library
+    _KERNELS[name] = library, source
     return function
 
 
 def _kernels_in(source: str) -> tuple[Path, ...]:
     """Return the libraries of the kernels that a function calls."""
+    return tuple(library for library, _ in _called_kernels(source))
+
+
+def kernel_sources(source: str) -> tuple[str, ...]:
+    """Return the C code of the kernels (see `compiled_kernel`) that the C code of a function calls."""
+    return tuple(text for _, text in _called_kernels(source))
+
+
+def _called_kernels(source: str) -> list[tuple[Path, str]]:
     called = set(re.findall(r"^int (\w+)\(", source, re.MULTILINE))
-    return tuple(library for name, library in _KERNELS.items() if name in called)
+    return [kernel for name, kernel in _KERNELS.items() if name in called]
 
 
 def _library(name: str, source: str, kernels: Sequence[Path]) -> Path:
