@@ -1,4 +1,4 @@
-"""What the tests of FMUs share: FMUs that are built when they are first used."""
+"""FMUs for all tests of this folder, built when they are first used."""
 
 import shutil
 from collections.abc import Callable

@@ -124,6 +124,8 @@ MODELS = {
         ],
         "v[TWICE] = 2 * v[WHOLE] + v[SMALL], v[INVERSE] = !v[FLAG], v[NEXT] = v[GEAR] + 1, v[HALF] = v[SINGLE] / 2;",
     ),
+    # For the test that counts its instances.
+    "Counted": Model([state("x", "0")], "v[X] += h;"),
     "Foreign": Model([Var("x", "output")], "", platform="x86_64-windows"),
     "Exchange": Model([Var("x", "output")], "", interface="ModelExchange"),
     "Integrator2": Model(
@@ -166,7 +168,7 @@ static Instance *made(void *environment, void *log, const char *name) {
 }
 static void freed(Instance *instance) {
     FILE *file = getenv("FREED") ? fopen(getenv("FREED"), "a") : 0;
-    if (file) fputs("freed\\n", file), fclose(file);
+    if (file) fprintf(file, "%s\\n", (char *)instance->name), fclose(file);
     free(instance->name), free(instance);
 }
 """

@@ -23,7 +23,9 @@ from vtbdrake.components.casadi_system.compiler import CompilerError, compiler_c
 from vtbdrake.fmi import FmuSystem, export_fmu
 from vtbdrake.testbed import DpsAlone, Interface, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.instants import sample_instants
+from vtbdrake.testbed.parts import WorldAlone
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.cube_toss import CubeTossScenario
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler_command()[0]) is None, reason="there is no C compiler")
 
@@ -173,6 +175,29 @@ def test_a_dps_reads_its_sensors_and_commands(dps: Path) -> None:
     np.testing.assert_allclose(forces, expected, atol=1e-11)
 
 
+def test_a_world_takes_commands_and_shows_its_sensors(tmp_path: Path) -> None:
+    path = export_fmu(CartPoleScenario(), tmp_path / "world.fmu", part="world", parameters={"angle": ANGLE})
+    assert validate_fmu(str(path)) == []
+    forces = 20.0 * np.sin(np.arange(40))
+    measured = []
+    with slave(path, {"angle": START[ANGLE]}) as (instance, reference, _):
+        for k, force in enumerate(forces):
+            instance.setFloat64([reference("force")], [force])
+            instance.doStep(0.02 * k, 0.02)
+            measured.append(instance.getFloat64([reference("joint_position")], 2))
+    world = WorldAlone(CartPoleScenario())
+    context = world.default_context()
+    world.write(context, {ANGLE: START[ANGLE]})
+    simulator, expected = world.simulator(context), []
+    for instant, force in zip(
+        sample_instants(0.02 * np.arange(41), 0.0, world.event_timings())[1:], forces, strict=True
+    ):
+        world.actuate(context, "force", force)
+        simulator.AdvanceTo(instant)
+        expected.append(world.diagram.GetOutputPort("sense.joint_position").Eval(context))
+    np.testing.assert_allclose(measured, expected, atol=1e-11)
+
+
 def test_what_does_not_fit_is_refused_with_a_sentence(native: Path) -> None:
     with slave(native, {}) as (instance, reference, said):
         refused: list[tuple[Callable[[], Any], str]] = [
@@ -254,7 +279,7 @@ def test_steps_that_add_up_with_rounding_meet_every_update(tmp_path: Path) -> No
         ({"outputs": OUTPUTS, "inputs": {"plant.state": "u.plan"}}, ValueError, "the name 'plant.state' is there"),
         ({"outputs": OUTPUTS, "inputs": ["time"]}, ValueError, "cannot be the input 'time'"),
         ({"outputs": OUTPUTS, "parameters": ["T_act.force"]}, ValueError, "cannot be varied"),
-        ({"outputs": OUTPUTS, "part": "world"}, ValueError, "part is testbed or dps, not 'world'"),
+        ({"outputs": OUTPUTS, "part": "sim"}, ValueError, "part is testbed, dps, world, not 'sim'"),
         ({"outputs": OUTPUTS, "kind": "source"}, ValueError, "kind is native or coupled, not 'source'"),
         ({"outputs": OUTPUTS, "step": 0.0}, ValueError, "step is a positive time in s, not 0.0"),
     ],
@@ -276,6 +301,18 @@ def test_what_is_not_compiled_names_the_other_kind(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(CompilerError, match=r"there is no 'no-such-compiler'"):
         export_fmu(CartPoleScenario(), tmp_path / "x.fmu", outputs=OUTPUTS)
+
+
+@pytest.mark.slow
+def test_contact_is_part_of_a_native_fmu(tmp_path: Path) -> None:
+    pose, velocity = "sim.sys.cube.position", "sim.sys.cube.velocity"
+    path = export_fmu(CubeTossScenario(), tmp_path / "cube.fmu", outputs=["plant.state"], parameters=[pose, velocity])
+    toss = {pose: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2], velocity: [3.0, 1.0, 2.0, 0.5, 0.0, 0.0]}
+    result = fmpy.simulate_fmu(str(path), stop_time=0.5, output_interval=0.05, start_values=toss)
+    rollouts = CubeTossScenario().build().compiled(horizon=0.5, outputs=["plant.state"], check=False)
+    batch = rollouts(toss)
+    assert batch.valid.all() and 0.0 < result["plant.state"][-1][6] < 0.15  # it has fallen, and lies on the ground
+    np.testing.assert_array_equal(result["plant.state"], batch.outputs["plant.state"][0])
 
 
 @pytest.mark.slow

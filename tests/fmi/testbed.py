@@ -1,19 +1,21 @@
-"""A testbed whose world is an FMU: x' = k u, and a DPS that holds x at a goal."""
+"""Testbeds with an FMU: in the world, which a DPS holds at a goal, and in a DPS."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from pydrake.systems.framework import DiagramBuilder, System
-from pydrake.systems.primitives import Adder, Gain, ZeroOrderHold
+from pydrake.systems.primitives import Adder, Gain, MatrixGain, PassThrough, ZeroOrderHold
 
+from tests.control.scripted import PERIOD, ServoScenario
 from vtbdrake.fmi import FmuSystem
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
 
 
 @dataclass(repr=False, eq=False)
 class TankScenario(Scenario):
-    """A tank, whose inflow the DPS commands."""
+    """A tank with the level x, x' = k u, whose inflow u the DPS commands."""
 
     path: str = ""
     fork: bool = True
@@ -42,3 +44,23 @@ class TankScenario(Scenario):
         builder.add("sys", "tank", tank)
         builder.sim_sensor("level", tank.GetOutputPort("x"))
         builder.sim_actuator("inflow", tank.GetInputPort("inflow"))
+
+
+@dataclass(repr=False, eq=False)
+class FilteringScenario(ServoScenario):
+    """A DPS whose filter is an FMU: it commands velocities that follow the integral of the first position."""
+
+    path: str = ""
+
+    def make_dps(self) -> System:
+        builder = DiagramBuilder()
+        first = builder.AddNamedSystem("first", MatrixGain(np.array([[1.0, 0.0]])))
+        fmu = builder.AddNamedSystem("fmu", FmuSystem(self.path, period=PERIOD))
+        share = builder.AddNamedSystem("share", MatrixGain(np.array([[0.3], [0.2]])))
+        builder.Connect(first.get_output_port(), fmu.get_input_port())
+        builder.Connect(fmu.get_output_port(), share.get_input_port())
+        builder.ExportInput(first.get_input_port(), "position")
+        for name in ("speed", "target"):
+            builder.ExportInput(builder.AddNamedSystem(name, PassThrough(2)).get_input_port(), name)
+        builder.ExportOutput(share.get_output_port(), "velocity")
+        return builder.Build()

@@ -28,7 +28,12 @@ def _addresses(texts: tuple[str, ...]) -> dict[str, str]:
 @option("--output [NAME=]ADDRESS", f"A variable or vector port to show. {_NAMED}", name="outputs", multiple=True)
 @option("--input [NAME=]ADDRESS", f"A variable to set between steps. {_NAMED}", name="inputs", multiple=True)
 @option("--parameter [NAME=]ADDRESS", f"A variable to set at the begin. {_NAMED}", name="parameters", multiple=True)
-@option("--part", "The whole testbed, or the DPS alone.", type=click.Choice(["testbed", "dps"]), default="testbed")
+@option(
+    "--part",
+    "The whole testbed, the DPS alone, or the simulated world alone.",
+    type=click.Choice(["testbed", "dps", "world"]),
+    default="testbed",
+)
 @option(
     "--kind",
     "Machine code of the compiled testbed, or Drake in a Python process.",
@@ -47,10 +52,10 @@ def export_fmu(
     kind: str,
     step: float | None,
 ) -> None:
-    """Write a testbed as an FMU: FMI 3.0, co-simulation.
+    """Write a testbed, its DPS or its world as an FMU: FMI 3.0, co-simulation.
 
-    Without --input, the inputs are the commands u, and for the DPS alone its sensor signals. Without --output, the
-    outputs of the DPS alone are its actuator signals.
+    Without --input, the inputs are the commands u, the sensor signals of the DPS alone, and the actuator signals of the
+    world alone. Without --output, the outputs are the actuator signals of the DPS, and the sensor signals of the world.
 
     \b
     Example:

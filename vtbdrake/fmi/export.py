@@ -1,4 +1,4 @@
-"""Testbeds and their DPS as functional mock-up units (FMI 3.0, co-simulation)."""
+"""Testbeds, their DPS and their worlds as functional mock-up units (FMI 3.0, co-simulation)."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def export_fmu(
     kind: str = "native",
     step: float | None = None,
 ) -> Path:
-    """Write a testbed, or its DPS, as an FMU for co-simulation (FMI 3.0) on Linux.
+    """Write a testbed, its DPS or its world as an FMU for co-simulation (FMI 3.0) on Linux.
 
     Its variables have the names of the addresses, or the names that a mapping ``{name: address}`` gives them. Numbers
     are Float64; what has a shape is an array. The importer may save and restore its state at any communication point,
@@ -53,12 +53,13 @@ def export_fmu(
     Args:
         scenario: The scenario.
         path: The file to write, such as ``cart_pole.fmu``; whole or not at all.
-        outputs: Variables and vector output ports. By default the actuator signals, if ``part`` is ``dps``.
-        inputs: Variables that the importer sets between steps. By default the commands u, and for a ``dps`` its sensor
-            signals. Of a ``dps``, signals are named as in its interface.
+        outputs: Variables and vector output ports. By default the actuator signals of a ``dps``, and the sensor
+            signals of a ``world``; signals have the names of the interface.
+        inputs: Variables that the importer sets between steps. By default the commands u, the sensor signals of a
+            ``dps``, and the actuator signals of a ``world``.
         parameters: Variables that the importer sets before it begins: dynamic ones (x) give the start; static ones (a)
             can be set between steps, too.
-        part: ``testbed``, or ``dps``: the DPS alone.
+        part: ``testbed``; ``dps``: the DPS alone; or ``world``: the simulated world alone.
         kind: ``native``: machine code of the compiled testbed, which needs nothing else, and whose trajectories equal
             `VirtualTestbed.compiled`'s to the last bit. ``coupled``: any testbed, computed by Drake in a Python process
             that the FMU starts: on this machine, or on one where the environment variable VTBDRAKE_PYTHON names a

@@ -1,4 +1,4 @@
-"""What an exported FMU computes: a testbed or its DPS, with the variables that cross its boundary."""
+"""What an exported FMU computes: a testbed, its DPS or its world, with the variables that cross its boundary."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from vtbdrake.common.argument_checks import as_addresses
 from vtbdrake.common.arrays import Array
+from vtbdrake.state.systems import output_ports
 from vtbdrake.state.variables import A, VariableError
 from vtbdrake.testbed import Interface, Scenario
 from vtbdrake.testbed.addressed import AddressedDiagram
@@ -57,7 +58,8 @@ class ExportedPart:
 
     Args:
         scenario: The scenario.
-        part: ``testbed``, or ``dps``: the DPS alone, which has its sensor signals as inputs.
+        part: ``testbed``; ``dps``: the DPS alone, which has its sensor signals as inputs; or ``world``: the simulated
+            world alone, which has the actuator signals as inputs.
         inputs: Addresses, or names in the FMU with their addresses, that the importer sets while time runs.
         parameters: Likewise for what it sets before; parameters of systems also later.
         outputs: Likewise for what it reads: variables, or vector output ports.
@@ -77,7 +79,7 @@ class ExportedPart:
         self, scenario: Scenario, part: str, *, inputs: Names = None, parameters: Names = (), outputs: Names = None
     ) -> None:
         if part not in _PARTS:
-            raise ValueError(f"part is {' or '.join(_PARTS)}, not {part!r}")
+            raise ValueError(f"part is {', '.join(_PARTS)}, not {part!r}")
         self.scenario, self.part = scenario, part
         self.target, signals_in, signals_out = _PARTS[part](scenario)
         commands = [f"{COMMAND}{signal.name}" for signal in self.target.interface.commands]
@@ -181,7 +183,7 @@ def _dps(scenario: Scenario) -> tuple[AddressedDiagram, dict[str, str], dict[str
     """Return the DPS, whose sensor signals are parameters of sources, and the addresses of its signals by name.
 
     Returns:
-        The Diagram; the addresses of its sensor signals; those of its actuator signals.
+        The Diagram; the addresses of its sensor signals; the addresses of its actuator signals.
     """
     scenario.validate()
     interface = scenario.interface()
@@ -206,12 +208,41 @@ def _dps(scenario: Scenario) -> tuple[AddressedDiagram, dict[str, str], dict[str
     return target, inputs, {signal.name: f"dps.{signal.name}" for signal in interface.act}
 
 
+def _world(scenario: Scenario) -> tuple[AddressedDiagram, dict[str, str], dict[str, str]]:
+    """Return the simulated world, whose actuator signals are parameters of sources, and the addresses of its signals.
+
+    Returns:
+        The Diagram; the addresses of its actuator signals; the addresses of its sensor signals.
+    """
+    scenario.validate()
+    interface = scenario.interface()
+    _refuse_abstract(interface)
+    parts = VirtualTestbedBuilder(interface, simulator_config=scenario.simulator_config)
+    parts.place_of = scenario.where_position
+    scenario.add_world(parts)
+    parts.finish_world()
+    builder = parts.diagram_builder
+    for signal in interface.act:
+        source = builder.AddNamedSystem(f"act.{signal.name}", ConstantVectorSource(signal.vector(signal.idle)))
+        builder.Connect(source.get_output_port(), parts.actuators[signal.name])
+    target = AddressedDiagram(
+        diagram=parts.build_diagram("exported_world"),
+        interface=interface,
+        simulator_config=unpaced(scenario.simulator_config),
+        scenario=scenario,
+        plant_roles=parts.plant_roles(),
+    )
+    ports = {
+        (port.get_system(), port.get_index()): address for address, (_, port) in output_ports(target.diagram).items()
+    }
+    sensors = {name: ports[port.get_system(), port.get_index()] for name, port in parts.sensors.items()}
+    return target, {signal.name: f"act.{signal.name}.value" for signal in interface.act}, sensors
+
+
 def _refuse_abstract(interface: Interface) -> None:
     abstract = [signal.name for signal in (*interface.sense, *interface.act) if not signal.is_vector]
     if abstract:
-        raise ValueError(
-            f"the signal {abstract[0]} is abstract, and an FMU takes numbers: export part='testbed', or split the DPS"
-        )
+        raise ValueError(f"the signal {abstract[0]} is abstract, and an FMU takes numbers: export part='testbed'")
 
 
-_PARTS = {"testbed": _testbed, "dps": _dps}
+_PARTS = {"testbed": _testbed, "dps": _dps, "world": _world}

@@ -139,22 +139,22 @@ class ImportedFmu:
             if listed.causality == causality and listed.type in (*_NUMBERS, "Enumeration")
         ]
 
-    def ports(self, causality: str, chosen: Sequence[str] | Mapping[str, str | Sequence[str]] | None) -> Ports:
+    def ports(self, causality: str, selection: Sequence[str] | Mapping[str, str | Sequence[str]] | None) -> Ports:
         """Return the variables of each port.
 
         Args:
             causality: ``input`` or ``output``.
-            chosen: Names of variables, each with a port of its name; or port -> the variables that it is made of; or
+            selection: Names of variables, each with a port of its name; or port -> the variables that it is made of; or
                 None for all.
 
         Raises:
             ValueError: A variable is not there, is named twice, or holds no numbers.
         """
-        if chosen is None:
+        if selection is None:
             return {variable.name: [variable] for variable in self.of_causality(causality)}
-        if isinstance(chosen, str):
-            raise ValueError(f"FmuSystem: {causality}s are names in a list, not {chosen!r}")
-        groups = chosen if isinstance(chosen, Mapping) else {name: name for name in chosen}
+        if isinstance(selection, str):
+            raise ValueError(f"FmuSystem: {causality}s are names in a list, not {selection!r}")
+        groups = selection if isinstance(selection, Mapping) else {name: name for name in selection}
         names = {port: [of] if isinstance(of, str) else list(of) for port, of in groups.items()}
         every = [name for of in names.values() for name in of]
         if twice := [name for name in every if every.count(name) > 1]:
@@ -179,9 +179,9 @@ class ImportedFmu:
     ) -> FmuVariable:
         listed = self._variables.get(name)
         if listed is None or not fits(listed):
-            what = "no such variable" if listed is None else f"one with the causality {listed.causality}"
+            reason = "no such variable" if listed is None else f"one with the causality {listed.causality}"
             raise ValueError(
-                f"FmuSystem: {name!r} is none of the {kind} of {self.name}, but {what}; it has "
+                f"FmuSystem: {name!r} is none of the {kind} of {self.name}, but {reason}; it has "
                 f"{listing(there)}{did_you_mean(name, there)}"
             )
         if listed.type not in (*_NUMBERS, "Enumeration", *(["String"] if texts else [])):

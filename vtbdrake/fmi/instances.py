@@ -79,7 +79,11 @@ class Values:
         return values
 
     def write(self, instance: Any, values: np.ndarray) -> None:
-        """Set the values, flat, in an instance of FMPy.
+        """Set the values in an instance of FMPy.
+
+        Args:
+            instance: The instance.
+            values: The values of all variables, flat.
 
         Raises:
             ValueError: A value is none of its variable's type.
@@ -148,12 +152,12 @@ class Instances:
             ValueError: A value is none of its variable's type.
         """
         key = time, parameters.tobytes()
-        kept = self._initial
-        if kept is not None and kept[0] == key and (self.fork or any(i.holds is kept[1] for i in self._all)):
-            return kept[1]
-        with self._used(None) as instance, self._told(instance, time):
+        last = self._initial
+        if last is not None and last[0] == key and (self.fork or any(i.holds is last[1] for i in self._all)):
+            return last[1]
+        with self._used(None) as instance, self._explained(instance, time):
             instance.begin(time, lambda slave: self._start(slave, parameters))
-            state = self._kept(instance, parameters)
+            state = self._state_of(instance, parameters)
         self._initial = key, state
         return state
 
@@ -180,7 +184,7 @@ class Instances:
                 f"the parameter {name} of {self._fmu.name} is fixed, and cannot change once the FMU has begun: set it "
                 "before the simulation begins"
             )
-        with self._used(state) as instance, self._told(instance, time):
+        with self._used(state) as instance, self._explained(instance, time):
             if instance.holds is not state:
                 self._restore(instance, state, time)
             if changed.any():
@@ -188,14 +192,14 @@ class Instances:
             self._inputs.write(instance.slave, inputs)
             instance.holds = None
             is_end = instance.step(time, step)
-            return self._kept(instance, parameters), is_end
+            return self._state_of(instance, parameters), is_end
 
     def _start(self, slave: Any, parameters: np.ndarray) -> None:
         self._parameters.write(slave, parameters)
         for variable, text in self._texts:
             slave.setString([variable.reference], [text])
 
-    def _kept(self, instance: _Instance, parameters: np.ndarray) -> FmuState:
+    def _state_of(self, instance: _Instance, parameters: np.ndarray) -> FmuState:
         data = instance.save() if self.fork else np.zeros(0, np.uint8)
         state = FmuState(True, data, parameters.copy(), self._outputs.read(instance.slave))
         instance.holds = state
@@ -210,7 +214,7 @@ class Instances:
         instance.load(state.data)
 
     @contextmanager
-    def _told(self, instance: _Instance, time: float) -> Iterator[None]:
+    def _explained(self, instance: _Instance, time: float) -> Iterator[None]:
         """Turn an error of FMPy's into one that names the time and what the FMU has logged."""
         instance.messages.clear()
         try:

@@ -1,7 +1,8 @@
 /* A compiled testbed: its updates in the order of Drake's Simulator.
 
 What stands before this text: the C code of CasADi with the functions update_... and record, NZ, NW, N_TIMINGS, N_WORK,
-N_IWORK, N_ARGUMENTS, N_RESULTS, `z_start`, `places` (where each value that can be set lies in z), `timings`, `reasons` (why a trajectory departs from Drake's). */
+N_IWORK, N_ARGUMENTS, N_RESULTS, `z_start`, `places` (where each value that can be set lies in z), `timings`, and
+`reasons` (why a trajectory departs from Drake's). */
 
 struct Model {
     double z[NZ];

@@ -49,9 +49,9 @@ class FmuSystem(AddressedSystem):
     Args:
         path: The FMU.
         period: The communication step T in s; by default the one that the file proposes.
-        inputs: Names of inputs, each of which becomes a port; or port -> the inputs that it is made of, one after the
-            other: ``{"joint_position": ["q1", "q2"]}``. By default all that hold numbers.
-        outputs: The same for outputs.
+        inputs: Names of inputs, which become ports of the same names; or port -> its inputs, one after the other:
+            ``{"joint_position": ["q1", "q2"]}``. By default all inputs that hold numbers.
+        outputs: Names of outputs, or port -> its outputs, likewise.
         parameters: Start values by name: of parameters, and of outputs and local variables that have one. Numbers are
             parameters of this system, and variables by address, where characters other than letters and digits are
             "_": the FMU takes what is in the Context when it begins, and later what is tunable.
@@ -184,7 +184,7 @@ def _start_values(
 
 
 def _entries(ports: Ports) -> dict[str, slice]:
-    """Return where the values of each port lie among those of all ports."""
+    """Return the slice of each port in the array of all values."""
     entries, start = {}, 0
     for port, variables in ports.items():
         end = start + sum(variable.size for variable in variables)
