@@ -28,7 +28,7 @@ CAUSES = {
 def main() -> None:
     """Print accepted and named recordings, coverage and errors for each law, without and with a disturbance."""
     names = [address.split(".")[-1] for address in VALUES]
-    header = ("law", "disturbance", "accepted", "named", "intervals of accepted that are right", *names)
+    header = ("law", "disturbance", "accepted", "named", "right intervals", *names)
     rows = [row(law, disturbance) for law in CAUSES for disturbance in DISTURBANCES]
     print(text_table(header, rows))
     print("Errors are medians, of the truth.")

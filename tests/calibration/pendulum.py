@@ -30,6 +30,7 @@ class PendulumScenario(Scenario):
 
     time_step: float = 0.0
     mass: float = 1.0
+    coulomb_velocity: float = 0.05
 
     def interface(self) -> Interface:
         return Interface(
@@ -58,7 +59,13 @@ class PendulumScenario(Scenario):
         plant.Finalize()
         builder.add_sensor("position", JointEncoders(plant, [joint], period=PERIOD))
         drives = JointDrives(
-            plant, [joint], period=PERIOD, coulomb=0.1, coulomb_velocity=0.05, viscous=0.01, max_delay=8
+            plant,
+            [joint],
+            period=PERIOD,
+            coulomb=0.1,
+            coulomb_velocity=self.coulomb_velocity,
+            viscous=0.01,
+            max_delay=8,
         )
         builder.add("act", "drives", drives)
         builder.connect(plant.get_state_output_port(), drives.GetInputPort("state"))

@@ -40,8 +40,10 @@ def recorded(
     offset: float = 0.0,
     disturbance: float = 0.0,
     seconds: float = 8.0,
+    center: float = CENTER,
     moment: float = MOMENT,
     coulomb: float = 0.0,
+    amplitude: float = 1.0,
     step: float = 4e-4,
 ) -> Log:
     """Return a log of the pendulum, with noise of 0.2 mrad.
@@ -54,25 +56,27 @@ def recorded(
         offset: What the encoder shows at zero, in rad.
         disturbance: Deviation of a torque that is not in the log, in N m; it is correlated over 50 ms.
         seconds: Duration.
+        center: Distance of the centre of mass from the joint, in m.
         moment: Moment of inertia about the centre of mass, in kg m^2.
         coulomb: Friction beside that of the law, in N m.
+        amplitude: Factor of the torques.
         step: Step of the simulation, in s.
     """
     rng = np.random.default_rng(seed)
     times = PERIOD * np.arange(round(seconds / PERIOD))
-    torques = commanded(rng, times)
+    torques = amplitude * commanded(rng, times)
     decay, walk = np.exp(-PERIOD / 0.05), np.zeros(times.size)
     for k in range(1, times.size):
         walk[k] = decay * walk[k - 1] + np.sqrt(1.0 - decay**2) * rng.normal()
     acting = torques + disturbance * walk
-    inertia = moment + MASS * CENTER**2
+    inertia = moment + MASS * center**2
     q = v = 0.0
     positions = []
     for k in range(times.size):
         positions.append(q)
         torque = acting[k - 1] if k else 0.0  # A command acts a period later, as with the testbed's drives.
         for _ in range(round(PERIOD / step)):
-            free = v + step * (torque - VISCOUS * v - MASS * GRAVITY * CENTER * np.sin(q)) / inertia
+            free = v + step * (torque - VISCOUS * v - MASS * GRAVITY * center * np.sin(q)) / inertia
             friction = coulomb + LAWS[law](v, torque)
             v = np.sign(free) * max(abs(free) - step * friction / inertia, 0.0)
             q += step * v

@@ -16,7 +16,7 @@ from vtbdrake.optimization import Parameter, Problem
 from vtbdrake.recording import DrivenScenario
 from vtbdrake.rollout import Quality
 from vtbdrake.testbed import ScenarioError, load_scenario
-from vtbdrake.testbed.pedigree import Number, Pedigree
+from vtbdrake.testbed.pedigree import Number, Pedigree, Posterior
 
 pytestmark = pytest.mark.one_python
 
@@ -50,6 +50,21 @@ def test_file_gives_the_calibrated_scenario_again(make, tmp_path: Path) -> None:
     (digest,) = loaded.pedigree.logs.values()
     assert len(digest) == 64 and digest == recorded(TRUTH, 21 if make is result else 22, seconds=6.0).digest
     assert PendulumScenario() != loaded and PendulumScenario().record() != loaded.record()
+
+
+def test_numbers_that_were_not_accepted_warn_where_they_are_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenario = PendulumScenario().with_values({})
+    scenario.pedigree.reasons = ["the innovations are coloured"]
+    scenario.pedigree.posterior = Posterior(
+        addresses=[COULOMB], mean=[0.2], covariance=[[0.0]], lower=[0.0], upper=[1.0]
+    )
+    scenario.save(tmp_path / "arm.yaml")
+    loaded = load_scenario(f"{NAME}@{tmp_path / 'arm.yaml'}")
+    assert "arm.yaml has numbers of a calibration that was not accepted: the innovations are coloured" in caplog.text
+    with pytest.warns(UserWarning, match="PendulumScenario was not accepted, .*: the innovations are coloured"):
+        assert loaded.samples(1) == [{COULOMB: 0.2}]
 
 
 def test_file_without_a_pedigree_is_as_it_was(tmp_path: Path) -> None:

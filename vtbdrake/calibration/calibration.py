@@ -17,7 +17,7 @@ from vtbdrake.calibration.fisher import Information, information_of
 from vtbdrake.calibration.inverse_dynamics import InverseDynamics, bounded_step, outward
 from vtbdrake.calibration.joint_model import CalibrationError, Inertia, JointModel
 from vtbdrake.calibration.log_checks import check_log, check_torques
-from vtbdrake.calibration.missing_terms import missing_terms
+from vtbdrake.calibration.missing_terms import chattering, missing_terms
 from vtbdrake.calibration.posterior import sandwich_covariance
 from vtbdrake.common.argument_checks import counted
 from vtbdrake.common.arrays import Array
@@ -441,6 +441,7 @@ def _result(
         reasons.append(f"the innovations are coloured (autocorrelation {correlation:.2g}): the model lacks something")
     if holdout > WORSE * fit:
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
+    reasons += chattering(segments, prepared.start, z)
     reasons += map(str, missing_terms(segments, noise, z, used, info))
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
     if not reasons and _start_is_as_good(segments, noise, white, held_back):

@@ -116,6 +116,8 @@ class JointModel:
         lower, upper: The range of each entry.
         nq, nu: Numbers of joint positions, and of actuators.
         joint_names: Names of the joints, by position.
+        actuated_names: Names of the joints with actuators, by actuator.
+        chatter: (q, z) -> T Fc / (I v_c) of each actuator's friction, (nu,): held over a period, it chatters above 2.
         edges: The velocity below which the Coulomb friction of a joint fades, (nq,), in rad/s or m/s.
 
     Raises:
@@ -234,6 +236,9 @@ class JointModel:
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         moving = sorted((joint.position_start(), joint.name()) for joint in joints if joint.num_positions())
         self.joint_names = tuple(name for _, name in moving)
+        self.actuated_names = tuple(
+            plant.get_joint_actuator(index).joint().name() for index in plant.GetJointActuatorIndices()
+        )
         self.selection: Array = plant.MakeActuationMatrix()
         selection = casadi.SX(casadi.DM(self.selection))
         drive = {name: self._drive_parameter(name, testbed, context, z) for name in _FRICTION}
@@ -258,6 +263,10 @@ class JointModel:
         needed, tau, rate, *step = dynamics.substituted(results, inputs)
         edges = casadi.Function("edges", [z], [drive["coulomb_velocity"]])(self.start)
         self.edges = self.selection @ np.asarray(edges).ravel()
+        inertia = casadi.jacobian(dynamics.inverse_dynamics(q, v, a), a)
+        (inertia,) = dynamics.substituted([inertia], inputs)
+        sharpness = drive["coulomb"] / (selection.T @ casadi.diag(inertia)) / drive["coulomb_velocity"]
+        self.chatter = casadi.Function("chatter", [q, z], [casadi.densify(self._drive_period * sharpness)])
         lost = selection @ friction(v) + dynamics.substituted([dynamics.damping_torque(v)], inputs)[0]
         self.friction = casadi.Function("friction", [v, z], [casadi.densify(lost)])
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})

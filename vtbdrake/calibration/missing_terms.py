@@ -30,6 +30,8 @@ _SIMPLER = 1.25
 # The noise was fitted without the term, and is too large if there is one: the deviation is at least this share of the
 # one by the noise.
 _LEAST_DEVIATION = 0.5
+# Held friction is stable up to this: the velocity changes by a factor of 1 - T Fc / (I v_c) in a step.
+_CHATTERS = 2.0
 # A term of whose information the fitted parameters take more than all but this share is not told apart from them.
 _OWN = 0.15
 # The quantiles of a joint's speeds at which Stribeck's friction is tried, and how much wider than the edge of Coulomb's
@@ -66,6 +68,27 @@ class MissingTerm:
             f"the torque of {self.joint} depends on {self.what}, which the model does not have: {self.size:.3g} +- "
             f"{self.deviation:.2g} N m (or N) in the mean, {self.share:.0%} of its friction"
         )
+
+
+def chattering(segments: Segments, start: Array, z: Array) -> list[str]:
+    """Return for which joints the model's friction chatters, as sentences: its estimates say nothing.
+
+    Friction that is held over a period T turns the velocity around if T Fc / (I v_c) is above 2.
+
+    Args:
+        segments: The recordings, with their filtered trajectories.
+        start: The parameters by inverse dynamics, which hold nothing: the filter may have taken friction away.
+        z: The estimate, (nz,).
+    """
+    model = segments.model
+    q = segments.trajectory[..., : model.nq].mean(axis=(0, 1))
+    ratios = np.max([np.asarray(model.chatter(q, at)).ravel() for at in (start, z)], axis=0)
+    return [
+        f"the friction of {name} is held over a period and chatters: T Fc / (I v_c) is {ratio:.2g}, and must not "
+        f"exceed {_CHATTERS:g}: make coulomb_velocity {ratio / _CHATTERS:.2g} times larger, or the period shorter"
+        for name, ratio in zip(model.actuated_names, ratios, strict=True)
+        if ratio > _CHATTERS
+    ]
 
 
 def missing_terms(

@@ -6,6 +6,7 @@ import copy
 import copyreg
 import math
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -374,7 +375,16 @@ class Scenario(ABC):
 
         Raises:
             ScenarioError: Nothing was calibrated.
+
+        Warns:
+            UserWarning: The calibration was not accepted.
         """
+        if self.pedigree.reasons:
+            warnings.warn(
+                f"the calibration of {type(self).__name__} was not accepted, and its samples are nearer to each other "
+                f"than to the truth: {'; '.join(self.pedigree.reasons)}",
+                stacklevel=2,
+            )
         return samples(self.pedigree.posterior, count, seed=seed)
 
     def save(self, path: str | os.PathLike[str], *, domain: ValidityDomain | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import sys
 import tempfile
@@ -19,6 +20,8 @@ from vtbdrake.common.scenario_names import ScenarioNameError, file_name, full_na
 from vtbdrake.common.suggestions import did_you_mean
 from vtbdrake.testbed.scenario import FILE_KEYS, Scenario, class_name
 from vtbdrake.testbed.scenario_identity import ScenarioError
+
+_log = logging.getLogger(__name__)
 
 S = TypeVar("S", bound=Scenario)
 _LARGEST_FILE = 1 << 22  # bytes
@@ -65,6 +68,9 @@ def load_scenario(source: str | os.PathLike[str]) -> Scenario:
         raise ScenarioError(f"after package.module:Class@ comes the name of a .yaml file, not {file!r}")
     scenario = _load_yaml(Path(file), name, key) if is_file else scenario_class(text)()
     scenario.validate()
+    if scenario.pedigree.reasons:
+        reasons = "; ".join(scenario.pedigree.reasons)
+        _log.warning("%s has numbers of a calibration that was not accepted: %s", source, reasons)
     return scenario
 
 

@@ -134,6 +134,27 @@ def test_pairs_that_are_improbable_together_are_dropped():
     np.testing.assert_array_equal(failed.mean, state.mean)
 
 
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("seed", [0, 3, 5])
+def test_track_is_judged_by_scans_of_two_detections_together(seed):
+    one, rng = drive(seed, ACCURATE), np.random.default_rng(seed)
+    pairs = [scan.select(rng.choice(len(scan), 2, replace=False)) for scan in one.scans]
+
+    def health_along(shift):
+        tracker = Tracker(one.map, correlation=ACCURATE.correlation)
+        state, found = tracker.start(one.poses[0] + shift, START)[0], []
+        for k in range(1, len(pairs)):
+            state, _ = tracker.update(tracker.predict(state, *one.motion(k), extent=PERIOD), pairs[k])
+            found.append((tracker.is_doubtful(state), tracker.is_lost(state)))
+        return np.array(found).T
+
+    doubtful, lost = health_along(np.zeros(3))
+    assert not lost.any() and doubtful.mean() < 0.2
+    # Elsewhere, most scans match nothing: six detections tell so, and then many more.
+    doubtful, lost = health_along(np.array([6.0, -5.0, 0.0]))
+    assert doubtful.argmax() <= 8 and lost[:24].any()
+
+
 def spread_out(places, deviation):
     n = len(places)
     return Landmarks(places, np.tile(deviation**2 * np.eye(2), (n, 1, 1)), np.full(n, 0.3), np.full(n, np.inf))

@@ -1,8 +1,8 @@
 """The health of a track: whether the estimate of a `Tracker` may be used, or is lost.
 
 *Failures.* A scan fails, and is not fused, if too few of its detections match, or too few of the landmarks that the
-last fused scan showed. The track is lost after ``patience`` failures in succession, or when position or heading are too
-uncertain.
+last fused scan showed. Scans with few detections are judged together, as soon as they have enough. The track is lost
+after ``patience`` failures in succession, or when position or heading are too uncertain.
 
 *Evidence.* The d² of a right first match is chi-square distributed, the d² of a match by chance is uniform within the
 gate γ of first matches. So the log-likelihood ratio of a match with d² is (a share ε = 0.2 of matches is by chance
@@ -38,7 +38,7 @@ _LEAST_SHARE = 0.15
 # A scan fails if it matches a smaller share of the landmarks that should be seen again.
 _LEAST_AGAIN = 0.25
 
-# The least number of detections, or of landmarks that should be seen again, for this test.
+# The least number of detections, or of landmarks that should be seen again, for this test, in one scan or several.
 _JUDGED_FROM = 6
 
 # With a larger standard deviation of the heading in rad, the track is lost: the linearization holds for small errors.
@@ -66,21 +66,32 @@ _TANGLED = 10.0
 _CHANCE = 0.2
 
 
-def fails(state: TrackState, detections: Landmarks, pairs: Indices) -> bool:
-    """Return whether a scan with these pairs of detection and landmark, (k, 2), fails.
+def judged(state: TrackState, detections: Landmarks, pairs: Indices) -> tuple[bool, Array]:
+    """Return whether a scan with these pairs of detection and landmark, (k, 2), fails, and what is still to be judged.
 
     Args:
         state: The state before the scan.
         detections: The detections of the scan, in H.
         pairs: Indices of the detection and of the landmark on the map.
+
+    Returns:
+        Whether it fails, and the counts for `TrackState.unjudged`, shape (2, 2).
     """
     matched, again = len(pairs), int(np.isin(pairs[:, 1], state.indices).sum())
     recent = state.landmark_positions[state.is_recent]
     # Near the largest distance of detections, landmarks are not seen reliably.
     reach = 0.7 * np.hypot(*detections.positions.T).max()
     expected = int((np.hypot(*(recent - state.mean[:2]).T) < reach).sum())
-    few = len(detections) >= _JUDGED_FROM and matched < _LEAST_SHARE * len(detections)
-    return few or (expected >= _JUDGED_FROM and again < _LEAST_AGAIN * expected)
+    fails, unjudged = False, np.zeros((2, 2))
+    scan = np.array([[len(detections), matched], [expected, again]], dtype=float)
+    for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN)):
+        # A scan with many is judged alone: those before it show another place.
+        count, found = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]
+        if count < _JUDGED_FROM:
+            unjudged[k] = count, found
+        elif found < least_share * count:
+            fails = True
+    return fails, unjudged
 
 
 def evidence(squares: Array, first_gate: float) -> float:

@@ -5,7 +5,7 @@ x = [X_WH; b; e; g; l_1; ...; l_n], see `vtbdrake.components.localization.tracki
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,10 @@ class TrackState:
         failures: The number of scans in succession that failed.
         distortion: The test statistic of a distorted map after the last scan that was fused.
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
+        unjudged: Of the last scans, which together had too few to be judged: the numbers of detections and of those
+            that matched, of landmarks that should be seen again and of those that were, shape (2, 2).
 
-    The last four are the health of the track, see `vtbdrake.components.localization.health`.
+    The last five are the health of the track, see `vtbdrake.components.localization.health`.
     """
 
     mean: Array
@@ -48,6 +50,7 @@ class TrackState:
     failures: int = 0
     distortion: float = 0.0
     drift: float = 1.0
+    unjudged: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     @classmethod
     def none(cls) -> TrackState:

@@ -251,20 +251,27 @@ class Tracker:
             return state, _NO_MATCHES
         detections = landmarks.widened(self.least_deviation)
         matches = self._associate(state, detections)
-        failed = replace(state, failures=state.failures + 1, drift=health.drift_after_failure(state))
-        if health.fails(state, detections, matches.pairs):
+        failed = replace(
+            state.with_arrays(unjudged=np.zeros((2, 2))),
+            failures=state.failures + 1,
+            drift=health.drift_after_failure(state),
+        )
+        fails, unjudged = health.judged(state, detections, matches.pairs)
+        if fails:
             return failed, Matches(matches.pairs)
         if len(matches.pairs) < 2:
-            return state, Matches(matches.pairs)
+            return state.with_arrays(unjudged=unjudged), Matches(matches.pairs)
         is_first = ~np.isin(matches.pairs[:, 1], state.indices)
         first = matches.select(is_first)
         extended = self._extended(state, first.pairs[:, 1], first.probability)
         fused, remaining = self._fused(extended, detections, np.vstack([matches.pairs[~is_first], first.pairs]))
         # Too few of the pairs may be left.
-        if health.fails(state, detections, remaining.pairs):
+        fails, unjudged = health.judged(state, detections, remaining.pairs)
+        if fails:
             return failed, Matches(remaining.pairs)
         evidence = min(self.credit, state.evidence + health.evidence(first.squares, self.first_gate))
         drift = health.drift_after(state, fused) if remaining.is_fused else state.drift
+        fused = fused.with_arrays(unjudged=unjudged)
         return replace(fused, evidence=evidence, failures=0, drift=drift), remaining
 
     def is_lost(self, state: TrackState) -> bool:
