@@ -96,6 +96,10 @@ def test_a_pose_on_a_sheared_map_becomes_doubtful():
     assert DOUBTFUL not in [answer.status for answer in right]
     assert wrong[-1].status == DOUBTFUL and not state.track.failures
     assert np.isnan(wrong[-1].pose).all() and np.isinf(wrong[-1].covariance[0, 0])
+    # It does not stay so for ever: after a while, the place is searched for again.
+    again, state = run(replace(unit_for(sheared), doubt_length=2.0), one.scans, one.reckoned)
+    first = [answer.status for answer in again].index(LOST)
+    assert [answer.status for answer in wrong][first - 1 : first + 1] == [DOUBTFUL, DOUBTFUL] and state.losses
 
 
 @pytest.mark.slow

@@ -95,6 +95,7 @@ class UnitState:
         tried_at: Distance travelled in m and time in s at the last attempt of global localization, shape (2,).
         ignored: The number of calls that were ignored, see `LocalizationUnit.step`.
         losses: The number of times that the track was lost.
+        doubted: The distance travelled since the track became doubtful, in m; 0 if it is not.
     """
 
     answer: Localization = field(default_factory=Localization.unknown)
@@ -103,6 +104,7 @@ class UnitState:
     tried_at: Array = field(default_factory=lambda: np.array([-inf, -inf]))
     ignored: int = 0
     losses: int = 0
+    doubted: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +130,12 @@ class LocalizationUnit:
         unit="m, s",
         ge=0.0,
         finite=False,
+    )
+    doubt_length: float = setting(
+        40.0,
+        "The distance over which a track may be doubtful before it is lost, and searched for again.",
+        unit="m",
+        gt=0.0,
     )
     begins_with_submap: bool = setting(
         False,
@@ -175,11 +183,13 @@ class LocalizationUnit:
             extent = self.drift.extent(motion, duration)
             predicted = self.tracker.predict(state.track, motion, C, extent=extent)
             track, matches = self.tracker.update(predicted, landmarks)
-            if not self.tracker.is_lost(track):
+            is_doubtful = self.tracker.is_doubtful(track)
+            doubted = state.doubted + float(np.hypot(*motion[:2])) if is_doubtful else 0.0
+            if not self.tracker.is_lost(track) and doubted <= self.doubt_length:
                 answer = self._answer(track, matches, len(landmarks), pose, time)
-                if self.tracker.is_doubtful(track):
+                if is_doubtful:
                     answer = Localization.unknown(DOUBTFUL, time=time, X_OH=pose, detected=len(landmarks))
-                return answer, replace(state, answer=answer, track=track)
+                return answer, replace(state, answer=answer, track=track, doubted=doubted)
             lost = Localization.unknown(LOST, time=time, X_OH=pose, detected=len(landmarks))
             submap = Submap.empty(pose).with_scan(landmarks, least_deviation=self.locator.least_deviation)
             return lost, UnitState(lost, submap=submap, ignored=state.ignored, losses=state.losses + 1)
