@@ -13,7 +13,9 @@ from mcap.writer import Writer
 
 from tests.real import recordings
 from vtbdrake.recording.log_format import LogError
+from vtbdrake.recording.log_reader import read_log
 from vtbdrake.recording.table_reader import read_table
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 pytestmark = pytest.mark.one_python
 
@@ -134,6 +136,8 @@ def test_bad_table_is_refused(table: dict[str, object], options: dict[str, objec
     ("name", "content", "message"),
     [
         ("a.xlsx", "x", "a table ends in .csv, .dat, .txt, .npz, .parquet, .mcap"),
+        ("a.lcm", "x", "Logs of the loop or of lcm-logger are read by read_log"),
+        ("a.mcap", "x", "is no MCAP file: it does not begin as one"),
         ("a.csv", "", "fewer than two lines"),
         ("a.csv", "time,q,q\n0,1,2\n", "two columns 'q'"),
         ("a.csv", "time,q\n0,1\n1\n2,3\n", "row 1 has 1 columns, not 2"),
@@ -144,6 +148,22 @@ def test_bad_file_is_refused(tmp_path: Path, name: str, content: str, message: s
     (tmp_path / name).write_text(content)
     with pytest.raises(LogError, match=message):
         read_table(tmp_path / name, sense={"q": "q"})
+
+
+def test_mcap_of_its_first_bytes_alone_has_no_column(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(LogError, match="has no column 'q'; it has: none"):
+        read_table(path, sense={"q": "q"})
+
+
+def test_table_is_no_log_and_the_error_says_what_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,q\n0,1\n")
+    with pytest.raises(LogError, match="is not a log of a control loop.*; read_table reads text, .npz, Parquet, MCAP"):
+        read_log(path)
+    with pytest.raises(LogError, match="is not an LCM log: it has no whole event; read_table reads text"):
+        read_log(path, CartPoleScenario())
 
 
 def test_recordings_of_real_robots_are_read_as_they_are() -> None:

@@ -12,6 +12,9 @@ import numpy as np
 from vtbdrake.recording.log_codec import find_events
 from vtbdrake.recording.log_format import LOG, OWN_PREFIX, LogError
 
+NO_LCM_LOG = "read_table reads text, .npz, Parquet, MCAP, bags of ROS and data sets of LeRobot"
+"""The remedy for a file that has no event of LCM."""
+
 _NO_EVENTS = np.empty((0, 4), np.int64)
 
 

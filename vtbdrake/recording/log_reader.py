@@ -27,7 +27,7 @@ from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.lcm_types.lcmt_vtb_state import lcmt_vtb_state
 from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_codec import whole_cycles
-from vtbdrake.recording.log_events import Damage, LogEvents, Message
+from vtbdrake.recording.log_events import NO_LCM_LOG, Damage, LogEvents, Message
 from vtbdrake.recording.log_format import (
     CHANGE,
     COMMANDED,
@@ -448,10 +448,12 @@ def _control_log(path: Path, events: LogEvents) -> ControlLog:
 def _read_start(path: Path, events: LogEvents) -> tuple[LogHeader, Snapshot]:
     if not events.of_loop:
         where = f"; {events.damages[0][1]} at byte {events.damages[0][0]}" if events.damages else ""
-        raise LogError(
-            f"{path} is not a log of a control loop: it has no event on {LOG}{where}; an LCM log of another program is "
-            "read through the protocol of its machine: read_log(path, scenario)"
+        remedy = (
+            "an LCM log of another program is read through the protocol of its machine: read_log(path, scenario)"
+            if events.channels
+            else NO_LCM_LOG
         )
+        raise LogError(f"{path} is not a log of a control loop: it has no event on {LOG}{where}; {remedy}")
     try:
         first = decode(lcmt_vtb_log, events.data(*events.on(LOG)[0][2:]))
         if zlib.crc32(first.header.encode()) != first.crc & 0xFFFFFFFF:

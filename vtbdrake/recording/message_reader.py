@@ -145,9 +145,10 @@ class McapTable(MessageTable):
 
     @property
     def _is_cut(self) -> bool:
+        size = self.path.stat().st_size
         with self.path.open("rb") as file:
-            file.seek(max(self.path.stat().st_size - len(_MAGIC), 0))
-            return file.read() != _MAGIC
+            file.seek(max(size - len(_MAGIC), 0))
+            return file.read() != _MAGIC or size < 2 * len(_MAGIC)
 
     def _summary_topics(self) -> Iterator[str]:
         with self.path.open("rb") as file:

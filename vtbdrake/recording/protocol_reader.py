@@ -16,7 +16,7 @@ from vtbdrake.lcm.lcm_bridge import ChannelReader
 from vtbdrake.lcm.maps import LcmMap
 from vtbdrake.lcm.protocol import protocol_of
 from vtbdrake.recording.log import Log, Series, checked_series
-from vtbdrake.recording.log_events import LogEvents
+from vtbdrake.recording.log_events import NO_LCM_LOG, LogEvents
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.testbed import Scenario, Signal
 
@@ -44,7 +44,7 @@ def read_by_protocol(events: LogEvents, source: str, scenario: Scenario) -> Log:
         ProtocolError: The scenario has no protocol.
     """
     if not events.channels:
-        raise LogError(f"{source} is not an LCM log: it has no whole event")
+        raise LogError(f"{source} is not an LCM log: it has no whole event; {NO_LCM_LOG}")
     protocol, interface = protocol_of(scenario), scenario.interface()
     reports = Reports(interface, protocol.reported, protocol.robot_mode)
     remarks = [f"{source}: recorded by another program: no switches, and no state of the DPS"]

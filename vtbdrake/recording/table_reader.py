@@ -197,8 +197,8 @@ def _read_file(path: Path) -> Table:
     suffix = path.suffix.lower()
     if suffix not in READERS:
         raise LogError(
-            f"{path}: a table ends in {', '.join(READERS)}. Read another format with its library, and give the "
-            'columns: read_table({"time": t, "q": q}, ...)'
+            f"{path}: a table ends in {', '.join(READERS)}. Logs of the loop or of lcm-logger are read by read_log. "
+            'Read another format with its library, and give the columns: read_table({"time": t, "q": q}, ...)'
         )
     return READERS[suffix](path)
 
