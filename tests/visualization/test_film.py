@@ -7,6 +7,7 @@ from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
+import pandas
 import pytest
 from click.testing import CliRunner
 from PIL import Image, ImageSequence
@@ -15,8 +16,12 @@ from pydrake.geometry import Meshcat
 from tests.testbeds import AcrobotScenario
 from vtbdrake.cli import main
 from vtbdrake.components.rendering import check_rendering
+from vtbdrake.machine.config import MachineConfig
 from vtbdrake.optimization import Motion
+from vtbdrake.recording import Recorder
+from vtbdrake.testing import LockStep
 from vtbdrake.visualization import Scene, make_meshcat, show_motion, show_motions, show_poses
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 WIDTH, HEIGHT = 160, 120
 
@@ -105,3 +110,25 @@ def test_command_line_films_a_rollout(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert frames(path)[0]["size"] == (640, 480)
+
+
+@pytest.mark.slow
+def test_command_line_films_a_replay(tmp_path: Path) -> None:
+    log, path, columns = tmp_path / "pole.lcm", tmp_path / "film.gif", tmp_path / "angle.csv"
+    config = MachineConfig(values={"sim.sys.cart_pole.pole_pin.position": 1.2})
+    with LockStep(CartPoleScenario(), config=config) as loop, Recorder(loop.runtime, log):
+        loop.runtime.take_over(timeout=1.0)
+        loop.runtime.run(cycles=25)
+    arguments = ["replay", str(log), "--scenario", "cart_pole", "--film", str(path)]
+    arguments += ["--record", "real.sense.joint_position", "--out", str(columns)]
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    meta, pictures = frames(path)
+    replayed = pandas.read_csv(columns)
+    assert (
+        meta["size"] == (640, 480)
+        and len(pictures) == np.floor(20.0 * (replayed["t"].iloc[-1] - replayed["t"].iloc[0])) + 1
+    )
+    # The pole swings down on its own: where the angle changed between two pictures, the pictures differ.
+    assert np.ptp(replayed["real.sense.joint_position[1]"]) > 0.5
+    assert (pictures[0] != pictures[-1]).any(axis=2).sum() > 500

@@ -33,12 +33,14 @@ def loop_log(log: Path, scenario: str | None) -> ControlLog:
 
     Args:
         log: The file of the log.
-        scenario: The scenario that the user has named, a short name or ``MODULE:CLASS``; None if none was named.
+        scenario: The scenario that the user has named: a short name, ``MODULE:CLASS`` or ``FILE.py:CLASS``; None if
+            none was named.
 
     Raises:
         click.UsageError: The scenario is another one, or was not named.
         LogError: The file is no log, or of a script or a notebook.
     """
+    from vtbdrake.common.scenario_names import ScenarioNameError, full_name, importable_name
     from vtbdrake.recording import read_log
     from vtbdrake.testbed.scenario import class_name
     from vtbdrake.testbed.scenario_file import scenario_class
@@ -52,8 +54,13 @@ def loop_log(log: Path, scenario: str | None) -> ControlLog:
             f"{log} is of the scenario {recorded}, and importing that runs its code: if you trust it, add "
             f"--scenario {recorded}"
         )
-    if scenario is not None and (requested := class_name(scenario_class(scenario))) != recorded:
-        raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
+    if scenario is not None:
+        try:
+            named = importable_name(full_name(scenario))
+        except ScenarioNameError as error:
+            raise click.UsageError(str(error)) from error
+        if (requested := class_name(scenario_class(named))) != recorded:
+            raise click.UsageError(f"{log} is of the scenario {recorded or '(unknown)'}, not of {requested}")
     return opened
 
 
