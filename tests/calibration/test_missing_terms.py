@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from tests.calibration.pendulum import PendulumScenario
+from tests.calibration.pendulum import DRIVES, PendulumScenario
 from tests.calibration.plain_pendulum import commanded, recorded
-from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, VALUES, VISCOUS, calibrated
+from tests.calibration.test_calibration import COULOMB, FIRST, MOMENT, PARAMETERS, VALUES, VISCOUS, calibrated
 from vtbdrake.calibration import Calibration, calibrate
 from vtbdrake.calibration.calibration import Verdict
 from vtbdrake.optimization import Parameter
@@ -42,6 +42,29 @@ def test_wrong_law_is_named(law: str, dependence: str) -> None:
     assert {each.verdict for each in result.parameters.values()} == {Verdict.DISCREPANT}
     (reason,) = result.reasons
     assert reason.startswith(f"the torque of pivot depends on {dependence}")
+
+
+@pytest.mark.parametrize(
+    ("law", "term", "truth"),
+    [("load", "load_friction", 0.1), pytest.param("direction", "asymmetry", 0.06, marks=pytest.mark.slow)],
+)
+def test_term_that_was_named_is_calibrated(law: str, term: str, truth: float) -> None:
+    address = f"{DRIVES}.{term}[0]"
+    result = calibrated(
+        recorded(law, seed=20), [*PARAMETERS, Parameter(address, -0.5 if law == "direction" else 0.0, 0.5)]
+    )
+    assert not [reason for reason in result.reasons if "depends on" in reason]
+    assert result.parameters[address].value == pytest.approx(truth, rel=0.15)
+
+
+@pytest.mark.slow
+def test_with_stribecks_friction_the_rest_of_the_law_is_right() -> None:
+    """Near rest the machine sticks, which smooth friction does not: so the term itself is not the machine's."""
+    stribeck = [Parameter(f"{DRIVES}.stribeck[0]", 0.0, 0.5), Parameter(f"{DRIVES}.stribeck_velocity[0]", 0.05, 1.0)]
+    result = calibrated(recorded("Stribeck", seed=20), [*PARAMETERS, *stribeck])
+    assert not [reason for reason in result.reasons if "depends on" in reason]
+    assert result.parameters[COULOMB].value == pytest.approx(0.2, rel=0.05)
+    assert result.parameters[VISCOUS].value == pytest.approx(0.03, rel=0.1)
 
 
 def test_size_of_a_missing_torque_is_told() -> None:

@@ -388,7 +388,8 @@ class Segments:
         motors = [self.model.motor(recording.times, recording.u, z)[0] for recording in self._recordings]
         m = np.stack([motors[i][span][:-1] for i, span in self._pieces], axis=1)
         v = self.trajectory[:-1, :, self.model.nq :].reshape(-1, self.model.nq)
-        friction = np.asarray(self.model.friction.map(len(v))(v.T, np.tile(z[:, np.newaxis], (1, len(v))))).T
+        arguments = v.T, m.reshape(len(v), -1).T, np.tile(z[:, np.newaxis], (1, len(v)))
+        friction = np.asarray(self.model.friction.map(len(v))(*arguments)).T
         return m @ self.model.selection.T, friction.reshape(*m.shape[:2], self.model.nq)
 
     def innovations(self, noise: Noise, model: Linearization) -> Innovations:

@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context
 from vtbdrake.common.argument_checks import suggestion
 from vtbdrake.common.arrays import Array
 from vtbdrake.components.actuators import JointDrives
+from vtbdrake.components.actuators.joint_drives import FRICTION, friction_torque
 from vtbdrake.components.casadi_system.kernel import Expression
 from vtbdrake.components.compiled_plant import PlantDynamics
 from vtbdrake.optimization import Parameter
@@ -29,12 +30,12 @@ from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.testbed.inertia import INERTIA_SIZE, inertia_of
 
 _WORLD = re.compile(r"sim\.(?:sys|env)\.(.*?)(?:\[(\d+)\])?$")
-_DRIVE = re.compile(r"(sim\.act\.\w+)\.(viscous|coulomb|time_constant|delay)(?:\[(\d+)\])?$")
+_TIMES = ("delay", "time_constant")
+# The edge of Coulomb friction is the model's simplification.
+_VARIED = "|".join([*(name for name in FRICTION if name != "coulomb_velocity"), *_TIMES])
+_DRIVE = re.compile(rf"(sim\.act\.\w+)\.({_VARIED})(?:\[(\d+)\])?$")
 _PARTS = ("mass", "center_of_mass", "inertia")
 _WHOLE = "whole"
-_FRICTION = ("viscous", "coulomb", "coulomb_velocity")
-_NO_FRICTION = {"viscous": 0.0, "coulomb": 0.0, "coulomb_velocity": 1.0}
-_TIMES = ("delay", "time_constant")
 _TINY = 1e-12
 
 
@@ -105,8 +106,8 @@ class JointModel:
     Args:
         testbed: The testbed. What acts on its plant beside the actuation (contact, pushes) is left out.
         parameters: The varied numbers: of the plant (``mass``, ``center_of_mass[i]``, ``inertia[i]``, ``damping``,
-            ``rotor_inertia``, ``pose[i]``), and of a `JointDrives` (``viscous[i]``, ``coulomb[i]``, ``time_constant``,
-            ``delay``).
+            ``rotor_inertia``, ``pose[i]``), and of a `JointDrives` (``viscous[i]``, ``coulomb[i]``, ``stribeck[i]``,
+            ``stribeck_velocity[i]``, ``load_friction[i]``, ``asymmetry[i]``, ``time_constant``, ``delay``).
         inertias: The bodies whose inertia is varied as a whole.
         measured_torque: The torques were measured in the drives: they act at once.
 
@@ -241,14 +242,13 @@ class JointModel:
         )
         self.selection: Array = plant.MakeActuationMatrix()
         selection = casadi.SX(casadi.DM(self.selection))
-        drive = {name: self._drive_parameter(name, testbed, context, z) for name in _FRICTION}
+        drive = {name: self._drive_parameter(name, testbed, context, z) for name in FRICTION}
         q, v, m = dynamics.symbols()
         a, h = casadi.SX.sym("a", self.nq), casadi.SX.sym("h")
         x, v_before = casadi.vertcat(q, v), casadi.SX.sym("v_before", self.nq)
 
         def friction(velocities: Expression) -> Expression:
-            speeds = selection.T @ velocities
-            return drive["viscous"] * speeds + drive["coulomb"] * casadi.tanh(speeds / drive["coulomb_velocity"])
+            return friction_torque(selection.T @ velocities, m, drive)
 
         def driven(velocities: Expression) -> Expression:
             return selection @ (m - friction(velocities))
@@ -268,7 +268,7 @@ class JointModel:
         sharpness = drive["coulomb"] / (selection.T @ casadi.diag(inertia)) / drive["coulomb_velocity"]
         self.chatter = casadi.Function("chatter", [q, z], [casadi.densify(self._drive_period * sharpness)])
         lost = selection @ friction(v) + dynamics.substituted([dynamics.damping_torque(v)], inputs)[0]
-        self.friction = casadi.Function("friction", [v, z], [casadi.densify(lost)])
+        self.friction = casadi.Function("friction", [v, m, z], [casadi.densify(lost)])
         self.unexplained = casadi.Function("unexplained", [q, v, a, m, z], [needed], {"cse": True})
         f = casadi.Function("rate", [x, held_torque, z], [rate])
         following = step[0] if step else _runge_kutta(lambda state: f(state, tau, z), x, h)
@@ -311,8 +311,10 @@ class JointModel:
     def _drive_parameter(self, name: str, testbed: VirtualTestbed, context: Context, z: Expression) -> Expression:
         """Return a parameter of the drives by actuator, (nu, 1)."""
         if not self.drives:
-            return casadi.SX(casadi.DM(np.full(self.nu, _NO_FRICTION[name])))
-        value = casadi.SX(casadi.DM(np.maximum(testbed.read(context, f"{self.drives}.{name}"), _TINY)))
+            return casadi.SX(casadi.DM(np.full(self.nu, float(name.endswith("velocity")))))
+        numbers = np.asarray(testbed.read(context, f"{self.drives}.{name}"))
+        # At a velocity of 0, some derivatives are not finite.
+        value = casadi.SX(casadi.DM(np.maximum(numbers, _TINY) if name.endswith("velocity") else numbers))
         for k, parameter in enumerate(self.names[: self.scalars]):
             if (match := _DRIVE.match(parameter)) and match[2] == name:
                 value[slice(None) if match[3] is None else int(match[3])] = z[k]

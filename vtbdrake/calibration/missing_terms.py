@@ -150,13 +150,13 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
         rms = _rms(friction[..., j]) or _rms(load)
         if rms > 0.0:
             shapes = {
-                "the direction of its motion (friction that is not the same in both)": [np.ones_like(v), sign],
-                "its speed near rest (Stribeck's friction)": [
+                "the direction of its motion (asymmetry of the drives)": [np.ones_like(v), sign],
+                "its speed near rest (stribeck of the drives)": [
                     sign * np.exp(-((v / max(width, _WIDER * model.edges[j])) ** 2))
                     for width in np.quantile(speed, _SLOW)
                 ],
                 "its speed (friction that is not linear in it)": [v * speed],
-                "its load (friction that grows with the torque)": [sign * abs(load)],
+                "its load (load_friction of the drives)": [sign * abs(load)],
                 "its position": [np.sin(q), np.cos(q), np.sin(2.0 * q), np.cos(2.0 * q)],
             }
             for what, torques in shapes.items():

@@ -98,6 +98,14 @@ def test_friction_opposes_the_motion() -> None:
     np.testing.assert_allclose(y, [expected] * 2, atol=1e-12)
 
 
+def test_friction_depends_on_speed_load_and_direction() -> None:
+    v = np.array([0.3, -0.2])
+    law = {"coulomb": 1.0, "coulomb_velocity": 1e-6, "stribeck": [0.5, 0.4], "stribeck_velocity": 0.25}
+    y = torques(2, v=tuple(v), load_friction=0.1, asymmetry=[0.2, -0.3], **law)
+    size = 1.0 + np.array([0.5, 0.4]) * np.exp(-((v / 0.25) ** 2)) + 0.1 * np.array([8.0, 4.0])
+    np.testing.assert_allclose(y, [np.array([8.0, -4.0]) - size * [1.0, -1.0] - [0.2, -0.3]] * 2, atol=1e-12)
+
+
 def test_friction_does_not_pass_the_current_loop() -> None:
     np.testing.assert_allclose(
         torques(1, u=lambda k: [0.0, 0.0], v=(1.0, 0.0), viscous=2.0, time_constant=1.0)[0, 0], -2.0
@@ -118,6 +126,10 @@ def test_every_value_is_a_variable() -> None:
         "viscous",
         "coulomb",
         "coulomb_velocity",
+        "stribeck",
+        "stribeck_velocity",
+        "load_friction",
+        "asymmetry",
         "time_constant",
         "delay",
     ]
@@ -128,6 +140,7 @@ def test_every_value_is_a_variable() -> None:
     [
         ({"limit": -1.0}, "limit must not be negative"),
         ({"viscous": [0.0, np.nan]}, "viscous must not be negative or NaN"),
+        ({"load_friction": -0.1}, "load_friction must not be negative"),
         ({"delay": 1.5}, "whole number of periods"),
         ({"period": 0.0}, "period must be positive"),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, DiscreteValues
 
-from vtbdrake.components.casadi_system.kernel import Kernel, clamp
+from vtbdrake.components.casadi_system.kernel import Expression, Kernel, clamp
 from vtbdrake.state import AddressedSystem, Quantity
 
 if TYPE_CHECKING:
@@ -38,13 +38,18 @@ class JointDrives(AddressedSystem):
 
         r_k = clip(u_{k-delay}, +- limit), no further than rate T from r_{k-1}          (amplifier)
         m_k = m_{k-1} + (1 - exp(-T / time_constant)) (r_k - m_{k-1})                   (current loop)
-        torque = m_k - viscous v - coulomb tanh(v / coulomb_velocity)                   (friction in gear and bearings)
+        torque = m_k - friction(v, m_k)                                                 (friction in gear and bearings)
+        friction = viscous v + asymmetry + tanh(v / coulomb_velocity)
+                   (coulomb + stribeck exp(-(v / stribeck_velocity)^2) + load_friction |m_k|)
 
     The current loop is first-order, the exact solution for a reference that is held; with a time constant of 0 it is
     ideal. A gear without backlash multiplies torque and divides speed: everything here is on its output side.
     What remains of it is the rotor's inertia, ``gear_ratio^2 rotor_inertia`` about the joint's axis, which belongs to
-    the plant's mass matrix: give both to the plant's JointActuator. Friction is smooth: a joint at rest under a load
-    below ``coulomb`` creeps instead of sticking, and with a step T that is not small against
+    the plant's mass matrix: give both to the plant's JointActuator.
+
+    Friction is larger near rest by ``stribeck``, grows with the motor's torque by ``load_friction``, and is larger by
+    ``asymmetry`` in positive direction, and smaller in negative one; these are 0 by default. It is smooth: a joint at
+    rest under a load below ``coulomb`` creeps instead of sticking, and with a step T that is not small against
     M coulomb_velocity / coulomb it chatters.
 
     The output is the system's state. A command that is itself a state of period T is thus read one period after it was
@@ -65,6 +70,10 @@ class JointDrives(AddressedSystem):
         viscous: ArrayLike = 0.0,
         coulomb: ArrayLike = 0.0,
         coulomb_velocity: ArrayLike = 0.01,
+        stribeck: ArrayLike = 0.0,
+        stribeck_velocity: ArrayLike = 0.1,
+        load_friction: ArrayLike = 0.0,
+        asymmetry: ArrayLike = 0.0,
         delay: int = 0,
         max_delay: int = 0,
         initial: ArrayLike = 0.0,
@@ -81,6 +90,11 @@ class JointDrives(AddressedSystem):
             viscous: Viscous friction in N m s/rad; a scalar or shape (n,).
             coulomb: Coulomb friction in N m; a scalar or shape (n,).
             coulomb_velocity: Velocity scale of the Coulomb friction in rad/s; a scalar or shape (n,).
+            stribeck: What friction near rest exceeds Coulomb friction by, in N m; a scalar or shape (n,).
+            stribeck_velocity: Velocity scale of that in rad/s; a scalar or shape (n,).
+            load_friction: Friction per torque of the motor; a scalar or shape (n,).
+            asymmetry: What resists motion in positive direction, and helps it in negative one, in N m; a scalar or
+                shape (n,).
             delay: Delay of the command in whole periods.
             max_delay: The largest delay that can be set in the Context, in whole periods; at least ``delay``.
             initial: The torque in N m before the first sample, both commanded and reached; a scalar or shape (n,).
@@ -102,6 +116,10 @@ class JointDrives(AddressedSystem):
             "viscous": viscous,
             "coulomb": coulomb,
             "coulomb_velocity": coulomb_velocity,
+            "stribeck": stribeck,
+            "stribeck_velocity": stribeck_velocity,
+            "load_friction": load_friction,
+            "asymmetry": asymmetry,
         }
         entries = {name: np.broadcast_to(np.asarray(value, dtype=float), (n,)) for name, value in by_joint.items()}
         self.max_delay = max(int(delay), int(max_delay))
@@ -119,9 +137,8 @@ class JointDrives(AddressedSystem):
         if self.max_delay:
             memory["in_transit"] = Quantity(np.tile(before, (self.max_delay, 1)), "N m")
         self._memory = self.declare_discrete_state(**memory)
-        units = {"limit": "N m", "rate": "N m/s", "viscous": "N m s/rad", "coulomb": "N m", "coulomb_velocity": "rad/s"}
         self._settings = self.declare_parameters(
-            **{name: Quantity(value, units[name], (0.0, inf)) for name, value in entries.items()},
+            **{name: Quantity(value, _UNITS[name], (_lowest(name), inf)) for name, value in entries.items()},
             time_constant=Quantity(time_constant, "s", (0.0, inf)),
             delay=Quantity(delay, "period", (0.0, float(self.max_delay))),
         )
@@ -156,24 +173,66 @@ class JointDrives(AddressedSystem):
         memory[: 2 * n] = y[n:]
 
 
+# Law of friction, by the names of its numbers for each joint, in the order of the parameters; the units of all numbers.
+FRICTION = (
+    "viscous",
+    "coulomb",
+    "coulomb_velocity",
+    "stribeck",
+    "stribeck_velocity",
+    "load_friction",
+    "asymmetry",
+)
+_UNITS = {
+    "limit": "N m",
+    "rate": "N m/s",
+    "viscous": "N m s/rad",
+    "coulomb": "N m",
+    "coulomb_velocity": "rad/s",
+    "stribeck": "N m",
+    "stribeck_velocity": "rad/s",
+    "load_friction": "1",
+    "asymmetry": "N m",
+}
+
+
+def _lowest(name: str) -> float:
+    return -inf if name == "asymmetry" else 0.0
+
+
+def friction_torque(v: Expression, motor: Expression, law: Mapping[str, Expression]) -> Expression:
+    """Return the torques by which friction resists, in N m, (n, 1).
+
+    Args:
+        v: Velocities of the joints in rad/s, (n, 1).
+        motor: Torques of their motors in N m, (n, 1).
+        law: The numbers of `FRICTION`, by name, (n, 1) each.
+    """
+    # A velocity of 0 makes the friction a step.
+    near_rest = casadi.exp(-((v / casadi.fmax(law["stribeck_velocity"], _TINY)) ** 2))
+    size = law["coulomb"] + law["stribeck"] * near_rest + law["load_friction"] * casadi.fabs(motor)
+    direction = casadi.tanh(v / casadi.fmax(law["coulomb_velocity"], _TINY))
+    return law["viscous"] * v + size * direction + law["asymmetry"]
+
+
 def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
     """Return [torque; m_k; r_k] as a kernel of (parameters, [m_{k-1}; r_{k-1}], delayed command, [q; v]).
 
     ``velocities`` are the places of the joints' velocities in [q; v], which has ``states`` entries.
     """
     n = len(velocities)
-    values, memory = casadi.SX.sym("values", 5 * n + 2), casadi.SX.sym("memory", 2 * n)
+    count = len(_UNITS)
+    values, memory = casadi.SX.sym("values", count * n + 2), casadi.SX.sym("memory", 2 * n)
     u, x = casadi.SX.sym("u", n), casadi.SX.sym("x", states)
-    limit, rate, viscous, coulomb, coulomb_velocity = casadi.vertsplit(values[: 5 * n], n)
+    by_joint = dict(zip(_UNITS, casadi.vertsplit(values[: count * n], n), strict=True))
+    limit, rate = by_joint["limit"], by_joint["rate"]
     motor, last = casadi.vertsplit(memory, n)
     reach = rate * period
     reference = clamp(clamp(u, -limit, limit), last - reach, last + reach)
     # 1 where the time constant is 0.
-    gain = -casadi.expm1(-period / values[5 * n])
+    gain = -casadi.expm1(-period / values[count * n])
     following = motor + gain * (reference - motor)
-    v = x[velocities]
-    # A velocity of 0 makes the friction a step.
-    friction = viscous * v + coulomb * casadi.tanh(v / casadi.fmax(coulomb_velocity, _TINY))
+    friction = friction_torque(x[velocities], following, by_joint)
     y = casadi.vertcat(following - friction, following, reference)
     return Kernel("drives", [values, memory, u, x], y, compile=False)
 
@@ -182,7 +241,7 @@ def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:
     if not 0.0 < period < inf:
         raise ValueError(f"JointDrives: period must be positive, in seconds, not {period}")
     for name, value in values.items():
-        if np.isnan(value).any() or (value < 0.0).any():
+        if np.isnan(value).any() or (value < _lowest(name)).any():
             raise ValueError(f"JointDrives: {name} must not be negative or NaN, but is {value.tolist()}")
     if values["delay"] != np.round(values["delay"]):
         raise ValueError(f"JointDrives: delay is a whole number of periods, not {values['delay']}")
