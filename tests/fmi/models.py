@@ -126,6 +126,7 @@ MODELS = {
     ),
     # For the test that counts its instances.
     "Counted": Model([state("x", "0")], "v[X] += h;"),
+    "Broken": Model([state("x", "0")], "extern double nobody; v[X] += nobody;"),
     "Foreign": Model([Var("x", "output")], "", platform="x86_64-windows"),
     "Exchange": Model([Var("x", "output")], "", interface="ModelExchange"),
     "Integrator2": Model(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -315,6 +317,14 @@ def test_contact_is_part_of_a_native_fmu(tmp_path: Path) -> None:
     np.testing.assert_array_equal(result["plant.state"], batch.outputs["plant.state"][0])
 
 
+def test_a_scenario_that_no_process_can_import_is_not_coupled(tmp_path: Path) -> None:
+    class LocalScenario(WaveScenario):
+        """A scenario within a function."""
+
+    with pytest.raises(ValueError, match=r"cannot import .*LocalScenario: define the scenario in a module"):
+        export_fmu(LocalScenario(), tmp_path / "x.fmu", part="dps", kind="coupled")
+
+
 @pytest.mark.slow
 def test_coupled_trajectories_equal_drakes(coupled: Path) -> None:
     assert validate_fmu(str(coupled)) == []
@@ -339,6 +349,25 @@ def test_a_coupled_fmu_saves_its_state_and_tells_its_errors(coupled: Path) -> No
         with pytest.raises(fmpy.fmi1.FMICallException):
             instance.setFloat64([reference(MASS)], [-1.0])
         assert f"{MASS} must be finite and lie in" in said[-1]
+
+
+def children() -> set[str]:
+    return {pid for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()}
+
+
+@pytest.mark.slow
+def test_the_process_of_a_coupled_fmu_ends_with_it_and_its_death_is_an_error(coupled: Path) -> None:
+    before = children()
+    with slave(coupled, {}) as (instance, reference, said):
+        (child,) = children() - before
+        os.kill(int(child), signal.SIGKILL)
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            steps(instance, reference, 0, 1)
+        assert "the Python process of the FMU has ended" in said[-1]
+    with slave(coupled, {}) as (instance, reference, _):
+        steps(instance, reference, 0, 1)
+        assert len(children() - before) == 1
+    assert children() == before
 
 
 @pytest.mark.slow

@@ -279,6 +279,10 @@ def test_files_that_are_no_fmu_for_this_computer_are_refused(fmu: Fmu, tmp_path:
         FmuSystem(fmu("Exchange"))
     with pytest.raises(FileNotFoundError, match=r"there is no FMU .*absent.fmu"):
         FmuSystem(tmp_path / "absent.fmu")
+    here = Path.cwd()
+    with pytest.raises(FmuError, match=r"Broken.fmu cannot be loaded: .*undefined symbol: nobody"):
+        FmuSystem(fmu("Broken"))
+    assert Path.cwd() == here  # which FMPy changes
     (tmp_path / "text.fmu").write_text("no zip")
     with pytest.raises(ValueError, match=r"text.fmu is no FMU that FMPy can read: "):
         FmuSystem(tmp_path / "text.fmu")

@@ -62,6 +62,7 @@ def export_fmu(
       vtbdrake export-fmu cart_pole cart_pole.fmu --output plant.state --output dps.force
       vtbdrake export-fmu cart_pole controller.fmu --part dps
     """
+    from vtbdrake.common.extras import extra_module
     from vtbdrake.fmi import export_fmu as export
 
     export(
@@ -74,9 +75,8 @@ def export_fmu(
         kind=kind,
         step=step,
     )
-    from fmpy import read_model_description
-
-    variables = read_model_description(str(out)).modelVariables
+    fmpy = extra_module("fmpy", purpose="export-fmu", extra="fmi")
+    variables = fmpy.read_model_description(str(out)).modelVariables
     rows = [f"{variable.causality:11} {variable.name}" for variable in variables]
     described = [{"name": variable.name, "causality": variable.causality} for variable in variables]
     show("\n".join(rows), {"file": out, "variables": described})

@@ -148,12 +148,19 @@ def _rows(kind: str, variables: Sequence[ExportedVariable]) -> list[str]:
 
 
 def _resources(part: ExportedPart) -> dict[str, bytes]:
-    """Return the files from which the Python process of a coupled FMU makes the part again."""
+    """Return the files from which the Python process of a coupled FMU makes the part again.
+
+    Raises:
+        ValueError: The process could not import the scenario.
+    """
+    name = part.scenario.name()
+    if name.startswith("__main__:") or "<locals>" in name:
+        raise ValueError(f"the Python process of a coupled FMU cannot import {name}: define the scenario in a module")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / SCENARIO
         part.scenario.save(file)
         scenario = file.read_bytes()
-    arguments = json.dumps({"scenario": part.scenario.name(), "part": part.part, **part.addresses()}, indent=1).encode()
+    arguments = json.dumps({"scenario": name, "part": part.part, **part.addresses()}, indent=1).encode()
     start = START.format(executable=sys.executable, path=search_path())
     return {
         f"resources/{SCENARIO}": scenario,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from math import prod
 from typing import Any, NamedTuple
@@ -215,6 +216,7 @@ def _world(scenario: Scenario) -> tuple[AddressedDiagram, dict[str, str], dict[s
         The Diagram; the addresses of its actuator signals; the addresses of its sensor signals.
     """
     scenario.validate()
+    scenario = copy.deepcopy(scenario)
     interface = scenario.interface()
     _refuse_abstract(interface)
     parts = VirtualTestbedBuilder(interface, simulator_config=scenario.simulator_config)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 import threading
 import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ _WARNING = 1
 _FATAL = 4
 # How many messages of an instance are kept for an error.
 _MESSAGES = 5
+# FMPy changes the current directory while it loads a library, and leaves it there if that fails.
+_LOADING = threading.Lock()
 
 
 class FmuError(RuntimeError):
@@ -213,7 +215,7 @@ class Instances:
             )
         instance.load(state.data)
 
-    @contextmanager
+    @contextlib.contextmanager
     def _explained(self, instance: _Instance, time: float) -> Iterator[None]:
         """Turn an error of FMPy's into one that names the time and what the FMU has logged."""
         instance.messages.clear()
@@ -226,7 +228,7 @@ class Instances:
                 f"{self._fmu.name} fails at t = {time:g} s: {one_line(error).rstrip('.')}: {said}"
             ) from error
 
-    @contextmanager
+    @contextlib.contextmanager
     def _used(self, state: FmuState | None) -> Iterator[_Instance]:
         instance = self._taken(state)
         try:
@@ -280,9 +282,10 @@ class _Instance:
                 messages.append(" ".join(message.decode(errors="replace").split()))
 
         try:
-            self.slave = fmu.fmpy.simulation.instantiate_fmu(
-                folder, fmu.description, "CoSimulation", logger=log, debug_logging=True
-            )
+            with _LOADING, contextlib.chdir("."):
+                self.slave = fmu.fmpy.simulation.instantiate_fmu(
+                    folder, fmu.description, "CoSimulation", logger=log, debug_logging=True
+                )
         except Exception as error:  # FMPy raises plain exceptions.
             said = "; ".join(messages)
             raise FmuError(f"{fmu.name} cannot be loaded: {one_line(error)}{said and f': {said}'}") from error
@@ -333,13 +336,13 @@ class _Instance:
 
     def free(self) -> None:
         """Free the instance."""
-        with suppress(Exception):  # An FMU may refuse to terminate in the state in which it is.
+        with contextlib.suppress(Exception):  # An FMU may refuse to terminate in the state in which it is.
             self.slave.terminate()
         self.slave.freeInstance()
 
 
 def _end(instances: list[_Instance], folder: str) -> None:
     for instance in instances:
-        with suppress(Exception):
+        with contextlib.suppress(Exception):
             instance.free()
     shutil.rmtree(folder, ignore_errors=True)
