@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ import vtbdrake as vtb
 from tests.fmi.testbed import FilteringScenario, TankScenario
 from tests.recording.servo import Servo
 from vtbdrake.fmi import FmuSystem
+from vtbdrake.fmi.extraction import ExtractionFolder
 from vtbdrake.fmi.instances import FmuError
 from vtbdrake.rollout import ThreadExecutor
 from vtbdrake.state.snapshot import SnapshotError
@@ -267,6 +269,20 @@ def test_instances_are_freed_with_their_system(fmu: Fmu, tmp_path: Path, monkeyp
     del system, simulator, context
     gc.collect()
     assert freed.read_text().split().count("Counted") == 1
+
+
+def test_folders_of_killed_processes_are_removed(fmu: Fmu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    alive = ExtractionFolder()
+    abandoned, unmarked = tmp_path / "vtbdrake-fmu-abandoned", tmp_path / "vtbdrake-fmu-unmarked"
+    for folder in (abandoned, unmarked):
+        folder.mkdir()
+    (abandoned / "lock").touch()
+    other = ExtractionFolder()
+    assert sorted(tmp_path.iterdir()) == sorted([Path(alive.path), Path(other.path), unmarked])
+    alive.remove()
+    other.remove()
+    assert list(tmp_path.iterdir()) == [unmarked]
 
 
 def test_files_that_are_no_fmu_for_this_computer_are_refused(fmu: Fmu, tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
-import tempfile
 import threading
 import weakref
 from collections import deque
@@ -15,6 +13,7 @@ import numpy as np
 
 from vtbdrake.common.arrays import Array, immutable
 from vtbdrake.common.failures import one_line
+from vtbdrake.fmi.extraction import ExtractionFolder
 from vtbdrake.fmi.imported import FmuVariable, ImportedFmu
 
 # Statuses of FMI 2 and 3.
@@ -133,13 +132,13 @@ class Instances:
         self._is_tunable = np.array([v.is_tunable for v in parameters for _ in range(v.size)], dtype=bool)
         self._names = [v.name for v in parameters for _ in range(v.size)]
         self._tunables = Values([v for v in parameters if v.is_tunable])
-        self._folder = tempfile.mkdtemp(prefix="vtbdrake-fmu-")
+        self._folder = ExtractionFolder()
         self._all: list[_Instance] = []
         self._idle: list[_Instance] = []
         self._most = 1 if fmu.once or not fork else None
         self._change = threading.Condition()
         weakref.finalize(self, _end, self._all, self._folder)
-        fmu.fmpy.extract(str(fmu.path), self._folder)
+        fmu.fmpy.extract(str(fmu.path), self._folder.path)
         self._initial: tuple[tuple[float, bytes], FmuState] | None = None
 
     def initial(self, time: float, parameters: np.ndarray) -> FmuState:
@@ -249,7 +248,7 @@ class Instances:
                 instance = (holders or self._idle)[0]
                 self._idle.remove(instance)
             else:
-                instance = _Instance(self._fmu, self._folder)
+                instance = _Instance(self._fmu, self._folder.path)
                 self._all.append(instance)
             return instance
 
@@ -341,8 +340,8 @@ class _Instance:
         self.slave.freeInstance()
 
 
-def _end(instances: list[_Instance], folder: str) -> None:
+def _end(instances: list[_Instance], folder: ExtractionFolder) -> None:
     for instance in instances:
         with contextlib.suppress(Exception):
             instance.free()
-    shutil.rmtree(folder, ignore_errors=True)
+    folder.remove()
