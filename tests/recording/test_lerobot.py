@@ -13,6 +13,7 @@ import pandas
 import pytest
 from PIL import Image
 from pyarrow import parquet
+from pydrake.systems.sensors import ImageRgba8U
 
 from vtbdrake.recording import LeRobotEpisode, Log, LogError, Series, episode_times, read_table, write_lerobot
 
@@ -178,6 +179,19 @@ def test_written_set_reads_back_as_a_log(folder: Path) -> None:
         read_table(folder, sense={"q": "observation.state"}, episode=2)
     with pytest.raises(LogError, match="no column 'observation.stat'; did you mean observation.state"):
         read_table(folder, sense={"q": "observation.stat"}, episode=0)
+
+
+def test_images_of_drake_are_pictures(tmp_path: Path) -> None:
+    def image(picture: np.ndarray) -> ImageRgba8U:
+        image = ImageRgba8U(64, 48)
+        image.mutable_data[:] = np.dstack([picture, np.full((48, 64), 77, np.uint8)])
+        return image
+
+    right = pictures(11, 1)
+    episode = LeRobotEpisode(log(0), images={"front": [image(picture) for picture in right]})
+    write_lerobot(tmp_path / "set", [episode], fps=FPS, video=False)
+    cells = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")["observation.images.front"].to_pylist()
+    assert np.array_equal([np.asarray(Image.open(BytesIO(cell["bytes"]))) for cell in cells], right)
 
 
 def test_command_that_no_other_follows_still_acts(tmp_path: Path) -> None:

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from math import floor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.sensors import ImageRgb8U, ImageRgba8U
 
 from vtbdrake.common.argument_checks import as_whole, suggestion
 from vtbdrake.common.arrays import Array
@@ -24,8 +25,8 @@ from vtbdrake.recording.log import Log, Series
 from vtbdrake.recording.log_format import LogError
 from vtbdrake.recording.log_reader import ControlLog
 
-Picture = NDArray[np.uint8]
-"""A picture, shape (height, width, 3), red, green and blue from 0 to 255."""
+Picture: TypeAlias = NDArray[np.uint8] | ImageRgb8U | ImageRgba8U
+"""A picture: red, green and blue from 0 to 255, shape (height, width, 3); or one of Drake's, without its opacity."""
 
 # Times are sums with rounding errors, in s.
 _ROUNDING = 1e-9
@@ -384,10 +385,10 @@ class _Camera:
         self._shape: tuple[int, ...] = ()
         self._statistics = PictureStatistics(count)
 
-    def __iter__(self) -> Iterator[Picture]:
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         number = 0
         for number, each in enumerate(self._pictures, start=1):
-            picture = np.asarray(each)
+            picture = each.data[:, :, :3] if isinstance(each, ImageRgb8U | ImageRgba8U) else np.asarray(each)
             self._shape = self._shape or picture.shape
             if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.shape != self._shape:
                 raise LogError(
@@ -433,13 +434,13 @@ class _Camera:
         return self._statistics.statistics()
 
 
-def _png(picture: Picture) -> bytes:
+def _png(picture: NDArray[np.uint8]) -> bytes:
     encoded = BytesIO()
     _library("PIL.Image").fromarray(picture).save(encoded, "PNG")
     return encoded.getvalue()
 
 
-def _write_film(path: Path, pictures: Iterable[Picture], fps: int) -> None:
+def _write_film(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: int) -> None:
     """Write pictures as H.264; every second one can be found without those before, as in LeRobot's own films."""
     film: Any = None
     try:
