@@ -55,6 +55,21 @@ def make_policy_dps(policy: System, *, period: float, force_limit: float) -> Dia
     return _built(builder)
 
 
+def make_pushed_dps(*, period: float, force_limit: float) -> Diagram:
+    """Return the DPS: ``env`` perceives, ``impl`` holds the command ``push`` (1, N), and ``act`` limits it.
+
+    A push takes effect when the force of a policy would that is sampled at the same time: see `make_policy_dps`.
+
+    Args:
+        period: Sample period of ``env`` and ``impl`` in seconds.
+        force_limit: The largest force in N.
+    """
+    impl = ZeroOrderHold(period, 1)
+    builder, _ = _begin(impl, period=period, force_limit=force_limit, output=impl.get_output_port().get_name())
+    builder.ExportInput(impl.get_input_port(), "push")
+    return _built(builder)
+
+
 def _begin(impl: System, *, period: float, force_limit: float, output: str) -> tuple[DiagramBuilder, System]:
     """Return the builder of a DPS without the inputs of ``impl``, and ``sense``."""
     builder = DiagramBuilder()
