@@ -52,6 +52,8 @@ BENCHMARKS: Registry = {
     "read_table_csv": "benchmarks.tables:read_table_csv",
     "read_table_parquet": "benchmarks.tables:read_table_parquet",
     "log_replay": "benchmarks.compiled_testbed:log_replay",
+    "gymnasium_step": "benchmarks.environments:gymnasium_step",
+    "gymnasium_vector_compiled": "benchmarks.environments:gymnasium_vector_compiled",
     "seeds_varied": "benchmarks.compiled_testbed:seeds_varied",
     "calibration_time": "benchmarks.calibration:calibration_time",
     "domain_query": "benchmarks.domain_query:domain_query",
