@@ -73,7 +73,7 @@ def test_the_strict_checker_of_gymnasium_finds_nothing(registered: str) -> None:
 
 
 def test_limits_of_the_signals_are_the_spaces(env: TestbedEnv) -> None:
-    assert env.action_space == gymnasium.spaces.Box(-60.0, 60.0, (1,), np.float64)
+    assert env.action_space == gymnasium.spaces.Box(-60.0, 60.0, (1,), np.float32)
     limits = [100.0, 1e3, 100.0, 100.0]
     assert env.observation_space == gymnasium.spaces.Box(-np.array(limits), np.array(limits), dtype=np.float64)
     unlimited = vtb.gymnasium_env(CartPoleScenario(), **{**BALANCING, "observation": ["plant.state"]})

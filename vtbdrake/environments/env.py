@@ -32,12 +32,17 @@ from vtbdrake.testbed import VirtualTestbed
 _NOTE = "episode"
 
 
-def box_of(channels: Channels) -> Box[np.float64]:
-    """Return the space of some channels: their limits, in double precision."""
+def action_box(channels: Channels) -> Box[np.float32]:
+    """Return the space of an action: its limits in single precision, as trainers compute; doubles are taken, too."""
+    return Box(channels.lower.astype(np.float32), channels.upper.astype(np.float32), dtype=np.float32)
+
+
+def observation_box(channels: Channels) -> Box[np.float64]:
+    """Return the space of an observation: its limits, in double precision."""
     return Box(channels.lower, channels.upper, dtype=np.float64)
 
 
-class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
+class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """A testbed as an environment for reinforcement learning; make one by `gymnasium_env`.
 
     Equal seeds and actions give equal episodes, bit for bit.
@@ -66,7 +71,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._actions = action_channels(self.testbed, episodes.action)
         observations = observation_channels(self.testbed, episodes.observation)
         self._switches = switch_values(self.testbed, self._actions)
-        self.action_space, self.observation_space = box_of(self._actions), box_of(observations)
+        self.action_space, self.observation_space = action_box(self._actions), observation_box(observations)
         self._write = writer_into(self.testbed, self._actions, self._runner.context)
         self._read = reader_into(self.testbed, observations, self._runner.context)
         self._reward, self._place = episodes.reward, episodes.reward_index

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vtbdrake.common.argument_checks import as_whole
 from vtbdrake.common.arrays import Array
-from vtbdrake.environments.env import box_of
+from vtbdrake.environments.env import action_box, observation_box
 from vtbdrake.environments.episodes import Episodes
 from vtbdrake.environments.spaces import action_channels, observation_channels
 from vtbdrake.testbed import VirtualTestbed
@@ -51,7 +51,8 @@ class TestbedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
         episodes.check(testbed)
         self._actions = action_channels(testbed, episodes.action)
         self._observations = observation_channels(testbed, episodes.observation)
-        self.single_action_space, self.single_observation_space = box_of(self._actions), box_of(self._observations)
+        self.single_action_space = action_box(self._actions)
+        self.single_observation_space = observation_box(self._observations)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
