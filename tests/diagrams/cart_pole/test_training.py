@@ -59,7 +59,7 @@ def fragile_policy(path: Path, *, lean: float) -> None:
         helper.make_node("MatMul", ["error", "angle"], ["leaning"]),
         helper.make_node("Abs", ["leaning"], ["lean"]),
         helper.make_node("Sub", ["most", "lean"], ["left"]),
-        helper.make_node("Sqrt", ["left"], ["root"]),  # Of a negative number, it is NaN.
+        helper.make_node("Sqrt", ["left"], ["root"]),  # The root of a negative number is NaN.
         helper.make_node("Mul", ["root", "zero"], ["nothing"]),
         helper.make_node("Add", ["nothing", "push"], ["force"]),
     ]
