@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Callable
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -45,7 +46,7 @@ def of_reward() -> dict[str, Any]:
 
 
 def of_slider() -> dict[str, Any]:
-    """Return a mass that meets its stops, which the compiled plant does not have."""
+    """Return a mass that meets its stops, which are compiled in machine code alone."""
     reward = vtb.Reward(lambda state: state[0] + 0.1 * state[1], of="plant.state")
     parameters = [vtb.Parameter("sim.sys.slider.position", -0.03, 0.03)]
     names: dict[str, Any] = {"action": ["force"], "observation": ["state", "plant.state"], "parameters": parameters}
@@ -78,6 +79,15 @@ def test_compiled_environments_equal_single_ones(statement: Callable[[], dict[st
     assert statement is not of_problem or (ended.any(axis=1) & ~ended.all(axis=1)).any()
 
 
+def test_a_step_that_cannot_be_compiled_is_made_in_drake(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    single = SyncVectorEnv([partial(vtb.gymnasium_env, **of_slider())] * 3)
+    expected = history(single, 45)
+    interpreted = CompiledVectorEnv(vtb.gymnasium_env(**of_slider()).episodes, 3, compile=False)
+    for one, other in zip(history(interpreted, 45), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_environments_on_worker_processes_equal_single_ones_bit_for_bit() -> None:
     arguments = of_problem()
@@ -86,7 +96,9 @@ def test_environments_on_worker_processes_equal_single_ones_bit_for_bit() -> Non
     for one, other in zip(history(envs, 30), expected, strict=True):
         assert one.tobytes() == other.tobytes()
     envs.close()
-    with pytest.raises(WorkerError, match="the environments are closed: make new ones"):
+    with pytest.raises(
+        WorkerError, match=r"the environments are closed, by close\(\) or by an interruption: make new ones"
+    ):
         envs.reset()
 
 
@@ -131,12 +143,16 @@ def test_auto_simulates_in_drake_what_cannot_be_compiled(caplog: pytest.LogCaptu
 
 
 def failing(**options: Any) -> Any:
-    reward = vtb.Reward(lambda state: 1.0, of="plant.state")
     scenario = NonfiniteScenario(plant=True, time_step=0.01, root="of state")
-    arguments: dict[str, Any] = {"action": {"force": (-1, 1)}, "observation": ["state"], "reward": reward}
-    return vtb.gymnasium_vector_env(
-        scenario, num_envs=3, **arguments, period=0.1, horizon=1.0, executor="processes", workers=2, **options
-    )
+    arguments: dict[str, Any] = {
+        "action": {"force": (-1, 1)},
+        "observation": ["state"],
+        "reward": vtb.Reward(lambda state: 1.0, of="plant.state"),
+        "period": 0.1,
+        "horizon": 1.0,
+    }
+    arguments |= options
+    return vtb.gymnasium_vector_env(scenario, num_envs=3, **arguments, executor="processes", workers=2)
 
 
 @pytest.mark.slow
@@ -169,6 +185,25 @@ def test_a_worker_process_that_dies_is_an_error() -> None:
         for _ in range(2):
             envs.step(np.zeros((3, 1)))
     assert not set(child_pids()) - others
+
+
+@pytest.mark.slow
+def test_an_interrupted_call_leaves_no_answers_for_the_next(tmp_path: Path) -> None:
+    fuse = tmp_path / "fuse"
+
+    def interrupting(state: np.ndarray) -> float:
+        if fuse.exists():
+            fuse.unlink()
+            os.kill(os.getppid(), signal.SIGINT)
+        return 0.0
+
+    envs = failing(reward=vtb.Reward(interrupting, of="plant.state"))
+    envs.reset()
+    fuse.touch()
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(np.zeros((3, 1)))
+    with pytest.raises(WorkerError, match="the environments are closed, .*by an interruption"):
+        envs.reset()
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,8 @@ class SegmentedRollouts:
 
     Attributes:
         instants: The simulator's times at the samples (s), shape (segments * every + 1,).
+        record_size: The number ny of recorded values of a sample, see `CompiledRollouts.columns`; the last one, the
+            doubt, is positive where the rollout has departed from Drake's.
     """
 
     def __init__(self, rollouts: CompiledRollouts, times: Array, *, every: int, t0: float) -> None:
@@ -46,6 +48,7 @@ class SegmentedRollouts:
         ]
         self._program: Program = rollouts.program(max(self._parts, key=len))
         self._plans = np.array([self._program.plan(part) for part in self._parts])
+        self.record_size: int = self._program.function.size1_out(1)
         samples = np.array(at_samples[1:]).reshape(-1, every)
         self._samples = samples - np.array(ends[:-1])[:, np.newaxis]
         self._first = [Instant(float(self.instants[0]), True, ())]
@@ -56,7 +59,7 @@ class SegmentedRollouts:
         Args:
             z: State and parameters, shape (n, nz).
         """
-        records = np.empty((len(z), self._program.function.size1_out(1)))
+        records = np.empty((len(z), self.record_size))
         plan = self._program.plan(self._first)
         noise = self._drawn(z, self._first) if self._walker.noise else None
         for chunk in self._chunks(len(z)):
@@ -72,12 +75,11 @@ class SegmentedRollouts:
             segments: The number of the segment of each rollout, from 0 on, shape (n,).
 
         Returns:
-            z at the end, shape (n, nz), and the records of the samples, shape (n, every, ny), whose last column, the
-            doubt, is positive where the rollout has departed from Drake's.
+            z at the end, shape (n, nz), and the records of the samples, shape (n, every, ny).
         """
         samples = self._samples[segments]
         after = np.empty_like(z)
-        records = np.empty((*samples.shape, self._program.function.size1_out(1)))
+        records = np.empty((*samples.shape, self.record_size))
         is_same = bool((segments == segments[0]).all())
         plans = self._plans[segments[0]] if is_same else self._plans[segments]
         noise = self._noise(z, segments)

@@ -30,7 +30,7 @@ _CHECKED_STEPS = 12
 class CompiledVectorEnv(TestbedVectorEnv):
     """Environments of the compiled testbed, whose steps equal Drake's to about 1e-15; see docs/compiled_testbeds.md.
 
-    A step that the compiled testbed cannot make (a joint reaches its stop, the state is not finite) is made in Drake.
+    A step that the compiled testbed cannot make (contact does not converge, the state is not finite) is made in Drake.
 
     Args:
         episodes: What an episode is.
@@ -57,7 +57,9 @@ class CompiledVectorEnv(TestbedVectorEnv):
         walker, t0 = self._rollouts.walker, s0.get_time()
         self._times = self._task.sample_times()
         self._segments = SegmentedRollouts(self._rollouts, self._times, every=episodes.every, t0=t0)
-        self._seeds = [address for address in seed_addresses(testbed.variables()) if walker.can_vary(address)]
+        self._seeds = seed_addresses(testbed.variables())
+        # The seed of a sensor that is not compiled, because nothing depends on it, has no effect.
+        self._without_effect = frozenset(address for address in self._seeds if not walker.can_vary(address))
         self._in_drake = _StepInDrake(testbed, self._rollouts, self._segments, episodes, self._actions)
         self._action_entries = np.concatenate(
             [np.arange(walker.size)[walker.place(a)] for a in self._actions.addresses]
@@ -155,10 +157,10 @@ class CompiledVectorEnv(TestbedVectorEnv):
 
     def _begin(self, rows: Rows, options: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
         """Begin an episode in some environments; return the values that were set."""
-        variables, everywhere = self._testbed.variables(), seed_addresses(self._testbed.variables())
+        variables = self._testbed.variables()
         drawn = []
         for row in rows.tolist():
-            beginning = self.episodes.drawn(self._random[row], options, variables)
+            beginning = self.episodes.drawn(self._random[row], options, variables, self._seeds)
             if beginning.start is not None:
                 raise ValueError(
                     "compiled environments begin at the problem's s0: state it there, Problem(start=snapshot), or take "
@@ -166,9 +168,8 @@ class CompiledVectorEnv(TestbedVectorEnv):
                 )
             drawn.append(beginning.values)
         alike: dict[tuple[str, ...], list[int]] = {}
-        unused = set(everywhere) - set(self._seeds)
         for k, values in enumerate(drawn):
-            alike.setdefault(tuple(a for a in values if a not in unused), []).append(k)
+            alike.setdefault(tuple(a for a in values if a not in self._without_effect), []).append(k)
         for addresses, indices in alike.items():
             arrays = {a: np.array([drawn[k][a] for k in indices], dtype=float) for a in addresses}
             self._z[rows[indices]] = self._rollouts.filled(self._z0, arrays)
@@ -186,7 +187,7 @@ class CompiledVectorEnv(TestbedVectorEnv):
         steps = self._steps[rows]
         after, records = self._segments.advance(z, steps)
         failures: dict[int, str] = {}
-        for k in np.flatnonzero((records[:, :, -1] > 0.0).any(axis=1) | ~self._accepted(records)).tolist():
+        for k in np.flatnonzero(~(records[:, :, -1] <= 0.0).all(axis=1) | ~self._accepted(records)).tolist():
             try:
                 after[k], records[k] = self._in_drake(z[k], int(steps[k]))
             except SimulationError as failure:
@@ -296,7 +297,7 @@ class _StepInDrake:
         """Return the record of the present state; its last entry, the doubt, is 0."""
         assert self._runner is not None
         columns = self._rollouts.columns
-        record = np.zeros(1 + max(entries.stop for entries in columns.values()))
+        record = np.zeros(self._segments.record_size)
         measured = {_measure_name(k): value for k, value in enumerate(self._runner.measured(time))}
         for name, entries in columns.items():
             value = measured[name] if name in measured else self._rollouts.read(name, self._runner.context)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,8 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array
-from vtbdrake.environments.episodes import Episodes, FailedEpisodeError
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
+from vtbdrake.environments.episodes import Episodes, FailedEpisodeError, seed_addresses
 from vtbdrake.environments.rewards import first_score, next_score, step_reward
 from vtbdrake.environments.spaces import (
     Channels,
@@ -76,6 +78,10 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self._read = reader_into(self.testbed, observations, self._runner.context)
         self._reward, self._place = episodes.reward, episodes.reward_index
         self._can_terminate = len(episodes.measures) > 1 or episodes.task.threshold is not None
+        self._variables = self.testbed.variables()
+        self._seeds = seed_addresses(self._variables)
+        # Without a system in Python, pydrake has nothing to convert, and loses no Ctrl-C.
+        self._interruptible = Interruptible() if self.testbed.python_systems else nullcontext()
         self._samples: Iterator[float] = iter(())
         self._needs_reset = "the environment is new"
         self._step, self._begun = 0, 0.0
@@ -106,7 +112,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
             FailedEpisodeError: The simulation fails at its start.
         """
         super().reset(seed=seed)
-        beginning = self.episodes.drawn(self.np_random, options, self.testbed.variables())
+        beginning = self.episodes.drawn(self.np_random, options, self._variables, self._seeds)
         start, begin_values = (None, {}) if beginning.start is None else self._start_at(beginning.start)
         self._needs_reset = "its reset has failed"
         self._samples = self._runner.simulate({**begin_values, **beginning.values, **self._switches}, start=start)
@@ -140,11 +146,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         score, self._step = self._score, self._step + 1
         terminated, info = False, {}
         try:
-            for _ in range(self.episodes.every):
-                time = next(self._samples)
-                terminated = self._take(time)
-                if terminated:
-                    break
+            with self._interruptible:
+                terminated = self._advance()
         except SimulationError as failure:
             return self._failed(action, failure)
         except BaseException:
@@ -213,9 +216,14 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     def _take_first_sample(self) -> None:
         try:
-            self._time = next(self._samples)
+            with self._interruptible:
+                self._time = next(self._samples)
         except SimulationError as failure:
             raise FailedEpisodeError(f"the simulation fails at the start of an episode: {failure}") from failure
+
+    def _advance(self) -> bool:
+        """Simulate until the end of the step; return whether the episode terminates, which ends it early."""
+        return any(self._take(next(self._samples)) for _ in range(self.episodes.every))
 
     def _take(self, time: float) -> bool:
         """Take a sample; return whether the episode terminates at it."""

@@ -112,13 +112,20 @@ class Episodes:
             for address, value in condition.items():
                 variables[address].check(value)
 
-    def drawn(self, random: np.random.Generator, options: Mapping[str, Any] | None, variables: Variables) -> Beginning:
+    def drawn(
+        self,
+        random: np.random.Generator,
+        options: Mapping[str, Any] | None,
+        variables: Variables,
+        seeds: Sequence[str],
+    ) -> Beginning:
         """Draw where an episode begins: a condition, the parameters, and the seeds of sensors.
 
         Args:
             random: The source of random numbers.
             options: What is given instead of drawn, by the names of `OPTIONS`; None: nothing.
             variables: The variables of the testbed.
+            seeds: The addresses of the seeds, see `seed_addresses`.
 
         Raises:
             ValueError: There is no such option, or it does not take the value.
@@ -131,8 +138,7 @@ class Episodes:
                 )
         # Everything is drawn each time: what is given does not change what follows.
         number = int(random.integers(len(self.conditions)))
-        seed = float(random.integers(_LARGEST_SEED))
-        values: dict[str, Any] = {address: seed for address in seed_addresses(variables)}
+        values: dict[str, Any] = dict.fromkeys(seeds, float(random.integers(_LARGEST_SEED)))
         values |= self.conditions[self._condition(options.get("condition", number))]
         values |= {parameter.address: parameter.from_unit(random.random()) for parameter in self.parameters}
         set_values = options.get("values", {})

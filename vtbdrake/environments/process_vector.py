@@ -60,7 +60,7 @@ class ProcessVectorEnv(TestbedVectorEnv):
         Raises:
             ActionError: As `TestbedEnv.step`; nothing happened.
             FailedEpisodeError: A simulation fails, and there is no ``failure_reward``: reset all.
-            WorkerError: A worker process has died.
+            WorkerError: A worker process has died, or a call was interrupted before.
         """
         checked = self._checked(actions)
         return self._merged(self._call([("step", checked[share]) for share in self._shares]))
@@ -80,7 +80,7 @@ class ProcessVectorEnv(TestbedVectorEnv):
     def _call(self, calls: Sequence[tuple[str, Any]]) -> list[Any]:
         """Let every worker do something, side by side, and return what they answer."""
         if self.closed:
-            raise WorkerError("the environments are closed: make new ones")
+            raise WorkerError("the environments are closed, by close() or by an interruption: make new ones")
         try:
             for connection, call in zip(self._connections, calls, strict=True):
                 connection.send(call)
@@ -91,6 +91,9 @@ class ProcessVectorEnv(TestbedVectorEnv):
             raise WorkerError(
                 f"a worker process of environments was lost (exit codes {codes}, {error}): make new environments"
             ) from error
+        except BaseException:  # Ctrl-C: what the workers answer belongs to no later call.
+            self.close()
+            raise
         for share, reply in zip(self._shares, replies, strict=True):
             if isinstance(reply, _EnvError):
                 reply.error.add_note(f"in environment {share.start + reply.number}")
