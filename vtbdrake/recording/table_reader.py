@@ -61,8 +61,8 @@ def read_table(
             .bag), whose columns are ``topic.field``, ``topic.field.field[2]`` and ``topic.log_time``: only the topics
             that are asked for are decoded; or the folder of a data set of LeRobot (v3.0), whose columns are ``time``,
             its features, and their entries by name (``observation.state.elbow``). For any other format, the columns
-            themselves. Without a line of names, the columns of a text are "0", "1", ... With pyarrow (the extra
-            ``recording``), a text is read ten times as fast.
+            themselves. Without a line of names, the columns of a text are "0", "1", ..., or have the names in a comment
+            (#) above the rows. With pyarrow (the extra ``recording``), a text is read ten times as fast.
         sense: For each sensor signal, its column, or the columns of its entries. ``name[2]`` is the third entry of a
             column that has several.
         act: The same for the actuator signals.

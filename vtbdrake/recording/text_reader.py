@@ -8,20 +8,25 @@ Columns with others than numbers are converted by the same function in both case
 from __future__ import annotations
 
 import csv
+import mmap
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vtbdrake.recording.log_format import LogError
 
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_COMMENT = "#"
+"""The first character of a line that is no row."""
+
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
+"""A number with a decimal comma, between separators that are no commas."""
 
 _LONGEST_ROW = 1 << 20
 """Bytes at the end of a text in which its last row begins: Arrow's own limit for a row."""
@@ -30,7 +35,9 @@ _LONGEST_ROW = 1 << 20
 def read_text(path: Path) -> Mapping[str, NDArray[Any]]:
     """Return the columns of a text by name: floats, NaN where a field is empty; texts, if some are no numbers.
 
-    Without a line of names, the columns are "0", "1", ... A last row that was cut off is left out.
+    Without a line of names, the columns are "0", "1", ..., or have the names in a comment above the rows. Lines that
+    begin with # are comments. Where semicolons, tabs or blanks separate fields, numbers may have decimal commas. A last
+    row that was cut off is left out.
 
     Args:
         path: The file, in UTF-8.
@@ -45,53 +52,75 @@ def read_text(path: Path) -> Mapping[str, NDArray[Any]]:
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the first line of a text tells.
+    """What the first lines of a text tell.
 
     Attributes:
         names: The names of the columns.
         separator: The character between fields; None for blanks.
-        has_header: Whether the first line has the names, and is no row.
+        decimal: The decimal mark, a point or a comma.
+        skipped: Number of lines before the first row: comments, and the line of names.
     """
 
     names: list[str]
     separator: str | None
-    has_header: bool
+    decimal: str
+    skipped: int
 
     @classmethod
     def of(cls, path: Path) -> _Layout:
         """Return the layout of a text."""
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            head = file.readline()
+            above, head = _after_comments(file)
+            below, first = _after_comments(file)
         separator = next((mark for mark in ",;\t" if mark in head), None)
-        names = [name.strip().strip('"') for name in _fields(head, separator)]
-        if not names:
+        if ";" in head and ";" in first:  # Its commas are decimal.
+            separator = ";"
+        fields = [name.strip().strip('"') for name in _fields(head, separator)]
+        if not fields:
             raise LogError(f"{path} is no table: it has fewer than two lines")
-        if all(_is_number(name) for name in names):
-            return cls([str(k) for k in range(len(names))], separator, False)
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise LogError(f"{path} has two columns {twice!r}")
-        return cls(names, separator, True)
+        decimal = "," if any(map(_DECIMAL_COMMA.fullmatch, _fields(first or head, separator))) else "."
+        if not all(_is_number(field, decimal) for field in fields):
+            return cls(_checked_names(fields, path), separator, decimal, len(above) + 1 + len(below))
+        comment = above[-1] if above else ""
+        names = _fields(comment.lstrip(f"{_COMMENT} ").strip(), separator)  # Of numpy.savetxt(header=...), say.
+        if len(names) != len(fields):
+            names = [str(k) for k in range(len(fields))]
+        return cls(_checked_names([name.strip() for name in names], path), separator, decimal, len(above))
+
+
+def _after_comments(file: TextIO) -> tuple[list[str], str]:
+    """Return the comments that follow in a file, and the line after them."""
+    comments = []
+    while (line := file.readline()).startswith(_COMMENT):
+        comments.append(line)
+    return comments, line
+
+
+def _checked_names(names: list[str], path: Path) -> list[str]:
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise LogError(f"{path} has two columns {twice!r}")
+    return names
 
 
 def _fields(line: str, separator: str | None) -> list[str]:
     return line.split() if separator is None else next(csv.reader([line], delimiter=separator), [])
 
 
-def _is_number(text: str) -> bool:
+def _is_number(text: str, decimal: str) -> bool:
     try:
-        float(text)
+        float(text.replace(decimal, "."))
     except ValueError:
         return False
     return True
 
 
-def _numbers(column: Sequence[str]) -> NDArray[Any]:
+def _numbers(column: Sequence[str], decimal: str) -> NDArray[Any]:
     """Return a column as floats, NaN where it is empty; as texts, if it has others than numbers."""
     texts = np.array(column)
     texts[np.char.strip(texts) == ""] = "nan"
     try:
-        return texts.astype(float)
+        return (texts if decimal == "." else np.char.replace(texts, decimal, ".")).astype(float)
     except ValueError:
         return texts
 
@@ -102,14 +131,15 @@ def _numbers(column: Sequence[str]) -> NDArray[Any]:
 class _ArrowColumns(Mapping[str, NDArray[Any]]):
     """The columns of a table of Arrow: floats, or the bytes of texts."""
 
-    def __init__(self, table: Any) -> None:
+    def __init__(self, table: Any, decimal: str) -> None:
         self._table = table
+        self._decimal = decimal
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column = self._table[name]
         if str(column.type) == "double":
             return np.asarray(column.to_numpy())
-        return _numbers([(text or b"").decode(errors="replace") for text in column.to_pylist()])
+        return _numbers([(text or b"").decode(errors="replace") for text in column.to_pylist()], self._decimal)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._table.column_names)
@@ -119,10 +149,13 @@ class _ArrowColumns(Mapping[str, NDArray[Any]]):
 
 
 def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
-    """Return the columns; None if Arrow cannot read the rows, because they have several lengths or there are none."""
+    """Return the columns; None if Arrow cannot read the rows: several lengths, comments between them, or none at all."""
     import pyarrow
     from pyarrow import csv as arrow_csv
 
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content.rfind(b"\n" + _COMMENT.encode()) >= max(_start(content, layout) - 1, 0):
+            return None
     rows = _rows(pyarrow.memory_map(os.fspath(path)).read_buffer(), layout)
     first = _first_row(rows, layout)
     if len(first) < len(layout.names):
@@ -130,7 +163,11 @@ def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
     # A separator may end each row: a field without a name.
     names = layout.names + [f"\0{k}" for k in range(len(first) - len(layout.names))]
     types = {name: pyarrow.float64() for name in names}
-    types |= {name: pyarrow.binary() for name, field in zip(names, first, strict=True) if not _is_number(field or "0")}
+    types |= {
+        name: pyarrow.binary()
+        for name, field in zip(names, first, strict=True)
+        if not _is_number(field or "0", layout.decimal)
+    }
     while True:
         try:
             table = arrow_csv.read_csv(
@@ -140,10 +177,10 @@ def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
                     delimiter=layout.separator or " ", quote_char=False if layout.separator is None else '"'
                 ),
                 convert_options=arrow_csv.ConvertOptions(
-                    column_types=types, include_columns=layout.names, null_values=[""]
+                    column_types=types, include_columns=layout.names, null_values=[""], decimal_point=layout.decimal
                 ),
             )
-            return _ArrowColumns(table)
+            return _ArrowColumns(table, layout.decimal)
         except pyarrow.ArrowInvalid as error:
             # A column whose first field is a number, or empty, has a text further down.
             column = re.search(r"In CSV column #(\d+)", str(error))
@@ -152,13 +189,15 @@ def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
             types[name] = pyarrow.binary()
 
 
+def _start(content: Any, layout: _Layout) -> int:
+    """Return the offset of the first row in the bytes of a text."""
+    lines = re.match(rb"(?:\xef\xbb\xbf)?(?:[^\r\n]*(?:\r\n|\r|\n|$)){%d}" % layout.skipped, content)
+    return lines.end() if lines else 0
+
+
 def _rows(content: Any, layout: _Layout) -> Any:
     """Return the rows of a text as bytes or a buffer, with one blank between fields, without a last row cut off."""
-    view = memoryview(content)
-    start = len(_BYTE_ORDER_MARK) if bytes(view[:3]) == _BYTE_ORDER_MARK else 0
-    if layout.has_header and (head := re.search(rb"\r?\n|\r|$", view)):
-        start = head.end()
-    rows = content[start:]
+    rows = content[_start(content, layout) :]
     if layout.separator is None and re.search(rb"  |\t|^ | \r?$", rows, re.MULTILINE):
         rows = re.sub(rb"[ \t]*[\r\n]+[ \t]*", b"\n", re.sub(rb"[ \t]+", b" ", rows)).strip(b" ")
     tail = bytes(memoryview(rows)[-_LONGEST_ROW:])
@@ -180,12 +219,13 @@ def _first_row(rows: Any, layout: _Layout) -> list[str]:
 def _read_by_rows(path: Path, layout: _Layout) -> dict[str, NDArray[Any]]:
     names = layout.names
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-        if layout.has_header:
+        for _ in range(layout.skipped):
             file.readline()
         if layout.separator is None:
-            rows = [line.split() for line in file if line.strip()]
+            rows = [line.split() for line in file if line.strip() and not line.startswith(_COMMENT)]
         else:
-            rows = [row for row in csv.reader(file, delimiter=layout.separator) if row]
+            reader = csv.reader(file, delimiter=layout.separator)
+            rows = [row for row in reader if row and not row[0].startswith(_COMMENT)]
     if not rows:
         raise LogError(f"{path} is no table: it has fewer than two lines")
     short = [number for number, row in enumerate(rows) if len(row) < len(names)]
@@ -194,4 +234,4 @@ def _read_by_rows(path: Path, layout: _Layout) -> dict[str, NDArray[Any]]:
     elif short:
         raise LogError(f"{path}: row {short[0]} has {len(rows[short[0]])} columns, not {len(names)}")
     columns = list(zip(*rows, strict=False))  # A separator may end each row.
-    return {name: _numbers(column) for name, column in zip(names, columns, strict=False)}
+    return {name: _numbers(column, layout.decimal) for name, column in zip(names, columns, strict=False)}
