@@ -30,6 +30,8 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import AffineSystem, ConstantVectorSource
 
+from vtbdrake.components.sensors import ContactSensor
+
 LEGS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 POSTURE = {"hip": 0.0, "thigh": 0.7, "knee": -1.4}
 HEIGHT = 0.33
@@ -60,6 +62,8 @@ def quadruped(
     playground: bool = False,
     stops: bool = False,
     drives: bool = False,
+    contact_period: float | None = None,
+    sampled: bool = False,
 ) -> tuple[Diagram, MultibodyPlant]:
     """Return a Diagram: four legs held by joint PD, a trot's length above the ground.
 
@@ -68,6 +72,8 @@ def quadruped(
         time_step: The time step of the plant, and the period of the controller, in s.
         playground: The ground is a slope, feet touch each other, there are a box and two balls, and materials differ.
         stops: The joints have stops.
+        contact_period: Period of contact switches of the feet, ``switches``, in s; None: there are none.
+        sampled: The plant's outputs show its last step.
         drives: The actuators have the joint PD, with effort limits, instead of the DPS; there is a feed-forward.
     """
     builder = DiagramBuilder()
@@ -75,7 +81,7 @@ def quadruped(
         time_step=time_step,
         contact_model="point",
         discrete_contact_approximation=approximation,
-        use_sampled_output_ports=False,
+        use_sampled_output_ports=sampled,
     )
     plant, scene_graph = AddMultibodyPlant(config, builder)
     trunk = plant.AddRigidBody("trunk", inertia(6.0, 0.0, (0.02, 0.06, 0.07)))
@@ -104,6 +110,10 @@ def quadruped(
     plant.Finalize()
     if not playground:
         scene_graph.collision_filter_manager().Apply(CollisionFilterDeclaration().ExcludeWithin(feet))
+    if contact_period is not None:
+        shanks = [plant.GetBodyByName(f"knee_{number}_link") for number in range(len(LEGS))]
+        switches = builder.AddNamedSystem("switches", ContactSensor(plant, shanks, period=contact_period))
+        builder.Connect(plant.get_contact_results_output_port(), switches.get_input_port())
     if drives:
         angles = [
             POSTURE[plant.get_joint_actuator(i).name().partition("_")[0]] for i in plant.GetJointActuatorIndices()

@@ -27,6 +27,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
+from tests.compiled.contact_agreement import outcome_shares, step_errors
+from tests.compiled.contact_worlds import WORLDS
 from tests.compiled.quadruped import HEIGHT, LEGS, POSTURE, inertia, quadruped, surface
 from vtbdrake.compiled import CompiledRollouts, UnsupportedTestbedError
 from vtbdrake.components.compiled_plant import PlantDynamics
@@ -212,13 +214,13 @@ def test_steps_are_drakes_on_a_playground(approximation: str, driven: bool) -> N
         v, forces, doubt = steps.compiled()
         assert doubt == 0.0
         touching += np.count_nonzero(np.any(forces, axis=1))
-        # The same problem: Drake solves it to 1e-6, the kernel to 1e-9.
+        # The same problem, solved to 1e-6, where the iteration ends as in Drake.
         assert steps.residual(expected) < 1.1e-6
-        assert steps.residual(v) < 2e-9
-        np.testing.assert_allclose(v, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
+        assert steps.residual(v) < 1.1e-6
+        np.testing.assert_allclose(v, expected, atol=1e-10 * max(1.0, np.abs(expected).max()))
         if driven:
             efforts = steps.plant.get_net_actuation_output_port().Eval(steps.context)
-            np.testing.assert_allclose(steps.efforts(), efforts, atol=1e-3)
+            np.testing.assert_allclose(steps.efforts(), efforts, atol=1e-7)
     assert touching > 200
 
 
@@ -234,7 +236,7 @@ def test_forces_balance_the_momentum(approximation: str) -> None:
         after, forces, _ = steps.compiled()
         # The sphere is the ball's; the forces are those on the ground.
         change = plant.time_step() * (np.array([0.0, 0.0, -9.81]) - forces.sum(axis=0) / 1.0)
-        np.testing.assert_allclose(after[3:] - v, change, atol=1e-12)
+        np.testing.assert_allclose(after[3:] - v, change, atol=1e-7)
         assert np.any(forces) == (height < 0.1)
 
 
@@ -341,7 +343,8 @@ def test_other_shapes_touch_as_in_drake(one: Shape | str, other: Shape, wedge: s
         expected, (v, forces, doubt) = steps.drake(), steps.compiled()
         assert doubt == 0.0
         touching += np.any(forces)
-        np.testing.assert_allclose(v, expected, atol=1e-5 * max(1.0, np.abs(expected).max()))
+        # Below the middle of what lies flat, the problem is nearly degenerate, and rounding grows in its iteration.
+        np.testing.assert_allclose(v, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))
     assert touching > 40
 
 
@@ -361,6 +364,31 @@ def test_an_arm_presses_on_a_wall() -> None:
     assert batch.valid.all()
     state = testbed.plant.GetPositionsAndVelocities(testbed.plant.GetMyContextFromRoot(simulator.get_context()))
     np.testing.assert_allclose(batch.outputs["plant.state"][0, -1], state, atol=1e-6)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_contact_sensors(sampled: bool) -> None:
+    """Switches of the feet of a quadruped that lands, with two thresholds."""
+    diagram, plant = quadruped("lagged", contact_period=0.01, sampled=sampled)
+    variables, outputs = collect(diagram), ["switches.foot_contact"]
+    options = {"horizon": 0.4, "sample_period": 0.01, "outputs": outputs}
+    context = diagram.CreateDefaultContext()
+    if sampled:
+        with pytest.raises(UnsupportedTestbedError, match="contact_results, which shows its last step.*to False"):
+            CompiledRollouts(diagram, variables, context, **options)
+        return
+    rollouts = CompiledRollouts(diagram, variables, context, **options)
+    thresholds = np.array([5.0, 60.0])
+    batch = rollouts({"switches.threshold": thresholds})
+    for row, threshold in enumerate(thresholds):
+        simulator = Simulator(diagram, context.Clone())
+        variables.write(simulator.get_mutable_context(), {"switches.threshold": threshold})
+        for k, time in enumerate(rollouts.times):
+            simulator.AdvanceTo(time)
+            expected = rollouts.read("switches.foot_contact", simulator.get_context())
+            np.testing.assert_array_equal(batch.outputs["switches.foot_contact"][row, k], expected)
+    closed = batch.outputs["switches.foot_contact"].mean(axis=(1, 2))
+    assert 0.0 < closed[1] < closed[0] < 1.0
 
 
 def test_other_approximations_and_models_are_refused_by_name() -> None:
@@ -391,3 +419,15 @@ def test_a_step_that_does_not_converge_ends_its_rollout_with_reason_and_time() -
     solver = "plant: the solver of contact, stops and controllers did not converge at t = 0.5 s"
     infinite = "the state of plant is not finite at t = 0.5 s"
     assert batch.reasons == ("", infinite, solver, infinite)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(WORLDS))
+def test_outcomes_are_drakes(name: str) -> None:
+    """Steps agree to rounding, and outcomes where Drake's do not depend on noise of 1e-9 at the begin."""
+    world = WORLDS[name]("lagged")
+    assert step_errors(world, 100).max() < 1e-6
+    shares = outcome_shares(world, 10, seed=1)
+    assert shares.repeatable >= 8
+    assert shares.alike == shares.repeatable
+    assert 0 < shares.happened < shares.repeatable

@@ -235,6 +235,20 @@ class ForceTorqueEquations(SensorEquations):
         super().__init__(system, context, varied, lambda at: -at.input("reaction_forces")(system.place))
 
 
+class ContactEquations(SensorEquations):
+    """`ContactSensor`."""
+
+    def __init__(self, system: Any, context: Context, varied: frozenset[str]) -> None:
+        settings = system.settings
+
+        def measure(at: At) -> Expression:
+            load = at.input("contact_results")
+            threshold = at.parameter(int(settings.index))[settings.vector.slice_of("threshold")]
+            return casadi.vertcat(*(casadi.SX(load(body) > threshold) for body in system.body_indices))
+
+        super().__init__(system, context, varied, measure)
+
+
 class DriveEquations(Equations):
     """`JointDrives`, whose delay is compiled in."""
 

@@ -24,14 +24,15 @@ from vtbdrake.state.variables import A, Variable
 # What may act on a plant beside its actuation.
 _ACTING = ("applied_generalized_force", "applied_spatial_force")
 _NOT_ACTING = ("geometry_query",)
-# How the names of ports end that the plant and its model instances have.
+# The names of ports end so that the plant and its model instances have.
 _TAKEN = ("actuation", "_desired_state")
+# The names of output ports end so whose values belong to a step.
+_OF_A_STEP = ("reaction_forces", "contact_results", "net_actuation")
 
 # The name of the present step, which several outputs share with the update.
 _STEP = "step"
-# Drake ends its iteration at an error of 1e-6 of the momentum, in which some velocities weigh little.
-_AGREEMENT_IN_CONTACT = 1e-4
-_AGREEMENT_OF_SOLVER = 1e-6  # Stops and drives make the problem linear in pieces: iterations end near its solution.
+# Iterations take the same path as Drake's, on which rounding grows where a problem is nearly degenerate.
+_AGREEMENT_OF_SOLVER = 1e-5
 
 
 class _Step(NamedTuple):
@@ -59,8 +60,8 @@ class _Step(NamedTuple):
 class PlantEquations(Equations):
     """A discrete plant that SAP steps, with point contact, joint stops and PD controllers of actuators.
 
-    The state, the reaction forces and the net actuation are output. Without a C compiler, a step that feels a stop
-    counts as doubtful.
+    The state, and a step's reaction forces, contact forces and net actuation are output. Without a C compiler, a step
+    that feels a stop counts as doubtful.
     """
 
     doubtful = "the solver of contact, stops and controllers did not converge"
@@ -102,7 +103,7 @@ class PlantEquations(Equations):
                 raise refusal(self._plant, f"has {part}, whose solver is written in C: {error}") from None
             self.doubtful = "a joint reaches a stop, which is compiled only where there is a C compiler"
             return None
-        self.agreement = _AGREEMENT_IN_CONTACT if pairs else _AGREEMENT_OF_SOLVER
+        self.agreement = _AGREEMENT_OF_SOLVER
         return solver
 
     def output(self, port: str, at: At) -> Expression:
@@ -112,9 +113,17 @@ class PlantEquations(Equations):
         for instance in _instances(self._plant):
             if port == f"{self._plant.GetModelInstanceName(instance)}_state":
                 return _part_of_state(self._plant, instance, x)
-        if port == "reaction_forces" and not self._plant.has_sampled_output_ports():
+        if port.endswith(_OF_A_STEP) and self._plant.has_sampled_output_ports():
+            raise refusal(
+                self._plant,
+                f"has the output port {port}, which shows its last step and is not compiled: set "
+                "use_sampled_output_ports to False, use its state, or keep it in Drake",
+            )
+        if port == "reaction_forces":
             return self._reactions(at)
-        if port.endswith("net_actuation") and not self._plant.has_sampled_output_ports():
+        if port == "contact_results":
+            return self._contact_load(at)
+        if port.endswith("net_actuation"):
             return self._net_actuation(port, at)
         raise refusal(
             self._plant, f"has the output port {port}, which is not compiled: use its state, or keep it in Drake"
@@ -141,6 +150,17 @@ class PlantEquations(Equations):
             return F
 
         return at_place
+
+    def _contact_load(self, at: At) -> Callable[[int], Expression]:
+        """Return the sum of the magnitudes of the present step's contact forces on a body, by its index, in N."""
+        step = self._step(at)
+
+        def on_body(body: int) -> Expression:
+            forces = self._contact.forces_on(body, step.forces, step.q)
+            (load,) = self._substituted([casadi.SX(sum(casadi.norm_2(force) for _, force in forces))], at)
+            return load
+
+        return on_body
 
     def _net_actuation(self, port: str, at: At) -> Expression:
         """Return the actuation within effort limits of the present step: the plant's, or a model instance's."""

@@ -9,6 +9,7 @@ from pydrake.systems.primitives import ConstantValueSource, PortSwitch, Trajecto
 from vtbdrake.compiled.components import (
     BoardEquations,
     CasadiEquations,
+    ContactEquations,
     DriveEquations,
     ForceTorqueEquations,
     JointSensorEquations,
@@ -25,7 +26,13 @@ from vtbdrake.compiled.equations import REMEDY, Equations, refusal
 from vtbdrake.compiled.plant import PlantEquations
 from vtbdrake.components.actuators import JointDrives
 from vtbdrake.components.casadi_system import CasadiSystem
-from vtbdrake.components.sensors import ForceTorqueSensor, JointEncoders, JointTachometers, JointTorqueSensors
+from vtbdrake.components.sensors import (
+    ContactSensor,
+    ForceTorqueSensor,
+    JointEncoders,
+    JointTachometers,
+    JointTorqueSensors,
+)
 from vtbdrake.components.spline_command import SplineCommand
 from vtbdrake.state.systems import is_python
 from vtbdrake.testbed.switch import SwitchBoard
@@ -33,6 +40,7 @@ from vtbdrake.testbed.switch import SwitchBoard
 EQUATIONS: dict[type, type[Equations]] = {
     CasadiSystem: CasadiEquations,
     ConstantValueSource: ConstantValueEquations,
+    ContactSensor: ContactEquations,
     JointDrives: DriveEquations,
     ForceTorqueSensor: ForceTorqueEquations,
     JointEncoders: JointSensorEquations,

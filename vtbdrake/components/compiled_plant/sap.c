@@ -4,7 +4,8 @@ The velocities v after the step minimize
 
     1/2 (v - v*)' A (v - v*) + sum over contacts l(J v) + sum over axes l(v_i),
 
-by Newton's method with an exact line search. A = M + dt D is factored as L' L along the tree of velocities
+by Newton's method with an exact line search. Iterations begin, proceed and end as Drake's do, at an error of 1e-6 of the
+momentum: what is left of it is the same, too, and does not drive apart what is sensitive. A = M + dt D is factored as L' L along the tree of velocities
 (Featherstone, RBDA, 6.3), and so is the Hessian A + sum J' G J: PARENT tells the velocity next to each on the way to the
 root, and each contact moves with velocities of one way. Contact models are those of Drake's discrete plant,
 
@@ -18,7 +19,8 @@ SapLimitConstraint) and PD controllers of actuators with their effort limits (Sa
 
 The text before this one defines NAME; NV, NC, NS, ND: the numbers of velocities, contacts, joints with stops and
 actuators with a controller; LAGGED: 0 or 1; DT: the time step (s); BETA: the near-rigid threshold; VS: the stiction
-tolerance (m/s); PARENT[NV]; COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; STOP[NS]: the velocity of
+tolerance (m/s); PARENT[NV]; TREE[NV]: the number of the tree of
+joints, below NV, that a velocity belongs to; COUNT[NC] and COLUMNS[NC][NV]: the velocities that move a contact; STOP[NS]: the velocity of
 a joint with stops, LOWER[NS] and UPPER[NS] (rad or m); DRIVE[ND]: the velocity of an actuator, KP[ND], KD[ND] and
 EFFORT[ND] (N m or N). Tables have a row more, because C has no empty ones.
 
@@ -33,10 +35,12 @@ Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of th
 #include <string.h>
 
 #define ARGUMENTS 12
-#define MOST_ITERATIONS 100
-#define MOST_STEPS 60
-#define TOLERANCE 1e-9
-#define DRAKES_TOLERANCE 1e-6
+/* Numbers of Drake's SapSolver. */
+#define MOST_ITERATIONS 100     /* also of a line search */
+#define TOLERANCE 1e-6          /* of the momentum */
+#define LONGEST_STEP 1.5        /* of a line search */
+#define SLOPE_TOLERANCE 1e-8    /* of a line search, against its first slope */
+#define SOFT_TOLERANCE 1e-7     /* N s, of the norm of SAP's tangential impulse */
 #define SIGMA 1e-3
 /* Of stops and controllers, in Drake: the near-rigid threshold, and the stiffness of a stop (N/m or N m/rad). */
 #define NEAR_RIGID (0.1 * 0.1 / (4.0 * M_PI * M_PI))
@@ -65,6 +69,7 @@ typedef struct {
     Contact contacts[NC + 1];
     Axis axes[2 * NS + ND + 1];
     int contact_count, axis_count;
+    int takes_part[NV];                      /* by tree: whether it has a contact or an axis; else, v = v* there */
 } Problem;
 
 /* Factor H = L' L in place, along the tree. Return 0 if H is not positive definite. */
@@ -149,7 +154,7 @@ static void impulse(const Contact *c, const double *vc, double *g, double (*G)[3
         for (int s = 0; s < 2; ++s) G[r][s] = c->mu * c->n0 * ((r == s) - t[r] * t[s]) / soft;
 #else
     double y[3] = {-vc[0] / c->Rt, -vc[1] / c->Rt, (c->vn_hat - vc[2]) / c->Rn};
-    double yr = sqrt(y[0] * y[0] + y[1] * y[1]), mu_hat = c->mu * c->Rt / c->Rn;
+    double yr = sqrt(y[0] * y[0] + y[1] * y[1] + SOFT_TOLERANCE * SOFT_TOLERANCE), mu_hat = c->mu * c->Rt / c->Rn;
     if (yr <= c->mu * y[2]) { /* it sticks */
         memcpy(g, y, 3 * sizeof *g);
         G[0][0] = G[1][1] = 1.0 / c->Rt;
@@ -211,7 +216,7 @@ static void prepare(Contact *c, const double *scale, const double *v0) {
 
 static void add_contacts(Problem *p, const double *const *in, const double *v0) {
     for (int at = 0; at < NC; ++at) {
-        if (!(in[5][at] < 0.0)) continue;
+        if (!(in[5][at] <= 0.0)) continue;
         Contact *c = p->contacts + p->contact_count++;
         *c = (Contact){.at = at, .phi = in[5][at], .k = in[6][at], .d = in[7][at], .mu = in[8][at]};
         frame(in[4] + 3 * at, c->R_WC);
@@ -289,69 +294,92 @@ static double gradient(Problem *p, const double *v, double *grad, double (*H)[NV
     return square;
 }
 
-/* The step along a direction at which the cost is least: Newton's method within a bracket. */
-static double line_search(Problem *p, const double *v, const double *direction, const double *grad) {
-    double Ap[NV], d[NV], begin[NC + 1][3], along[NC + 1][3];
-    multiply(p->A, direction, Ap);
-    for (int i = 0; i < NV; ++i) d[i] = v[i] - p->v_star[i];
+/* A direction from v, and what is needed for the slope of the cost along it. */
+typedef struct {
+    double v[NV], direction[NV], Ap[NV], dAp, pAp;
+    double begin[NC + 1][3], along[NC + 1][3]; /* velocities of contacts */
+} Line;
+
+/* Return the slope of the cost after a step along a line, and its curvature. */
+static double slope_after(const Problem *p, const Line *line, double step, double *curvature) {
+    double slope = line->dAp + step * line->pAp;
+    *curvature = line->pAp;
     for (int a = 0; a < p->contact_count; ++a) {
-        contact_velocity(p->contacts + a, v, begin[a]);
-        contact_velocity(p->contacts + a, direction, along[a]);
-    }
-    double pAp = dot(direction, Ap), dAp = dot(d, Ap), slope0 = fabs(dot(grad, direction));
-    double step = 1.0, low = 0.0, high = INFINITY;
-    for (int k = 0; k < MOST_STEPS; ++k) {
-        double slope = dAp + step * pAp, curvature = pAp;
-        for (int a = 0; a < p->contact_count; ++a) {
-            double vc[3], g[3], G[3][3];
-            for (int r = 0; r < 3; ++r) vc[r] = begin[a][r] + step * along[a][r];
-            impulse(p->contacts + a, vc, g, G);
-            for (int r = 0; r < 3; ++r) {
-                slope -= g[r] * along[a][r];
-                for (int s = 0; s < 3; ++s) curvature += along[a][r] * G[r][s] * along[a][s];
-            }
+        const double *along = line->along[a];
+        double vc[3], g[3], G[3][3];
+        for (int r = 0; r < 3; ++r) vc[r] = line->begin[a][r] + step * along[r];
+        impulse(p->contacts + a, vc, g, G);
+        for (int r = 0; r < 3; ++r) {
+            slope -= g[r] * along[r];
+            for (int s = 0; s < 3; ++s) *curvature += along[r] * G[r][s] * along[s];
         }
-        for (int a = 0; a < p->axis_count; ++a) {
-            int i = p->axes[a].v;
-            double falls;
-            slope -= axis_impulse(p->axes + a, v[i] + step * direction[i], &falls) * direction[i];
-            curvature += falls * direction[i] * direction[i];
-        }
-        if (fabs(slope) <= 1e-8 * slope0) break;
-        if (slope > 0.0) high = step;
-        else low = step;
-        double next = step - slope / curvature;
-        if (!(next > low && next < high)) next = high < INFINITY ? 0.5 * (low + high) : 2.0 * step;
-        if (fabs(next - step) <= 1e-14 * step) break;
-        step = next;
     }
-    return step;
+    for (int a = 0; a < p->axis_count; ++a) {
+        int i = p->axes[a].v;
+        double along = line->direction[i], falls;
+        slope -= axis_impulse(p->axes + a, line->v[i] + step * along, &falls) * along;
+        *curvature += falls * along * along;
+    }
+    return slope;
 }
 
-/* Iterate from v; return whether it converges. */
-static int minimize(Problem *p, double *v) {
-    double H[NV][NV], grad[NV], direction[NV], A_v[NV];
-    int stalled = 0;
+/* Return the step at which the cost is least, by Newton's method with bisection (rtsafe); NaN if there is none. */
+static double line_search(Problem *p, Line *line, double slope0) {
+    double curvature, d[NV];
+    multiply(p->A, line->direction, line->Ap);
+    for (int i = 0; i < NV; ++i) d[i] = line->v[i] - p->v_star[i];
+    line->dAp = dot(d, line->Ap), line->pAp = dot(line->direction, line->Ap);
+    for (int a = 0; a < p->contact_count; ++a) {
+        contact_velocity(p->contacts + a, line->v, line->begin[a]);
+        contact_velocity(p->contacts + a, line->direction, line->along[a]);
+    }
+    if (!(slope0 < 0.0)) return NAN;
+    if (slope_after(p, line, LONGEST_STEP, &curvature) < SLOPE_TOLERANCE * -slope0) return LONGEST_STEP;
+    double step = fmin(-slope0 / curvature, LONGEST_STEP), tolerance = SLOPE_TOLERANCE * step;
+    double low = 0.0, high = LONGEST_STEP, change = high, before = high;
     for (int k = 0; k < MOST_ITERATIONS; ++k) {
+        double slope = slope_after(p, line, step, &curvature);
+        if (slope < 0.0) low = step;
+        else high = step;
+        if (fabs(slope) < SLOPE_TOLERANCE * -slope0) return step;
+        int is_slow = 2.0 * fabs(slope) > fabs(before * curvature);
+        double next = step - slope / curvature;
+        before = change;
+        if (is_slow || !(low <= next && next <= high)) {
+            change = 0.5 * (high - low);
+            step = low + change;
+        } else {
+            change = slope / curvature;
+            step = next;
+        }
+        if (fabs(change) < tolerance) return step;
+    }
+    return NAN;
+}
+
+/* Iterate from the velocities before the step; return whether it converges. */
+static int minimize(Problem *p, double *v) {
+    double H[NV][NV], grad[NV], A_v[NV];
+    Line line;
+    for (int i = 0; i < NV; ++i)
+        if (!p->takes_part[TREE[i]]) v[i] = p->v_star[i];
+    for (int k = 0; k <= MOST_ITERATIONS; ++k) {
         double impulses = gradient(p, v, grad, H), residual = 0.0, momentum = 0.0;
         multiply(p->A, v, A_v);
         for (int i = 0; i < NV; ++i) {
+            if (!p->takes_part[TREE[i]]) continue;
             residual += grad[i] * grad[i] * p->scale[i];
             momentum += A_v[i] * A_v[i] * p->scale[i];
         }
         if (!isfinite(momentum + impulses)) return 0;
-        double tolerance = stalled ? DRAKES_TOLERANCE : TOLERANCE;
-        if (sqrt(residual) <= 1e-14 + tolerance * sqrt(fmax(momentum, impulses))) return 1;
-        if (stalled || !factor(H)) return 0;
-        for (int i = 0; i < NV; ++i) direction[i] = -grad[i];
-        solve(H, direction);
-        double step = line_search(p, v, direction, grad), change = 0.0, size = 0.0;
-        for (int i = 0; i < NV; ++i) {
-            v[i] += step * direction[i];
-            change += step * direction[i] * step * direction[i] * p->A[i][i];
-            size += v[i] * v[i] * p->A[i][i];
-        }
-        stalled = change <= 1e-28 * size; /* as near as rounding allows */
+        if (sqrt(residual) <= 1e-14 + TOLERANCE * sqrt(fmax(momentum, impulses))) return 1;
+        if (k == MOST_ITERATIONS || !factor(H)) return 0;
+        for (int i = 0; i < NV; ++i) line.direction[i] = -grad[i];
+        solve(H, line.direction);
+        memcpy(line.v, v, sizeof line.v);
+        double step = line_search(p, &line, dot(grad, line.direction));
+        if (!(step > 0.0)) return 0;
+        for (int i = 0; i < NV; ++i) v[i] += step * line.direction[i];
     }
     return 0;
 }
@@ -387,7 +415,13 @@ static int take_step(const double **arg, Problem *p, double *v) {
     add_contacts(p, in, in[2]);
     add_stops(p, in[2], in[9]);
     add_drives(p, in[10], in[11]);
-    if (p->contact_count + p->axis_count) return minimize(p, v); /* from the velocities before the step, as Drake */
+    if (p->contact_count + p->axis_count) {
+        memset(p->takes_part, 0, sizeof p->takes_part);
+        for (int a = 0; a < p->contact_count; ++a)
+            for (int m = 0, at = p->contacts[a].at; m < COUNT[at]; ++m) p->takes_part[TREE[COLUMNS[at][m]]] = 1;
+        for (int a = 0; a < p->axis_count; ++a) p->takes_part[TREE[p->axes[a].v]] = 1;
+        return minimize(p, v);
+    }
     memcpy(v, p->v_star, sizeof p->v_star);
     return 1;
 }

@@ -176,6 +176,7 @@ class SapSolver:
                 f"#define DT {self._plant.time_step()!r}\n#define VS {_STICTION_TOLERANCE!r}\n",
                 f"#define BETA {self._plant.get_sap_near_rigid_threshold()!r}\n",
                 _table("int PARENT", self._elimination_tree(places)),
+                _table("int TREE", self._trees()),
                 _table("int COUNT", [len(row) for row in places]),
                 f"static const int COLUMNS[NC + 1][NV] = {{{', '.join([*map(_row, places), '{0}'])}}};\n",
                 _table("int STOP", [stop.v for stop in stops]),
@@ -199,6 +200,22 @@ class SapSolver:
         blocks = [(a * b, c * d) for a, b in shapes_out for c, d in shapes_in]
         signature = _signature(f"jac_{name}", [*shapes_in, *shapes_out], blocks)
         return name, f"{source}\n#define JACOBIAN jac_{name}\n{jacobian}{signature}"
+
+    def _trees(self) -> list[int]:
+        """Return the number of the tree of each velocity: bodies that joints connect without the world."""
+        numbers = list(range(self._plant.num_bodies()))
+        for index in self._plant.GetJointIndices():
+            joint = self._plant.get_joint(index)
+            ends = [int(body.index()) for body in (joint.parent_body(), joint.child_body())]
+            if int(self._plant.world_body().index()) not in ends:
+                first, second = (numbers[end] for end in ends)
+                numbers = [first if number == second else number for number in numbers]
+        trees: dict[int, int] = {}
+        for body in bodies(self._plant):
+            for place in self._model.way(int(body.index())):
+                trees[place] = numbers[int(body.index())]
+        order = sorted(set(trees.values()))
+        return [order.index(trees[place]) for place in range(self._model.nv)]
 
     def _elimination_tree(self, places: Sequence[Sequence[int]]) -> list[int]:
         ways = [self._model.way(int(body.index())) for body in bodies(self._plant)]

@@ -40,6 +40,11 @@ class ContactSensor(SampledSensor):
         plant: The finalized plant.
         bodies: The bodies that have a switch.
         threshold: The force (N) above which a switch closes; a parameter of the Context.
+
+    Attributes:
+        entry_names: Names of the bodies, one for each entry of the output.
+        body_indices: Indices of the bodies in the plant.
+        settings: The parameter ``threshold``.
     """
 
     def __init__(
@@ -59,21 +64,22 @@ class ContactSensor(SampledSensor):
             "foot_contact", default=np.zeros(len(bodies)), period=period, unit="1", stream=stream, errors=errors
         )
         self.entry_names = tuple(body.name() for body in bodies)
+        self.body_indices = tuple(int(body.index()) for body in bodies)
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Which sum of forces a body or geometry adds to.
         self._count = len(bodies)
         self._slots = [self._count] * plant.num_bodies()
-        for k, body in enumerate(bodies):
-            self._slots[int(body.index())] = k
+        for k, index in enumerate(self.body_indices):
+            self._slots[index] = k
         self._geometry_slots = {
             # By number: the ids themselves would hold the plant.
             geometry.get_value(): k
             for k, body in enumerate(bodies)
             for geometry in plant.GetCollisionGeometriesForBody(body)
         }
-        self._settings = self.declare_parameters(threshold=Quantity(threshold, "N", (0.0, np.inf)))
+        self.settings = self.declare_parameters(threshold=Quantity(threshold, "N", (0.0, np.inf)))
 
     def _measure(self, context: Context, state: DiscreteValues) -> NDArray[np.float64]:
         results = self._results_port.Eval(context)
         forces = contact_forces(results, self._slots, self._geometry_slots, self._count)
-        return (forces > self._settings.view(context).threshold).astype(float)
+        return (forces > self.settings.view(context).threshold).astype(float)
