@@ -82,7 +82,7 @@ class _Layout:
         if not all(_is_number(field, decimal) for field in fields):
             return cls(_checked_names(fields, path), separator, decimal, len(above) + 1 + len(below))
         comment = above[-1] if above else ""
-        names = _fields(comment.lstrip(f"{_COMMENT} ").strip(), separator)  # Of numpy.savetxt(header=...), say.
+        names = _fields(comment.lstrip(f"{_COMMENT} ").strip(), separator)  # As numpy.savetxt writes its header.
         if len(names) != len(fields):
             names = [str(k) for k in range(len(fields))]
         return cls(_checked_names([name.strip() for name in names], path), separator, decimal, len(above))
@@ -149,7 +149,7 @@ class _ArrowColumns(Mapping[str, NDArray[Any]]):
 
 
 def _read_by_arrow(path: Path, layout: _Layout) -> _ArrowColumns | None:
-    """Return the columns; None if Arrow cannot read the rows: several lengths, comments between them, or none at all."""
+    """Return the columns; None if Arrow cannot read the rows: several lengths, comments between them, or no row."""
     import pyarrow
     from pyarrow import csv as arrow_csv
 
