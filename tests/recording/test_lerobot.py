@@ -49,7 +49,9 @@ def pictures(count: int, seed: int) -> np.ndarray:
     return np.tile(colors[:, np.newaxis, np.newaxis].astype(np.uint8), (1, 48, 64, 1))
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["video", "images"])
+@pytest.fixture(
+    scope="module", params=[pytest.param(True, marks=pytest.mark.slow, id="video"), pytest.param(False, id="images")]
+)
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("lerobot") / "drives"
     logs = [log(0), log(1, duration=0.5)]
