@@ -2,7 +2,8 @@
 
 ``python -m vtbdrake_diagrams.double_pendulum.reality FOLDER`` prints it. FOLDER holds the repository
 dfki-ric-underactuated-lab/double_pendulum (BSD-3): its excitation runs of 2023-06-29 of the design C.1, each with
-positions and torques that were measured at 500 Hz for 10 s, and three published sets of parameters.
+positions and torques that were measured at 500 Hz for 10 s, swing-ups of the real acrobot, and published sets of
+parameters.
 """
 
 from __future__ import annotations
@@ -53,14 +54,16 @@ def recordings(folder: Path) -> list[Log]:
     paths = sorted(folder.glob("data/experiment_records/design_C.1/sys_id/*/*/trajectory.csv"))
     if not paths:
         raise FileNotFoundError(f"{folder} has no data/experiment_records/design_C.1/sys_id")
-    return [
-        vtb.read_table(
-            path,
-            sense={POSITION: ["pos_meas1", "pos_meas2"]},
-            act={TORQUE: ["tau_meas1", "tau_meas2"]},
-        )
-        for path in paths
-    ]
+    return [_read(path) for path in paths]
+
+
+def swing_ups(folder: Path) -> list[Log]:
+    """Return the swing-ups on the real system, whose shoulder is not driven."""
+    return [_read(path) for path in sorted(folder.glob("leaderboard/acrobot/*/src_data/*/*/trajectory.csv"))]
+
+
+def _read(path: Path) -> Log:
+    return vtb.read_table(path, sense={POSITION: ["pos_meas1", "pos_meas2"]}, act={TORQUE: ["tau_meas1", "tau_meas2"]})
 
 
 def stand_in(count: int = 8, seconds: float = 5.0) -> list[Log]:
@@ -231,15 +234,16 @@ def main(folder: Path) -> None:
         rows[name] = {"m1 r1 + m2 l1": p["m1"] * p["r1"] + p["m2"] * p["l1"], "m2 r2": p["m2"] * p["r2"], "I2": p["I2"]}
     for name, row in rows.items():
         print(f"{name:12}" + "".join(f"{value:16.4f}" for value in row.values()))
-    print(f"\nRMS error in rad of predictions over {HORIZON:g} s, of {len(held_out)} runs that were not fitted:")
     predictions: dict[str, Callable[[Log], Callable[..., Array]]] = {
         "calibrated": lambda log: TestbedPrediction(values, log),
         **{name: lambda log, p=p: partial(published_prediction, p) for name, p in sets.items()},  # type: ignore[misc]
     }
-    for name, make in predictions.items():
-        errors = np.concatenate([prediction_errors(log, make(log)) for log in held_out])
-        median, most = np.quantile(errors, [0.5, 0.9])
-        print(f"{name:12} median {median:.4f}, 90 % within {most:.4f} ({len(errors)} predictions)")
+    for text, runs in ((f"{len(held_out)} runs that were not fitted", held_out), ("swing-ups", swing_ups(folder))):
+        print(f"\nRMS error in rad of predictions over {HORIZON:g} s, {text}:")
+        for name, make in predictions.items():
+            errors = np.concatenate([prediction_errors(log, make(log)) for log in runs])
+            median, most = np.quantile(errors, [0.5, 0.9])
+            print(f"{name:12} median {median:.4f}, 90 % within {most:.4f} ({len(errors)} predictions)")
 
 
 if __name__ == "__main__":
