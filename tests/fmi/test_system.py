@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ZeroOrderHold
 from scipy.integrate import solve_ivp
 
 import vtbdrake as vtb
@@ -23,6 +25,7 @@ from vtbdrake.fmi.instances import FmuError
 from vtbdrake.rollout import ThreadExecutor
 from vtbdrake.state.snapshot import SnapshotError
 from vtbdrake.testbed import DpsAlone
+from vtbdrake.testing import check_scenario
 
 Fmu = Callable[[str], Path]
 
@@ -200,6 +203,29 @@ def test_rollouts_in_threads_equal_serial_ones_and_vary_parameters(fmu: Fmu) -> 
     values = [rollout.value for rollout in serial.rollouts]
     assert values == [rollout.value for rollout in threads.rollouts]
     assert values == sorted(values) and values[0] < values[-1]
+
+
+def test_what_is_sampled_with_a_step_sees_the_outputs_before_it(fmu: Fmu) -> None:
+    builder = DiagramBuilder()
+    system = builder.AddSystem(FmuSystem(fmu("Integrator"), period=0.1, parameters={"x": 5.0}))
+    hold = builder.AddSystem(ZeroOrderHold(0.1, 1))
+    other = builder.AddSystem(FmuSystem(fmu("Integrator"), period=0.1))
+    for reader in (hold, other):
+        builder.Connect(system.get_output_port(), reader.get_input_port())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    system.get_input_port().FixValue(system.GetMyMutableContextFromRoot(context), [1.0])
+    for k in range(1, 4):
+        simulator.AdvanceTo(0.1 * k - 0.05)
+        values = [s.get_output_port().Eval(s.GetMyContextFromRoot(context)).item() for s in (system, hold, other)]
+        x = [5.0 + 0.2 * j for j in range(k + 1)]  # the outputs at 0, 0.1, ... s
+        np.testing.assert_allclose(values, [x[k], x[k - 1], 0.2 * sum(x[:k])], rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_a_scenario_with_an_fmu_passes_all_checks(fmu: Fmu) -> None:
+    check_scenario(TankScenario(path=str(fmu("Integrator"))))
 
 
 @pytest.mark.slow

@@ -22,7 +22,9 @@ class TankScenario(Scenario):
 
     def interface(self) -> Interface:
         return Interface(
-            sense=[Signal("level", 1)], act=[Signal("inflow", 1, idle=[0.0])], commands=[Signal("goal", 1, default=1.0)]
+            sense=[Signal("level", 1, unit="m", lower=-10.0, upper=10.0)],
+            act=[Signal("inflow", 1, unit="m^3/s", lower=-50.0, upper=50.0, idle=0.0)],
+            commands=[Signal("goal", 1, unit="m", lower=-2.0, upper=2.0, default=1.0)],
         )
 
     def make_dps(self) -> System:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import Value
-from pydrake.systems.framework import AbstractStateIndex, Context, EventStatus, State
+from pydrake.systems.framework import AbstractStateIndex, Context, DiscreteValues, EventStatus, State
 
 from vtbdrake.common.argument_checks import as_array, as_flag, as_number
 from vtbdrake.fmi.imported import FmuVariable, ImportedFmu, Ports
@@ -34,10 +34,10 @@ class FmuSystem(AddressedSystem):
         output_ports:
         - <every port in outputs>
 
-    At t = 0, T, 2 T, ... the inputs are read, the FMU does a step of length T with them, and the output ports show what
-    it then tells: from t on, as a discrete plant shows the state after the step that begins at t, and a sample at t + T
-    shows the FMU's outputs at t + T. So there is no direct feedthrough. An input port that nothing is connected to
-    leaves the start value that the FMU's file tells.
+    At t = 0, T, 2 T, ... the inputs are read, and the FMU does a step of length T with them. As with a discrete plant,
+    what is updated at t still sees the FMU's outputs at t, and from then on the ports show its outputs at t + T. So
+    there is no direct feedthrough. An input port that nothing is connected to leaves the start value that the FMU's
+    file tells.
 
     The whole state of the FMU is in the Context, serialized by the FMU itself: contexts can be cloned, saved and
     simulated side by side, as exactly as the FMU restores its state. It is initialized when it is first needed, at the
@@ -97,17 +97,27 @@ class FmuSystem(AddressedSystem):
         self._starts = np.concatenate([np.zeros(0), *(fmu.start(v) for of in ports_in.values() for v in of)])
         state = self.DeclareAbstractState(Value(_NOT_BEGUN))
         self.codecs = {0: _codec(fmu, fork=fork)}
-        prerequisites = {self.abstract_state_ticket(AbstractStateIndex(state)), self.all_parameters_ticket()}
-        self._current = self.declare_cache("state of the FMU", self._begun, prerequisites | {self.time_ticket()})
+        # Unrestricted updates come before discrete ones, which must still see the outputs before the step: so these are
+        # discrete state. It is not addressed, because it is empty until the first step.
+        size = sum(variable.size for of in ports_out.values() for variable in of)
+        self._shown = self.declare_discrete_state(outputs=Quantity(np.zeros(size), addressed=False))
+        prerequisites = {
+            self.abstract_state_ticket(AbstractStateIndex(state)),
+            self.discrete_state_ticket(self._shown.index),
+            self.all_parameters_ticket(),
+            self.time_ticket(),
+        }
+        self._outputs = self.declare_cache("outputs of the FMU", self._present_outputs, prerequisites)
         for port, entries in _entries(ports_out).items():
-            self._declare_output(port, entries, prerequisites | {self.time_ticket()})
+            self._declare_output(port, entries, prerequisites)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self._period, 0.0, self._step)
+        self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._show)
         # What fails, fails here.
         self._instances.initial(0.0, self._values_of(self.CreateDefaultContext()))
 
     def _declare_output(self, port: str, entries: slice, prerequisites: Any) -> None:
         def calc(system: FmuSystem, context: Context, output: Any) -> None:
-            output.set_value(system._current(context).outputs[entries])
+            output.set_value(system._outputs(context)[entries])
 
         self.DeclareVectorOutputPort(port, entries.stop - entries.start, _method(self, calc), prerequisites)
 
@@ -131,19 +141,27 @@ class FmuSystem(AddressedSystem):
         state: FmuState = context.get_abstract_state(0).get_value()
         return state if state.begun else self._instances.initial(context.get_time(), self._values_of(context))
 
+    def _present_outputs(self, context: Context) -> np.ndarray:
+        if context.get_abstract_state(0).get_value().begun:
+            return self._shown.array(context).copy()
+        return self._begun(context).outputs
+
     def _step(self, context: Context, state: State) -> EventStatus:
         inputs = self._starts.copy()
         for port, entries in self._ports:
             if port.HasValue(context):
                 inputs[entries] = port.Eval(context)
-        time = context.get_time()
-        following, is_end = self._instances.advanced(
-            self._begun(context), time, self._period, inputs, self._values_of(context)
-        )
+        time, present = context.get_time(), self._begun(context)
+        following, is_end = self._instances.advanced(present, time, self._period, inputs, self._values_of(context))
         state.get_mutable_abstract_state(0).set_value(following)
+        # At the first step they are not there yet.
+        self._shown.mutable_array(state.get_mutable_discrete_state())[:] = present.outputs
         if is_end:
             return EventStatus.ReachedTermination(self, f"the FMU asks to end the simulation at t = {time:g} s")
         return EventStatus.Succeeded()
+
+    def _show(self, context: Context, discrete_state: DiscreteValues) -> None:
+        self._shown.mutable_array(discrete_state)[:] = context.get_abstract_state(0).get_value().outputs
 
 
 def _method(system: FmuSystem, function: Any) -> Any:
