@@ -39,6 +39,11 @@ def of_problem() -> dict[str, Any]:
     return {"problem": problem, **SIGNALS, "observation": observation, "period": 0.05}
 
 
+def of_noise() -> dict[str, Any]:
+    """Return episodes with more steps than those for which random numbers are drawn at once."""
+    return {"problem": CartPoleScenario(position_errors=NOISE), **BALANCING, "horizon": 1.4}
+
+
 def of_reward() -> dict[str, Any]:
     """Return a reward that CasADi's symbols do not pass."""
     reward = vtb.Reward(lambda angle: 1.0 if abs(angle - np.pi) < 0.2 else -0.5, of=POLE)
@@ -62,16 +67,16 @@ def history(envs: Any, count: int, *, seed: int = 5) -> list[np.ndarray]:
     return [begin, *(np.array([np.array(result[k]) for result in results]) for k in range(4))]
 
 
-@pytest.mark.parametrize("statement", [of_problem, of_reward, of_slider])
+@pytest.mark.parametrize("statement", [of_problem, of_noise, of_reward, of_slider])
 def test_compiled_environments_equal_single_ones(statement: Callable[[], dict[str, Any]]) -> None:
     arguments = statement()
     single = SyncVectorEnv([partial(vtb.gymnasium_env, **arguments)] * 3)
-    expected = history(single, 45)
+    expected = history(single, 80)
     compiled = vtb.gymnasium_vector_env(**arguments, num_envs=3, executor="compiled")
     assert isinstance(compiled, CompiledVectorEnv)
     assert compiled.metadata["autoreset_mode"] is single.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert (compiled.action_space, compiled.observation_space) == (single.action_space, single.observation_space)
-    for one, other in zip(history(compiled, 45), expected, strict=True):
+    for one, other in zip(history(compiled, 80), expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-9)
     ended = expected[3] | expected[4]
     assert ended.any(axis=0).all() and (statement is not of_problem or expected[3].any())

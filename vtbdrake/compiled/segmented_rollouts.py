@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,10 @@ from vtbdrake.common.arrays import Array
 from vtbdrake.compiled.compiled_rollouts import CompiledRollouts, Program
 from vtbdrake.compiled.schedule import Instant, schedule
 from vtbdrake.testbed.instants import sample_instants
+
+# The largest number of segments for which random numbers are drawn at once, and of the numbers of one rollout in them.
+_MOST_AHEAD = 64
+_MOST_NUMBERS = 1 << 15
 
 
 class SegmentedRollouts:
@@ -52,6 +55,9 @@ class SegmentedRollouts:
         samples = np.array(at_samples[1:]).reshape(-1, every)
         self._samples = samples - np.array(ends[:-1])[:, np.newaxis]
         self._first = [Instant(float(self.instants[0]), True, ())]
+        self._ahead = max(1, min(_MOST_AHEAD, _MOST_NUMBERS // (self._program.count * max(1, self._walker.noise))))
+        # (seeds, number of the block of segments) -> random numbers, shape (segments, count, noise).
+        self._drawn_blocks: dict[tuple[bytes, int], Array] = {}
 
     def begin(self, z: Array) -> Array:
         """Return the records of the first sample of rollouts that begin at z, shape (n, ny).
@@ -61,7 +67,9 @@ class SegmentedRollouts:
         """
         records = np.empty((len(z), self.record_size))
         plan = self._program.plan(self._first)
-        noise = self._drawn(z, self._first) if self._walker.noise else None
+        noise = None
+        if self._walker.noise:
+            noise = self._walker.draw_numbers(self._walker.seeds(z), self._first, self._program.count)
         for chunk in self._chunks(len(z)):
             each = None if noise is None else noise[chunk]
             records[chunk] = self._program.run(z[chunk], each, plan)[1][:, 0]
@@ -96,14 +104,34 @@ class SegmentedRollouts:
         return [slice(k, k + self._program.most) for k in range(0, count, self._program.most)]
 
     def _noise(self, z: Array, segments: NDArray[np.intp]) -> Array | None:
-        """Return the random numbers of all rollouts in their segments, shape (n, count, noise), if there are some."""
+        """Return the random numbers of all rollouts in their segments, shape (n, count, noise), if there are some.
+
+        They are drawn for several segments ahead: one after the other, they would take longer than the rollouts.
+        """
         if not self._walker.noise:
             return None
-        noise = np.empty((len(z), self._program.count, self._walker.noise))
-        for number in np.unique(segments).tolist():
-            rows = np.flatnonzero(segments == number)
-            noise[rows] = self._drawn(z[rows], self._parts[number])
-        return noise
+        seeds = self._walker.seeds(z)
+        blocks, places = np.divmod(segments, self._ahead)
+        keys = list(zip(map(np.ndarray.tobytes, seeds), blocks.tolist(), strict=True))
+        missing: dict[int, dict[bytes, int]] = {}
+        for row, key in enumerate(keys):
+            if key not in self._drawn_blocks:
+                missing.setdefault(key[1], {})[key[0]] = row
+        for block, rows in missing.items():
+            numbers = self._drawn_block(seeds[list(rows.values())], block)
+            self._drawn_blocks |= {(seed, block): each.copy() for seed, each in zip(rows, numbers, strict=True)}
+        if len(self._drawn_blocks) > 2 * len(keys):
+            self._drawn_blocks = {key: self._drawn_blocks[key] for key in keys}
+        return np.array([self._drawn_blocks[key][place] for key, place in zip(keys, places.tolist(), strict=True)])
 
-    def _drawn(self, z: Array, instants: Sequence[Instant]) -> Array:
-        return self._walker.draw_numbers(self._walker.seeds(z), instants, self._program.count)
+    def _drawn_block(self, seeds: Array, number: int) -> Array:
+        """Return the random numbers of a block of segments, shape (n, segments, count, noise).
+
+        Args:
+            seeds: The seeds of the draws, shape (n, draws).
+            number: The number of the block.
+        """
+        count, parts = self._program.count, self._parts[number * self._ahead : (number + 1) * self._ahead]
+        padded = [[*part, *[Instant(part[-1].time, False, ())] * (count - len(part))] for part in parts]
+        numbers = self._walker.draw_numbers(seeds, list(chain.from_iterable(padded)), count * len(parts))
+        return numbers.reshape(len(seeds), len(parts), count, -1)
