@@ -67,7 +67,9 @@ def history(envs: Any, count: int, *, seed: int = 5) -> list[np.ndarray]:
     return [begin, *(np.array([np.array(result[k]) for result in results]) for k in range(4))]
 
 
-@pytest.mark.parametrize("statement", [of_problem, of_noise, of_reward, of_slider])
+@pytest.mark.parametrize(
+    "statement", [of_problem, of_slider, *(pytest.param(of, marks=pytest.mark.slow) for of in (of_noise, of_reward))]
+)
 def test_compiled_environments_equal_single_ones(statement: Callable[[], dict[str, Any]]) -> None:
     arguments = statement()
     single = SyncVectorEnv([partial(vtb.gymnasium_env, **arguments)] * 3)
