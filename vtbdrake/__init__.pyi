@@ -45,3 +45,4 @@ from .testbed import Scenario as Scenario
 from .testbed import Signal as Signal
 from .testbed import SlowPart as SlowPart
 from .testbed import load_scenario as load_scenario
+from .visualization.scenes import write_scene as write_scene

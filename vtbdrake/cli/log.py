@@ -20,7 +20,7 @@ from vtbdrake.cli.options import (
     set_option,
     settings,
 )
-from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, show
+from vtbdrake.cli.output import RECORDINGS, json_option, save_recording, say, show
 from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
@@ -152,10 +152,14 @@ def replay(
         raise FailedError(f"not everything was compared: {report.ended}")
 
 
+# The suffixes of scenes, as `vtbdrake.visualization.scenes` writes them.
+_SCENES = (".mcap", ".rrd")
+
+
 def _parse_export(text: str) -> Path:
     from vtbdrake.recording.export import EXPORTS
 
-    return output(*EXPORTS)(text)
+    return output(*EXPORTS, *_SCENES)(text)
 
 
 @click.command()
@@ -163,27 +167,41 @@ def _parse_export(text: str) -> Path:
 @click.argument("out", callback=converted(_parse_export), shell_complete=complete_file)
 @option(
     "--scenario SCENARIO",
-    "The scenario of the machine, through whose protocol a log of another program is read: a name or MODULE:CLASS.",
+    "The scenario of the log: its world is in a scene; a log of another program is read through its protocol.",
     parse=parse_scenario,
 )
+@option("--rate HZ", "States of the world per second in a scene.", type=click.FloatRange(0.0, min_open=True), default=30.0)
+@option("--images/--no-images", "Whether a scene has images and scans.", default=True)
 @json_option
-def export(log: Path, out: Path, scenario: Scenario | None) -> None:
-    """Write a LOG as MCAP (for Foxglove), CSV or Parquet.
+def export(log: Path, out: Path, scenario: Scenario | None, rate: float, images: bool) -> None:
+    """Write a LOG as CSV or Parquet, or as a scene for Foxglove (MCAP) or Rerun (.rrd).
 
-    The suffix of OUT says which. A log of lcm-logger needs the scenario of its machine.
+    The suffix of OUT says which. A scene has the signals and events of the log. With --scenario, whose code runs, it
+    also has the world, which a replay of the log computes. A log of lcm-logger needs the scenario of its machine, and
+    has signals alone.
 
     \b
     Example:
-      vtbdrake export run.lcm run.mcap
+      vtbdrake export run.lcm run.parquet
+      vtbdrake export run.lcm run.mcap --scenario manipulator
+      vtbdrake export run.lcm run.rrd --scenario manipulator
       vtbdrake export lcmlog-2026-11-29.00 run.csv --scenario cart_pole
     """
     from vtbdrake.recording import Log, read_log
     from vtbdrake.recording.export import export as export_log
 
     opened = read_log(log) if scenario is None else opened_log(log, scenario)
-    export_log(opened, out)
+    if out.suffix in _SCENES:
+        from vtbdrake.visualization import write_scene
+
+        write_scene(opened, out, rate=rate, images=images, world=scenario is not None)
+    else:
+        export_log(opened, out)
     if isinstance(opened, Log):
         show(opened, {"file": out, "sense": [*opened.sense], "act": [*opened.act], "remarks": opened.remarks})
         return
     described = {"cycles": len(opened), "period": opened.header.period, "incomplete": opened.incomplete}
     show(opened, {"file": out, "scenario": opened.header.scenario_name, **described})
+    if out.suffix in _SCENES and scenario is None:
+        name = opened.header.scenario_name
+        say(f"the file has no world: to compute it, which runs the scenario's code, add --scenario {name}")

@@ -368,6 +368,9 @@ import_option = option(
     expose_value=False,
 )
 film_option = option("--film FILE", "Write a film: .mp4, .gif or .webp.", parse=output(".mp4", ".gif", ".webp"))
+scene_option = option(
+    "--scene FILE", "Write the scene for Foxglove (.mcap) or Rerun (.rrd).", parse=output(".mcap", ".rrd")
+)
 set_option = option(
     "--set ADDRESS=VALUE",
     "Set a variable in s0 to a number or a JSON list. May be repeated.",

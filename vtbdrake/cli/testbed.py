@@ -19,6 +19,7 @@ from vtbdrake.cli.options import (
     output,
     sample_period_option,
     scenario_argument,
+    scene_option,
     set_option,
     settings,
     start_option,
@@ -174,6 +175,7 @@ def diagram(scenario: Scenario, mode: str, out: Path | None) -> None:
 @option("--snapshot FILE", "Write s(t_end), for --start.", parse=output())
 @option("--html FILE", "Write an animation for any web browser.", parse=output(".html"))
 @film_option
+@scene_option
 @json_option
 def rollout(
     scenario: Scenario,
@@ -186,6 +188,7 @@ def rollout(
     snapshot: Path | None,
     html: Path | None,
     film: Path | None,
+    scene: Path | None,
 ) -> None:
     """Simulate a testbed once.
 
@@ -227,11 +230,15 @@ def rollout(
         from vtbdrake.optimization import Motion
         from vtbdrake.visualization import make_meshcat, show_motion
 
-        scene = show_motion(make_meshcat(), Motion.of(scenario, result))
+        recording = show_motion(make_meshcat(), Motion.of(scenario, result))
         if html is not None:
-            scene.save(html)
+            recording.save(html)
         if film is not None:
-            scene.film(film)
+            recording.film(film)
+    if scene is not None:
+        from vtbdrake.visualization import write_rollout
+
+        write_rollout(task, parameters, scene, testbed=testbed, end=_simulated(result))
     if result.failed:
         raise FailedError(f"the rollout failed: {one_line(result.message)}")
     if snapshot is not None:

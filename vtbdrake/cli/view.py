@@ -23,7 +23,7 @@ from vtbdrake.cli.options import (
     start_option,
     trust_option,
 )
-from vtbdrake.cli.output import json_option, say
+from vtbdrake.cli.output import json_option, say, show
 from vtbdrake.cli.page import browser_option, page_options, serve
 from vtbdrake.cli.problem import parse_problem
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from vtbdrake.optimization import Problem, ProblemFile
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
+    from vtbdrake.web.live.session import Session
 
 # The suffixes of model files: URDF, SDF, MJCF, and model directives of Drake.
 _MODEL_SUFFIXES = (".urdf", ".sdf", ".xml", ".dmd.yaml", ".dmd.yml")
@@ -129,6 +130,8 @@ def _is_problem(text: str) -> bool:
 @option("--certificate FILE", "With --tls, a certificate (PEM); one is made if it is left out.", type=_FILE)
 @option("--key FILE", "With --certificate, its private key (PEM).", type=_FILE)
 @package_option
+@option("--foxglove", "Serve what is shown to Foxglove, too, on this machine alone.", is_flag=True)
+@option("--rerun", "Serve what is shown to viewers of Rerun, too, on this machine alone.", is_flag=True)
 @option("--play", "Let time run at once.", is_flag=True)
 @browser_option
 @json_option
@@ -148,6 +151,8 @@ def view(
     certificate: Path | None,
     key: Path | None,
     packages: tuple[tuple[str, Path], ...],
+    foxglove: bool,
+    rerun: bool,
     play: bool,
     browser: bool,
 ) -> None:
@@ -166,6 +171,7 @@ def view(
       vtbdrake view station.yaml#Demo
       vtbdrake view cart_pole --url tcpq://127.0.0.1:7700
       vtbdrake view manipulator --log arm.lcm
+      vtbdrake view manipulator --foxglove --play
     """
     from vtbdrake.recording import Log
     from vtbdrake.testbed import Scenario
@@ -190,6 +196,7 @@ def view(
                 "a loop is shown as it is: leave --set, --start, --play, --problem, --study and --log out, or --url"
             )
         with view_loop(scenario, url, **page) as watched:
+            _mirror(watched.session, foxglove=foxglove, rerun=rerun)
             serve(watched, browser=browser)
         return
     viewed: Scenario | None = scenario
@@ -204,4 +211,21 @@ def view(
             viewed = None  # The log describes its scenario; fields that were set have to be the recorded ones.
     page |= {"problem": problem, "study": study, "trusted": trusted, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
+        _mirror(running.session, foxglove=foxglove, rerun=rerun)
         serve(running, browser=browser, ready=running.session.play if play else None)
+
+
+def _mirror(session: Session[Any], *, foxglove: bool, rerun: bool) -> None:
+    """Show a session in Foxglove and Rerun, too, and say where."""
+    if foxglove:
+        from vtbdrake.visualization import FoxgloveServer
+
+        server = FoxgloveServer()
+        session.mirror(server)
+        show(f"for Foxglove, open the connection {server.address}", {"foxglove": server.address})
+    if rerun:
+        from vtbdrake.visualization import RerunServer
+
+        hub = RerunServer()
+        session.mirror(hub)
+        show(f"for Rerun: rerun {hub.address}", {"rerun": hub.address})

@@ -182,7 +182,7 @@ def body_surfaces(
             continue
         group = min(plant.GetBodiesWeldedTo(body), key=lambda welded: int(welded.index()))
         X_GB = plant.CalcRelativeTransform(context, group.body_frame(), body.body_frame())
-        vertices, triangles = _surface(inspector.GetShape(geometry), name)
+        vertices, triangles = shape_surface(inspector.GetShape(geometry), name)
         points = (X_GB @ inspector.GetPoseInFrame(geometry)) @ vertices.T
         surfaces.setdefault(int(group.index()), []).append((points.T, triangles))
     return surfaces
@@ -206,8 +206,12 @@ def _group(body: int, surfaces: Sequence[Surface], device: Any) -> _WeldedBodies
     return _WeldedBodies(body, scene, np.concatenate([center, [radius], lower, upper]))
 
 
-def _surface(shape: Shape, name: str) -> Surface:
-    """Return the surface of a shape in its own frame.
+def shape_surface(shape: Shape, name: str) -> Surface:
+    """Return the surface of a shape in its own frame: vertices in m, (v, 3), and triangles, (t, 3).
+
+    Args:
+        shape: The shape; a mesh is one of an .obj file.
+        name: The name of its geometry, for the error.
 
     Raises:
         ValueError: Rays cannot be cast at such a shape.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -18,6 +19,7 @@ from vtbdrake.visualization.plots import FAILED, Picture, draw_trajectory, finis
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
+    from vtbdrake.optimization import Motion
     from vtbdrake.reasoning.reasoner import Reasoner
 
 _QUALITIES = colormaps["viridis"]
@@ -70,6 +72,51 @@ def _draw_qualities(axes: Axes, decision: Decision, colors: Mapping[int, str]) -
     axes.set(xlabel=address if single else "candidate", ylabel=decision.name, title=title)
 
 
+@dataclass(frozen=True)
+class Ghosts:
+    """Motions that are shown together, each with a look of its own.
+
+    Attributes:
+        motions: Label -> motion.
+        colors: Label -> tint, any matplotlib colour; a motion without an entry keeps its own colours.
+        opacity: Label -> opacity, in (0, 1].
+    """
+
+    motions: Mapping[str, Motion]
+    colors: Mapping[str, str]
+    opacity: Mapping[str, float]
+
+    @property
+    def looks(self) -> dict[str, Any]:
+        """Return the arguments ``colors`` and ``opacity`` of what shows motions."""
+        return {"colors": self.colors, "opacity": self.opacity}
+
+
+def decision_ghosts(reasoner: Reasoner, decision: Decision, *, most: int = 6) -> Ghosts:
+    """Return how the candidates would move: ghosts coloured by their quality, and the chosen one solid.
+
+    The rollouts are simulated again from the state in which the decision was made.
+
+    Args:
+        reasoner: The reasoner that made the decision.
+        decision: The decision.
+        most: The largest number of candidates, the best first; the plan in use is one of them.
+
+    Raises:
+        ValueError: All candidates failed at once, or the mental testbed has no plant.
+    """
+    if most < 1:
+        raise ValueError(f"one candidate is shown at least, not {most}")
+    ranked = [candidate for candidate in decision.ranked if candidate.rollouts]
+    shown = ranked[:most] if decision.candidates[0] in ranked[:most] else [*ranked[: most - 1], decision.candidates[0]]
+    colors = decision_colors(decision)
+    labels = {c.number: f"{c.number}{' (plan in use)' if c.number == 0 else ''}" for c in shown}
+    motions = {labels[c.number]: reasoner.motion(decision, c.number) for c in shown}
+    tints = {labels[c.number]: colors[c.number] for c in shown}
+    opacity = {labels[c.number]: 1.0 if c.number == decision.chosen else 0.35 for c in shown}
+    return Ghosts(motions, tints, opacity)
+
+
 def show_decision(
     meshcat: Meshcat, reasoner: Reasoner, decision: Decision, *, most: int = 6, count: int = 0, prefix: str = "decision"
 ) -> Scene:
@@ -88,18 +135,10 @@ def show_decision(
     Raises:
         ValueError: All candidates failed at once, or the mental testbed has no plant.
     """
-    if most < 1:
-        raise ValueError(f"one candidate is shown at least, not {most}")
-    ranked = [candidate for candidate in decision.ranked if candidate.rollouts]
-    shown = ranked[:most] if decision.candidates[0] in ranked[:most] else [*ranked[: most - 1], decision.candidates[0]]
-    colors = decision_colors(decision)
-    labels = {c.number: f"{c.number}{' (plan in use)' if c.number == 0 else ''}" for c in shown}
-    motions = {labels[c.number]: reasoner.motion(decision, c.number) for c in shown}
-    tints = {labels[c.number]: colors[c.number] for c in shown}
-    opacity = {labels[c.number]: 1.0 if c.number == decision.chosen else 0.35 for c in shown}
+    ghosts = decision_ghosts(reasoner, decision, most=most)
     if count:
-        return show_poses(meshcat, motions, count=count, prefix=prefix, colors=tints, opacity=opacity)
-    return show_motions(meshcat, motions, prefix=prefix, colors=tints, opacity=opacity)
+        return show_poses(meshcat, ghosts.motions, count=count, prefix=prefix, **ghosts.looks)
+    return show_motions(meshcat, ghosts.motions, prefix=prefix, **ghosts.looks)
 
 
 def decision_colors(decision: Decision) -> dict[int, str]:

@@ -83,14 +83,14 @@ class Drawing:
         self._boxes: list[tuple[FrameId, NDArray[np.float64]]] | None = None  # the corners in each frame, see `corners`
         meshcat.Delete(path)
         for frame in inspector.GetAllFrameIds():
-            moves = frame != inspector.world_frame_id() and not _is_anchored(testbed.plant, frame)
+            moves = frame != inspector.world_frame_id() and not is_anchored(testbed.plant, frame)
             geometries = inspector.GetGeometries(frame, Role.kIllustration)
             if not geometries or not parts & (Parts.MOVING if moves else Parts.ANCHORED):
                 continue
             place = f"{path}/{inspector.GetName(frame)}".replace("::", "/")
             for geometry in geometries:
-                color = _color(inspector, geometry)
-                color = _tinted(color, tint, opacity) if moves else color
+                color = illustration_color(inspector, geometry)
+                color = tinted_color(color, tint, opacity) if moves else color
                 self._shapes.append((geometry, color, moves))
                 part = f"{place}/{inspector.GetName(geometry)}-{geometry.get_value()}".replace("::", "/")
                 meshcat.SetObject(part, inspector.GetShape(geometry), color)
@@ -245,20 +245,37 @@ def _boxes(inspector: SceneGraphInspector, frame: FrameId) -> NDArray[np.float64
     return np.hstack(corners)
 
 
-def _is_anchored(plant: MultibodyPlant | None, frame: FrameId) -> bool:
+def is_anchored(plant: MultibodyPlant | None, frame: FrameId) -> bool:
+    """Return whether a frame of the scene belongs to a body that is fixed to the world.
+
+    Args:
+        plant: The plant of the bodies, if there is one.
+        frame: The frame, other than the world's.
+    """
     body = plant.GetBodyFromFrameId(frame) if plant is not None else None
     return plant is not None and body is not None and plant.IsAnchored(body)
 
 
-def _color(inspector: SceneGraphInspector, geometry: GeometryId) -> Rgba:
-    """Return the colour in which a geometry is illustrated."""
+def illustration_color(inspector: SceneGraphInspector, geometry: GeometryId) -> Rgba:
+    """Return the colour in which a geometry is illustrated.
+
+    Args:
+        inspector: It knows the geometry.
+        geometry: A geometry with the role of illustration.
+    """
     properties = inspector.GetIllustrationProperties(geometry)
     color: Rgba = properties.GetPropertyOrDefault("phong", "diffuse", Rgba(0.9, 0.9, 0.9, 1.0))
     return color
 
 
-def _tinted(color: Rgba, tint: ColorType | None, opacity: float) -> Rgba:
-    """Return a colour in another tint, of the same brightness, so that the parts of a robot can be distinguished."""
+def tinted_color(color: Rgba, tint: ColorType | None, opacity: float) -> Rgba:
+    """Return a colour in another tint, of the same brightness, so that the parts of a robot can be distinguished.
+
+    Args:
+        color: The colour.
+        tint: The tint, any matplotlib colour; None keeps the colour.
+        opacity: A factor of the opacity.
+    """
     rgb = np.array([color.r(), color.g(), color.b()])
     if tint is not None:
         rgb = 0.75 * np.array(to_rgb(tint)) + 0.25 * rgb @ _BRIGHTNESS

@@ -283,7 +283,7 @@ def show_motion(
     Raises:
         ValueError: The motion has no sample, its states do not fit the scenario's plant, or there is nothing to draw.
     """
-    _check(motion, prefix, rate)
+    check_motion(motion, prefix, rate)
     meshcat.Delete(prefix)
     still, reel = _record(meshcat, [_Actor(motion=motion, path=prefix)], rate, camera)
     return Scene(meshcat, curves=_curves({"": motion}, {"": _PALETTE[0]}), still=still, reel=reel)
@@ -322,14 +322,14 @@ def show_motions(
     Raises:
         ValueError: There is no motion, a label or opacity makes no sense, or as in `show_motion`.
     """
-    tints, opacities = _looks(motions, colors, opacity)
+    tints, opacities = motion_looks(motions, colors, opacity)
     step = np.asarray(spacing, dtype=float)
     if step.shape != (3,):
         raise ValueError(f"spacing is a displacement of shape (3,) in metres, not of shape {step.shape}")
     actors: list[_Actor] = []
     for number, (name, motion) in enumerate(motions.items()):
         path = f"{prefix}/{name}"
-        _check(motion, path, rate)
+        check_motion(motion, path, rate)
         drawn = any(other.motion.scenario == motion.scenario for other in actors) and not step.any()
         actors.append(
             _Actor(
@@ -377,20 +377,20 @@ def show_poses(
     Raises:
         ValueError: There is no motion or instant, a label or opacity makes no sense, or as in `show_motion`.
     """
-    tints, opacities = _looks(motions, colors, opacity)
+    tints, opacities = motion_looks(motions, colors, opacity)
     if count < 1:
         raise ValueError(f"a motion is drawn at one instant at least, not at {count}")
     for name, motion in motions.items():
-        _check(motion, f"{prefix}/{name}", 1.0)
+        check_motion(motion, f"{prefix}/{name}", 1.0)
     meshcat.Delete(prefix)
     stages, still, corners = list[PosedTestbed](), Still(), []
     for name, motion in motions.items():
         count_before = len(stages)
-        stage = _stage_of(motion.scenario, stages)
+        stage = stage_of(motion.scenario, stages)
         if len(stages) > count_before:
             path = f"{prefix}/surroundings/{len(stages)}"
             Drawing(meshcat, stage.testbed, stage.context, path, parts=Parts.ANCHORED).add_to(still, stage.context)
-        states = _states(motion, stage.testbed, f"{prefix}/{name}")
+        states = motion_states(motion, stage.testbed, f"{prefix}/{name}")
         instants = np.linspace(0, len(states) - 1, count).round().astype(int)
         for k, sample in enumerate(dict.fromkeys(instants.tolist())):
             stage.set_state(states[sample])
@@ -409,18 +409,32 @@ def show_poses(
     return Scene(meshcat, title=title, legend=tints, still=still)
 
 
-def _stage_of(scenario: Scenario, stages: list[PosedTestbed]) -> PosedTestbed:
-    """Return the stage of a scenario, made if there is none yet: a terrain with many shapes takes long to build."""
+def stage_of(scenario: Scenario, stages: list[PosedTestbed]) -> PosedTestbed:
+    """Return the stage of a scenario, made if there is none yet: a terrain with many shapes takes long to build.
+
+    Args:
+        scenario: The scenario.
+        stages: The stages so far; a new one is appended.
+    """
     stage = next((each for each in stages if each.testbed.scenario == scenario), None)
     if stage is None:
         stages.append(stage := PosedTestbed(scenario))
     return stage
 
 
-def _looks(
+def motion_looks(
     motions: Mapping[str, Motion], colors: Mapping[str, ColorType] | None, opacity: float | Mapping[str, float]
 ) -> tuple[dict[str, str], dict[str, float]]:
-    """Return the tints and the opacities by label."""
+    """Return the tints and the opacities by label.
+
+    Args:
+        motions: Label -> motion.
+        colors: Label -> tint, any matplotlib colour; None: every motion has one of its own.
+        opacity: The opacity in (0, 1], for all or by label.
+
+    Raises:
+        ValueError: There is no motion, or a label or opacity makes no sense.
+    """
     if not motions:
         raise ValueError("there is no motion to show")
     tints = {name: to_hex(c) for name, c in (zip(motions, cycle(_PALETTE)) if colors is None else colors.items())}
@@ -436,15 +450,31 @@ def _looks(
     return tints, opacities
 
 
-def _check(motion: Motion, path: str, rate: float) -> None:
+def check_motion(motion: Motion, path: str, rate: float) -> None:
+    """Raise a ValueError if a motion has no sample, or the rate is not positive.
+
+    Args:
+        motion: The motion.
+        path: What it is drawn for, for the error.
+        rate: The number of samples per second that are shown at most.
+    """
     if len(motion.times) == 0:
         raise ValueError(f"the motion for {path} has no sample: its simulation failed at once")
     if not rate > 0.0:
         raise ValueError(f"rate is a positive number of keyframes per second, not {rate}")
 
 
-def _states(motion: Motion, testbed: VirtualTestbed, path: str) -> np.ndarray:
-    """Return the states of a motion, shape (n, nq + nv)."""
+def motion_states(motion: Motion, testbed: VirtualTestbed, path: str) -> np.ndarray:
+    """Return the states of a motion, shape (n, nq + nv).
+
+    Args:
+        motion: The motion.
+        testbed: A testbed of its scenario.
+        path: What it is drawn for, for the error.
+
+    Raises:
+        ValueError: The states do not fit the testbed's plant, or it has none.
+    """
     plant = testbed.plant
     if plant is None:
         raise ValueError(f"the scenario of the motion for {path} has no plant, so that there is nothing to draw")
@@ -485,7 +515,7 @@ def _record(meshcat: Meshcat, actors: list[_Actor], rate: float, camera: Viewpoi
     meshcat.StartRecording(frames_per_second=_RESOLUTION, set_visualizations_while_recording=True)
     try:
         for actor in actors:
-            shown, take = actor.play(meshcat, _stage_of(actor.motion.scenario, stages), end, rate, still)
+            shown, take = actor.play(meshcat, stage_of(actor.motion.scenario, stages), end, rate, still)
             corners += shown
             takes.append(take)
     finally:
@@ -510,7 +540,7 @@ class _Actor:
         self, meshcat: Meshcat, stage: PosedTestbed, end: float, rate: float, still: Still
     ) -> tuple[list[np.ndarray], Take]:
         """Record the motion, add instants of it to the picture; return the corners of what moves, and a take."""
-        states = _states(self.motion, stage.testbed, self.path)
+        states = motion_states(self.motion, stage.testbed, self.path)
         drawing = Drawing(
             meshcat,
             stage.testbed,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import VirtualTestbed
     from vtbdrake.visualization.drawing import Drawing
-    from vtbdrake.web.live.recorded_course import RecordedCourse
+    from vtbdrake.recording.recorded_course import RecordedCourse
     from vtbdrake.web.live.scene import LiveScene
 
 # Colours of the ghosts by name: a preview, one that fails, and the course without the intervention, of another branch

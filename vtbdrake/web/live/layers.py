@@ -17,11 +17,11 @@ from pydrake.perception import PointCloud
 from pydrake.systems.framework import Context, OutputPort, PortDataType, System
 
 from vtbdrake.common.failures import FAILURES, one_line
-from vtbdrake.components.sensors.camera import Camera
 from vtbdrake.components.sensors.laser_scanner import LaserScanner
 from vtbdrake.components.world_model.world_model import WorldModel
-from vtbdrake.state.systems import is_camera, leaves
+from vtbdrake.state.systems import leaves
 from vtbdrake.testbed import slow_parts
+from vtbdrake.visualization.cameras import camera_view, cameras
 from vtbdrake.visualization.drawing import Drawing, Parts
 
 if TYPE_CHECKING:
@@ -476,25 +476,6 @@ class Layers:
 def _refuse_unmeasured(is_measured: bool, context: Context, world: Context | None) -> None:
     if is_measured and world is not None and world is not context:
         raise LayerError("it was not simulated: the world of this log is what the DPS believed of it")
-
-
-def cameras(testbed: VirtualTestbed) -> dict[str, System]:
-    """Return the cameras of a testbed, by their paths in its Diagram."""
-    return {path: s for path, s in leaves(testbed.diagram) if isinstance(s, Camera) or is_camera(s)}
-
-
-def camera_view(camera: System, context: Context) -> tuple[RigidTransform, CameraInfo]:
-    """Return the pose of a camera in the world, and its optics.
-
-    Args:
-        camera: A camera of vtbdrake, or Drake's `RgbdSensor`.
-        context: The context of the camera, not the root context.
-    """
-    if isinstance(camera, Camera):
-        return camera.X_WC(context), camera.info(context)
-    core = camera.GetColorRenderCamera(context).core()
-    X_WB = camera.body_pose_in_world_output_port().Eval(context)
-    return X_WB @ core.sensor_pose_in_camera_body(), core.intrinsics()
 
 
 def frustum(info: CameraInfo, depth: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vtbdrake.common.failures import FAILURES, one_line
 from vtbdrake.state.archive import PRIVATE
 from vtbdrake.web.live.player import Player, SessionConfig
-from vtbdrake.web.live.recorded_course import RecordedCourse
+from vtbdrake.recording.recorded_course import RecordedCourse
 from vtbdrake.web.live.session import SessionError
 
 if TYPE_CHECKING:

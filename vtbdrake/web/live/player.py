@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.visualization.still import Still
-    from vtbdrake.web.live.recorded_course import RecordedCourse
+    from vtbdrake.recording.recorded_course import RecordedCourse
 
 # The part of the wall time between two frames that a simulation and a preview may take.
 STEPPING_SHARE = 0.8

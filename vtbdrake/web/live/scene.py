@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from vtbdrake.drake_workarounds.kept_meshcats import abandon_if_dead, is_running
 from vtbdrake.visualization.drawing import Drawing, Parts
 from vtbdrake.visualization.meshcat import make_meshcat
+from vtbdrake.visualization.scenes.scene_writer import SceneWriter
 from vtbdrake.web.live.layers import Layers
 from vtbdrake.web.live.watching import Groups
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
     from vtbdrake.testbed import VirtualTestbed
+    from vtbdrake.visualization.scenes.output import SceneOutput
     from vtbdrake.visualization.still import Still
     from vtbdrake.visualization.viewpoint import Viewpoint
 
@@ -51,6 +53,7 @@ class LiveScene:
     ) -> None:
         self._testbed, self._only_poses = testbed, only_poses
         self._shown = Groups()
+        self._mirrors: list[SceneWriter] = []
         self._drawing: Drawing | None = None
         self.bodies: tuple[str, ...] = ()
         self.followed = ""
@@ -104,6 +107,15 @@ class LiveScene:
         self._shown.set(viewer, layers)
         self.layers.show(self._shown.names())
 
+    def mirror(self, output: SceneOutput) -> None:
+        """Write what is drawn from now on to an output, too; of a loop that runs elsewhere, the poses alone.
+
+        Args:
+            output: A server of Foxglove or Rerun, say.
+        """
+        is_simulated = not self._only_poses
+        self._mirrors.append(SceneWriter(self._testbed, output, images=is_simulated, signals=is_simulated))
+
     def draw(self, context: Context, world: Context) -> None:
         """Draw the world of a state and the layers of another one.
 
@@ -114,11 +126,15 @@ class LiveScene:
         if self._drawing is not None:
             self._drawing.pose(world)
             self.layers.draw(context, world)
+        for mirror in self._mirrors:
+            mirror.write(context, world=world)
 
     def pose(self, context: Context) -> None:
         """Draw the world of a state, without layers."""
         if self._drawing is not None:
             self._drawing.pose(context)
+        for mirror in self._mirrors:
+            mirror.write(context)
 
     def still(self, context: Context) -> Still | None:
         """Return a picture of a state; None if the testbed has no geometry."""

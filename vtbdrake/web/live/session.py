@@ -20,6 +20,7 @@ from vtbdrake.web.serving.requests import Requests
 
 if TYPE_CHECKING:
     from vtbdrake.testbed import Scenario
+    from vtbdrake.visualization.scenes.output import SceneOutput
     from vtbdrake.visualization.still import Still
     from vtbdrake.web.live.scene import LiveScene
 
@@ -132,6 +133,14 @@ class Stage(ABC):
     def redraw(self) -> None:
         """Draw what is shown into a new picture."""
 
+    def mirror(self, output: SceneOutput) -> None:
+        """Draw into an output, too, see `Session.mirror`.
+
+        Args:
+            output: The output.
+        """
+        self.scene.mirror(output)
+
     def close(self) -> None:  # noqa: B027
         """End what the stage has begun, but for its picture."""
 
@@ -177,6 +186,8 @@ class Session(Closing, ABC, Generic[_Stage]):
         self._closed = False
         # What has become of the picture, if its server has died.
         self._picture = ""
+        # Where else it is shown.
+        self._outputs: list[SceneOutput] = []
         # The stage belongs to the thread.
         self._stage_of_thread: _Stage | None = None
         ready: Future[None] = Future()
@@ -222,6 +233,15 @@ class Session(Closing, ABC, Generic[_Stage]):
             LayerError: The testbed has no such layer.
         """
         self._do(lambda: self._stage.show(viewer, tuple(layers)))
+
+    def mirror(self, output: SceneOutput) -> None:
+        """Show in another viewer what is shown from now on: a `FoxgloveServer` or a `RerunServer`, for example.
+
+        Args:
+            output: The output, which the session closes at its end.
+        """
+        self._outputs.append(output)
+        self._do(lambda: self._mirror(output))
 
     @abstractmethod
     def still(self) -> Still | None:
@@ -282,6 +302,10 @@ class Session(Closing, ABC, Generic[_Stage]):
         self._tell_scene()
         self._publish(stage.frame())
 
+    def _mirror(self, output: SceneOutput) -> None:
+        self._stage.mirror(output)
+        self._publish(self._stage.frame())
+
     def _tell_scene(self) -> None:
         scene = self._stage.scene
         self.meshcat_url = scene.url
@@ -318,6 +342,8 @@ class Session(Closing, ABC, Generic[_Stage]):
         """Give up the Meshcat, which must end in the thread that made it, and all that refers to it."""
         stage = self._stage_of_thread
         self._stage_of_thread = None
+        for output in self._outputs:
+            output.close()
         if stage is None:
             return
         stage.close()

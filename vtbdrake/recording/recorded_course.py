@@ -1,4 +1,4 @@
-"""The course of a log, replayed in a session or beside it."""
+"""The course of a log: what the DPS did, and the world that it believed in."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vtbdrake.recording.replay import RewindableReplay
+from vtbdrake.common.closing import Closing
+from vtbdrake.recording.replay import KEPT_WORK, RewindableReplay
 from vtbdrake.testbed.switch import Position
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
-    from vtbdrake.recording import ControlLog
+    from vtbdrake.recording.log_reader import ControlLog
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import VirtualTestbed
 
 _ROUNDING = 1e-9  # s
 
 
-class RecordedCourse:
+class RecordedCourse(Closing):
     """The course of a log: the DPS repeats it bit by bit, and the world is what the DPS believed of it.
 
     If all sensor signals were simulated, the world is the recorded one.
@@ -29,8 +30,10 @@ class RecordedCourse:
     Args:
         log: The log.
         testbed: A testbed of its scenario.
+        kept_work: Processor time of the replay from one kept state to the next, in seconds; inf keeps none.
 
     Attributes:
+        times: Times of the DPS at the ends of the cycles, in seconds, shape (n,).
         end: The last time of the log, in seconds.
         failure: Always empty: an error of the DPS is part of what was recorded.
         is_recorded: True: its states come from a log.
@@ -41,12 +44,12 @@ class RecordedCourse:
 
     is_recorded = True
 
-    def __init__(self, log: ControlLog, testbed: VirtualTestbed) -> None:
-        self._testbed, self._replay = testbed, RewindableReplay(log, testbed)
+    def __init__(self, log: ControlLog, testbed: VirtualTestbed, *, kept_work: float = KEPT_WORK) -> None:
+        self._testbed, self._replay = testbed, RewindableReplay(log, testbed, kept_work=kept_work)
         self._believed_world, self._believed_at = testbed.default_context(), -1
         self._copier = testbed.copier_from(testbed)
         self.begin = self.time
-        times = self._replay.times
+        self.times = times = self._replay.times
         self.end = float(times[-1]) if len(times) else self.begin
         self.failure = ""
 
