@@ -125,3 +125,21 @@ def test_recording_that_is_cut_off_is_read_to_its_end(tmp_path: Path) -> None:
     values = log.sense["a"].values[:, 0]
     assert 5 < len(values) < 50 and np.array_equal(values, np.arange(len(values)))
     assert any("is cut off, and was read up to there" in remark for remark in log.remarks)
+
+
+@pytest.mark.parametrize("size", [8, 30, 120])
+def test_recording_with_nothing_left_says_that_it_is_cut_off(tmp_path: Path, size: int) -> None:
+    path = write_json(tmp_path / "run.mcap", [{"a": float(k)} for k in range(50)])
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(LogError, match=r"no column '/pose.a'; it has: none; .*run.mcap is cut off, and was read up to"):
+        read_table(path, sense={"a": "/pose.a"}, time="log_time")
+
+
+def test_damaged_recording_gives_one_sentence(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "run.mcap", [{"a": float(k)} for k in range(50)])
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 4
+    content[middle : middle + 40] = bytes(range(40))
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=r"run.mcap is damaged: \w+, [^\n]+$"):
+        read_table(path, sense={"a": "/pose.a"}, time="log_time")

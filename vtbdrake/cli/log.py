@@ -170,7 +170,9 @@ def _parse_export(text: str) -> Path:
     "The scenario of the log: its world is in a scene; a log of another program is read through its protocol.",
     parse=parse_scenario,
 )
-@option("--rate HZ", "States of the world per second in a scene.", type=click.FloatRange(0.0, min_open=True), default=30.0)
+@option(
+    "--rate HZ", "States of the world per second in a scene.", type=click.FloatRange(0.0, min_open=True), default=30.0
+)
 @option("--images/--no-images", "Whether a scene has images and scans.", default=True)
 @json_option
 def export(log: Path, out: Path, scenario: Scenario | None, rate: float, images: bool) -> None:

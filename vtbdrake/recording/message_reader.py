@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from vtbdrake.common.extras import extra_module
+from vtbdrake.common.failures import one_line
 from vtbdrake.recording.log_format import LogError
 
 LOG_TIME = "log_time"
@@ -151,22 +151,31 @@ class McapTable(MessageTable):
             return file.read() != _MAGIC or size < 2 * len(_MAGIC)
 
     def _summary_topics(self) -> Iterator[str]:
-        with self.path.open("rb") as file:
-            summary = extra_module("mcap.reader", purpose="MCAP", extra="recording").make_reader(file).get_summary()
+        reader = extra_module("mcap.reader", purpose="MCAP", extra="recording")
+        with self._read() as file:
+            summary = reader.make_reader(file).get_summary()
         yield from {channel.topic for channel in summary.channels.values()} if summary else ()
 
     def _raw(self, topics: list[str] | None) -> Iterator[tuple[Any, Any, Any]]:
         reader = extra_module("mcap.reader", purpose="MCAP", extra="recording")
-        errors = extra_module("mcap.exceptions", purpose="MCAP", extra="recording")
-        with self.path.open("rb") as file:
-            if not self._is_cut:
-                yield from reader.make_reader(file).iter_messages(topics)
-                return
-            try:
+        with self._read() as file:
+            if self._is_cut:
                 yield from reader.NonSeekingReader(file).iter_messages(topics, log_time_order=False)
-            except (errors.McapError, ValueError, EOFError, struct.error) as error:
-                remark = f"{self.path} is cut off, and was read up to there: {error or type(error).__name__}"
-                self.remarks = [remark]
+            else:
+                yield from reader.make_reader(file).iter_messages(topics)
+
+    @contextmanager
+    def _read(self) -> Iterator[BinaryIO]:
+        """Yield the file; of one that is cut off, what can be read is read, and one that is damaged is a LogError."""
+        is_cut = self._is_cut
+        with self.path.open("rb") as file:
+            try:
+                yield file
+            except Exception as error:  # The reader and its decompressors raise whatever the file makes them raise.
+                if not is_cut:
+                    raise LogError(f"{self.path} is damaged: {type(error).__name__}, {one_line(error)}") from error
+        if is_cut:
+            self.remarks = [f"{self.path} is cut off, and was read up to there"]
 
     def _messages(self, topic: str) -> Messages:
         decoders: dict[int, Callable[[bytes], Any]] = {}
@@ -174,7 +183,11 @@ class McapTable(MessageTable):
         for schema, channel, message in self._raw([topic]):
             if channel.id not in decoders:
                 decoders[channel.id] = self._decoder(schema, channel)
-            messages.append((message.log_time, decoders[channel.id](message.data)))
+            try:
+                messages.append((message.log_time, decoders[channel.id](message.data)))
+            except Exception as error:  # as in `_read`
+                text = f"{self.path}: a message of {topic} at {1e-9 * message.log_time:g} s cannot be read"
+                raise LogError(f"{text}: {one_line(error)}") from error
         return sorted(messages, key=lambda each: each[0])
 
     def _decoder(self, schema: Any, channel: Any) -> Callable[[bytes], Any]:

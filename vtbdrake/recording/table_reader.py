@@ -166,7 +166,8 @@ def _column(table: Table, name: str, source: str) -> Array:
         column = column[:, int(index[:-1])]
     else:
         shown = ", ".join(list(table)[:20]) + (", ..." if len(table) > 20 else "")
-        raise LogError(f"{source} has no column {name!r}{suggestion(name, table)}; it has: {shown or 'none'}")
+        remarks = "; ".join(["", *getattr(table, "remarks", ())])
+        raise LogError(f"{source} has no column {name!r}{suggestion(name, table)}; it has: {shown or 'none'}{remarks}")
     try:
         values: Array = np.asarray(column, dtype=float)
     except (TypeError, ValueError) as error:

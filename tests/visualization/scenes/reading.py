@@ -38,7 +38,9 @@ def pose(message: Any) -> RigidTransform:
     return RigidTransform(Quaternion(q.w, q.x, q.y, q.z), [p.x, p.y, p.z])
 
 
-def world_poses(messages: Mapping[str, list[tuple[int, Any]]], time: int, prefix: str = "/") -> dict[str, RigidTransform]:
+def world_poses(
+    messages: Mapping[str, list[tuple[int, Any]]], time: int, prefix: str = "/"
+) -> dict[str, RigidTransform]:
     """Return the poses of all frames in the world at a time in ns, by the tree of frames."""
     edges = {}
     for topic in (f"{prefix}tf_static", f"{prefix}tf"):
@@ -56,7 +58,14 @@ def world_poses(messages: Mapping[str, list[tuple[int, Any]]], time: int, prefix
 
 
 class Recording:
-    """A recording of Rerun: columns by entity; static ones have one row."""
+    """A recording of Rerun: columns by entity; static ones have one row.
+
+    Args:
+        path: Its file.
+
+    Raises:
+        RuntimeError: The file ends in the middle of a message.
+    """
 
     def __init__(self, path: Path) -> None:
         self._times: dict[tuple[str, str], list[int]] = defaultdict(list)

@@ -65,7 +65,7 @@ class ShapesScenario(Scenario):
     def interface(self) -> Interface:
         return Interface(
             sense=[Signal("joint_position", size=2, entry_names=("turn", "slide"))],
-            act=[Signal("drive", size=2, idle=0.0)],
+            act=[Signal("drive", size=2, unit="N m", idle=0.0)],
         )
 
     def make_dps(self) -> System:
@@ -94,7 +94,9 @@ class ShapesScenario(Scenario):
             config = LaserScannerConfig(
                 frequency=10.0, rays_per_second=2000.0, azimuth=6.0, elevation=3.0, max_range=20.0
             )
-            scanner = LaserScanner(plant, frame, RayCaster(plant, scene_graph, role=Role.kProximity), config=config, slice_period=0.05)
+            scanner = LaserScanner(
+                plant, frame, RayCaster(plant, scene_graph, role=Role.kProximity), config=config, slice_period=0.05
+            )
             builder.add("sense", "scanner", scanner)
             connect_laser_scanner(builder.diagram_builder, scanner, plant)
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pydrake.geometry import Mesh
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 
 from tests.visualization.scenes.reading import Recording, pose, read_mcap, world_poses
-from tests.visualization.scenes.shapes import BALL, CAMERA, SHAPES, X_LINK, ShapesScenario
+from tests.visualization.scenes.shapes import CAMERA, SHAPES, X_LINK, ShapesScenario
 from vtbdrake.components.ray_casting import shape_surface
 from vtbdrake.state.systems import leaves
 from vtbdrake.visualization import SceneWriter

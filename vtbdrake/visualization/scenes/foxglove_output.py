@@ -116,9 +116,7 @@ class _FoxgloveOutput(SceneOutput):
             timestamp=self._stamp(time), frame_id=frame.name, id=frame.name, frame_locked=True, **primitives
         )
 
-    def write_poses(
-        self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]
-    ) -> None:
+    def write_poses(self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> None:
         self._log(topic, "FrameTransforms", time, **self._transforms(time, frames, poses))
 
     def write_joints(

@@ -62,9 +62,7 @@ class SceneOutput(Closing, ABC):
         """
 
     @abstractmethod
-    def write_poses(
-        self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]
-    ) -> None:
+    def write_poses(self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> None:
         """Write the poses of moving frames in their parents.
 
         Args:
@@ -130,8 +128,8 @@ class SceneOutput(Closing, ABC):
             is_error: Whether it is an error.
         """
 
-    def flush(self) -> None:  # noqa: B027
+    def flush(self) -> None:
         """Show what was written, if somebody looks at it."""
 
-    def restart(self) -> None:  # noqa: B027
+    def restart(self) -> None:
         """Note that times go back, as after a reset."""

@@ -14,6 +14,7 @@ from vtbdrake.common.extras import extra_module
 from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput
 from vtbdrake.visualization.scenes.ports import loopback_port
 from vtbdrake.visualization.scenes.scene_meshes import triangle_mesh
+from vtbdrake.visualization.scenes.scene_model import WORLD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,12 +80,12 @@ class _RerunOutput(SceneOutput):
         self._stream = rr.RecordingStream("vtbdrake")
         self._stream.set_log_time_enabled(False)
         self._stream.set_sinks(sink)
-        self._paths: dict[str, str] = {}
+        self._paths = {WORLD: WORLD}  # of the entities, by frame
         self._buffers: dict[str, _Rows] = {}
         self._instants = 0
         self._last: int | None = None
         self._pinholes: dict[str, tuple[Any, ...]] = {}
-        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     # -- rows
 
@@ -137,7 +138,8 @@ class _RerunOutput(SceneOutput):
     ) -> None:
         rr = self._rr
         for frame in frames:
-            self._paths[frame.name] = self._path(frame)
+            if frame.parent:
+                self._paths[frame.name] = self._path(frame)
             for visual in frame.shapes:
                 place = f"{self._paths[frame.name]}/{rr.escape_entity_path_part(visual.name)}"
                 self._stream.log(place, *_SHAPES[type(visual.shape).__name__](rr, visual), static=True)
@@ -147,17 +149,14 @@ class _RerunOutput(SceneOutput):
 
     def _path(self, frame: SceneFrame) -> str:
         """Return the path of a frame's entity, in which the parts that its name shares with its parent's stand once."""
-        above = self._paths.get(frame.parent, "")
         parts = frame.name.split("/")
         for shared in frame.parent.split("/"):
             if len(parts) == 1 or parts[0] != shared:
                 break
             parts = parts[1:]
-        return "/".join([*([above] if above else []), *map(self._rr.escape_entity_path_part, parts)])
+        return "/".join([self._paths[frame.parent], *map(self._rr.escape_entity_path_part, parts)])
 
-    def write_poses(
-        self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]
-    ) -> None:
+    def write_poses(self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> None:
         for frame, pose in zip(frames, poses, strict=True):
             wxyz = pose.rotation().ToQuaternion().wxyz()
             self._append(self._paths[frame.name], time, (pose.translation(), wxyz), self._transform_columns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from math import floor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,6 +84,7 @@ class SceneWriter(Closing):
         images: Whether images of cameras are written.
         signals: Whether signals and scans are written.
         record: Addresses of variables and vector ports that are written, too.
+        without: Streams of signals that are left out, ``sense/position``.
 
     Attributes:
         model: What is drawn.
@@ -105,13 +106,16 @@ class SceneWriter(Closing):
         images: bool = True,
         signals: bool = True,
         record: Sequence[str] = (),
+        without: Collection[str] = (),
     ) -> None:
-        if not 0.0 < as_number("the rate of a scene", rate):
+        if not as_number("the rate of a scene", rate) > 0.0:
             raise ValueError(f"the rate of a scene is a positive number of states per second, not {rate}")
         self.rate, self._last = rate, -1
         self._readers = _signal_readers(testbed) if signals else {}
         for address in as_addresses("what is recorded in a scene", record):
             self._readers[f"variable/{address}"] = (testbed.reader(address), ())
+        for stream in without:
+            self._readers.pop(stream, None)
         self.model = model or SceneModel(testbed)
         self._moving = [frame for frame in self.model.frames if frame.moves]
         self._cameras = self.model.cameras if images else {}

@@ -38,14 +38,7 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import VirtualTestbed
 
 Source = (
-    Motion
-    | ProblemRollout
-    | Mapping[str, Motion | ProblemRollout]
-    | Ghosts
-    | ControlLog
-    | Log
-    | str
-    | os.PathLike[str]
+    Motion | ProblemRollout | Mapping[str, Motion | ProblemRollout] | Ghosts | ControlLog | Log | str | os.PathLike[str]
 )
 """What a scene is written of; a path is the one of a log."""
 
@@ -315,7 +308,8 @@ def _log_writing(log: ControlLog, choice: _Choice, world: bool) -> Callable[[Sce
     testbed = log.scenario.build()
 
     def write(output: SceneOutput) -> None:
-        writer = choice.writer(testbed, output, signals=False)
+        # What nothing of the machine was part of is not in the log, but in its replay.
+        writer = choice.writer(testbed, output, without=_recorded_streams(log))
         with ExitStack() as stack:
             course = stack.enter_context(RecordedCourse(log, testbed, kept_work=inf))
             interruptible = stack.enter_context(Interruptible())
@@ -329,6 +323,12 @@ def _log_writing(log: ControlLog, choice: _Choice, world: bool) -> Callable[[Sce
             entries.write_until(None)
 
     return write
+
+
+def _recorded_streams(log: ControlLog) -> set[str]:
+    """Return the streams of the signals that a log has itself."""
+    sides = {"sense": {name: source != 0 for name, source in log.sources.items()}, "command": log.commanded}
+    return {f"{side}/{name}" for side, each in sides.items() for name, present in each.items() if present.any()}
 
 
 class _EntriesInStep:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
     from pydrake.systems.framework import Context
 
+    from vtbdrake.recording.recorded_course import RecordedCourse
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import VirtualTestbed
     from vtbdrake.visualization.drawing import Drawing
-    from vtbdrake.recording.recorded_course import RecordedCourse
     from vtbdrake.web.live.scene import LiveScene
 
 # Colours of the ghosts by name: a preview, one that fails, and the course without the intervention, of another branch

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat, Rgba, Sphere
-from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
 from pydrake.multibody.tree import BodyIndex
 from pydrake.perception import PointCloud

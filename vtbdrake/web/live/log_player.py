@@ -11,9 +11,9 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING, Any
 
 from vtbdrake.common.failures import FAILURES, one_line
+from vtbdrake.recording.recorded_course import RecordedCourse
 from vtbdrake.state.archive import PRIVATE
 from vtbdrake.web.live.player import Player, SessionConfig
-from vtbdrake.recording.recorded_course import RecordedCourse
 from vtbdrake.web.live.session import SessionError
 
 if TYPE_CHECKING:

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from pydrake.systems.framework import Context
 
     from vtbdrake.optimization import Problem
+    from vtbdrake.recording.recorded_course import RecordedCourse
     from vtbdrake.rollout.course import Course
     from vtbdrake.state import Snapshot
     from vtbdrake.testbed import Scenario
     from vtbdrake.visualization.still import Still
-    from vtbdrake.recording.recorded_course import RecordedCourse
 
 # The part of the wall time between two frames that a simulation and a preview may take.
 STEPPING_SHARE = 0.8
