@@ -12,6 +12,7 @@ import pytest
 from tests.cli.program import PENDULUM, error_of, run
 from tests.recording.lcm_logger import PERIOD, write_log
 from tests.recording.servo import Servo
+from tests.visualization.scenes.reading import read_mcap
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
 from vtbdrake.recording.log_events import LogEvents
@@ -107,11 +108,22 @@ def test_a_log_has_nobodys_code_run(path: Path, tmp_path: Path) -> None:
 
 
 def test_export_writes_every_format(path: Path, tmp_path: Path) -> None:
-    for suffix in (".csv", ".parquet", ".mcap"):
+    for suffix in (".csv", ".parquet", ".mcap", ".rrd"):
         out = tmp_path / f"run{suffix}"
         program = run("export", path, out)
         assert program.exit_code == 0 and "20 cycles of 0.001 s" in program.stdout, program.stderr
         assert out.stat().st_size > 1000
+        assert ("add --scenario tests.control.scripted:Servo" in program.stdout) == (suffix in (".mcap", ".rrd"))
+
+
+def test_scene_of_a_log_has_its_world_if_the_scenario_is_named(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    program = run("export", path, out, *SCENARIO, "--rate", "100", "--no-images")
+    assert program.exit_code == 0 and "has no world" not in program.stdout, program.stderr
+    messages = read_mcap(out)
+    # The servo has no plant: its frames are the world alone, and the replay gives the commands u.
+    assert [entity.id for entity in messages["/scene"][0][1].entities] == []
+    assert len(messages["/u/target"]) == 3
 
 
 def test_log_of_lcm_logger_is_exported_by_the_protocol_of_its_machine(tmp_path: Path) -> None:
@@ -141,7 +153,7 @@ def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
             ("replay", path, "--scenario", "tests.testbeds:PendulumScenario"),
             "is of the scenario tests.control.scripted",
         ),
-        (("export", path, tmp_path / "run.xls"), "ends in .csv or .mcap or .parquet"),
+        (("export", path, tmp_path / "run.xls"), "ends in .csv or .parquet or .mcap or .rrd"),
     ]:
         assert expected in error_of(*arguments)
 

@@ -94,12 +94,12 @@ def test_dps_runs_on_a_log_that_can_be_replayed(path: Path, truth: Log, tmp_path
         feed(part, CartPoleScenario(), tmp_path / "no.lcm")
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".mcap"])
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_exported_samples_are_read_back(path: Path, tmp_path: Path, suffix: str) -> None:
     log = read_log(path, LcmPendulum())
     export(log, tmp_path / f"run{suffix}")
-    names = ("/sense/position.value", "/sent/torque.value") if suffix == ".mcap" else ("sense.position", "sent.torque")
-    back = read_table(tmp_path / f"run{suffix}", sense={"position": names[0]}, act={"torque": names[1]})
+    path = tmp_path / f"run{suffix}"
+    back = read_table(path, sense={"position": "sense.position"}, act={"torque": "sent.torque"})
     assert back == log
 
 

@@ -34,10 +34,10 @@ def log_entries(log: ControlLog | Log) -> Iterator[LogEntry]:
     """Yield all entries of a log in the order of time.
 
     The streams are ``sense/<signal>``, ``command/<signal>`` (actuator commands of the DPS) and ``sent/<signal>`` (after
-    the guards), wherever they have a new value; ``cycle/since_last`` in s and ``cycle/ok``, 1 if the DPS's commands
-    were sent; and, when they happen, ``variable/<address>`` (variables that were changed, the commands u among them)
-    and the texts ``switches``, ``result/<slow part>``, ``faults`` and ``reset`` (of the guards). A value that is not
-    there is NaN. Abstract signals are left out.
+    the guards), wherever they have a new value; ``cycle/time`` (of the DPS, s), ``cycle/since_last`` (on the loop's
+    clock, s) and ``cycle/ok``, 1 if the DPS's commands were sent; and, when they happen, ``variable/<address>``
+    (variables that were changed, the commands u among them) and the texts ``switches``, ``result/<slow part>``,
+    ``faults`` and ``reset`` (of the guards). A value that is not there is NaN. Abstract signals are left out.
 
     Args:
         log: The log; one of another program has samples alone.
@@ -72,9 +72,10 @@ def _entries(log: ControlLog) -> Iterator[LogEntry]:
     for i, stream, content, is_error in [*_initial(log), *_changes(log), *_faults(log)]:
         occasional.setdefault(i, []).append(LogEntry(times[i], stream, content, is_error))
     series = [(stream, values.tolist(), present.tolist()) for stream, values, present in _series(log)]
-    since_last, ok = [None, *np.diff(log.now).tolist()], log.ok.tolist()
+    since_last, ok, dps_times = [None, *np.diff(log.now).tolist()], log.ok.tolist(), log.times.tolist()
     for i, time in enumerate(times):
         yield from occasional.get(i, ())
+        yield LogEntry(time, "cycle/time", [dps_times[i]])
         if (since := since_last[i]) is not None:
             yield LogEntry(time, "cycle/since_last", [since])
         yield LogEntry(time, "cycle/ok", [float(ok[i])])

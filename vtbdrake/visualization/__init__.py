@@ -1,6 +1,6 @@
 """Pictures: plots of sweeps, studies and rollouts, recordings in Meshcat, the drawing of a testbed."""
 
-from vtbdrake.visualization.decisions import Ghosts, decision_ghosts, plot_decision, show_decision
+from vtbdrake.visualization.decisions import GhostMotions, decision_ghosts, plot_decision, show_decision
 from vtbdrake.visualization.diagram import svg
 from vtbdrake.visualization.log_motion import log_motion
 from vtbdrake.visualization.meshcat import Scene, make_meshcat, show_motion, show_motions, show_poses
@@ -17,7 +17,7 @@ from vtbdrake.visualization.world_model_drawing import show_world_model
 
 __all__ = [
     "FoxgloveServer",
-    "Ghosts",
+    "GhostMotions",
     "RerunServer",
     "Scene",
     "SceneOutput",

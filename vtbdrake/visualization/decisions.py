@@ -73,7 +73,7 @@ def _draw_qualities(axes: Axes, decision: Decision, colors: Mapping[int, str]) -
 
 
 @dataclass(frozen=True)
-class Ghosts:
+class GhostMotions:
     """Motions that are shown together, each with a look of its own.
 
     Attributes:
@@ -92,8 +92,8 @@ class Ghosts:
         return {"colors": self.colors, "opacity": self.opacity}
 
 
-def decision_ghosts(reasoner: Reasoner, decision: Decision, *, most: int = 6) -> Ghosts:
-    """Return how the candidates would move: ghosts coloured by their quality, and the chosen one solid.
+def decision_ghosts(reasoner: Reasoner, decision: Decision, *, most: int = 6) -> GhostMotions:
+    """Return the motions of the candidates as ghosts: coloured by their quality, and the chosen one solid.
 
     The rollouts are simulated again from the state in which the decision was made.
 
@@ -114,7 +114,7 @@ def decision_ghosts(reasoner: Reasoner, decision: Decision, *, most: int = 6) ->
     motions = {labels[c.number]: reasoner.motion(decision, c.number) for c in shown}
     tints = {labels[c.number]: colors[c.number] for c in shown}
     opacity = {labels[c.number]: 1.0 if c.number == decision.chosen else 0.35 for c in shown}
-    return Ghosts(motions, tints, opacity)
+    return GhostMotions(motions, tints, opacity)
 
 
 def show_decision(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import socket
 import struct
 import subprocess
@@ -21,6 +23,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from pydrake.systems.analysis import Simulator
 from websockets.sync.client import ClientConnection, connect
 
+from tests.cli.program import ROOT
 from tests.visualization.scenes.reading import Recording, world_poses
 from tests.visualization.scenes.shapes import ShapesScenario
 from vtbdrake.testbed import VirtualTestbed
@@ -141,6 +144,26 @@ def test_live_session_is_mirrored_until_it_ends() -> None:
             client.receive_until("/tf", 10**8)
             client.receive_until("/joint_states")
     assert not listening(server.port)
+
+
+@pytest.mark.slow
+def test_command_line_serves_both_viewers_until_it_is_interrupted() -> None:
+    command = [sys.executable, "-m", "vtbdrake", "view", "tests.visualization.scenes.shapes:ShapesScenario"]
+    program = subprocess.Popen(
+        [*command, "--no-browser", "--foxglove", "--rerun", "--json"], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    try:
+        assert program.stdout is not None
+        foxglove_at, rerun_at = (json.loads(program.stdout.readline()) for _ in range(2))
+        assert re.fullmatch(r"rerun\+http://127.0.0.1:\d+/proxy", rerun_at["rerun"])
+        with client_of(foxglove_at["foxglove"]) as client:
+            client.receive_until("/scene")
+        assert "url" in json.loads(program.stdout.readline())
+        program.send_signal(signal.SIGINT)
+        assert program.wait(PATIENCE) == 0
+    finally:
+        program.kill()
+        program.wait()
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")

@@ -25,7 +25,7 @@ LINK = "world/arm/link"
 
 @dataclass(frozen=True)
 class Truth:
-    """What Drake says at the times of the states: poses of the bodies in the world, q and v, images and points."""
+    """Drake's own values at the times of the states: poses of the bodies in the world, q and v, images and points."""
 
     times: list[int]
     poses: list[dict[str, RigidTransform]]

@@ -11,6 +11,7 @@ import pytest
 from pydrake.geometry import Mesh
 from pydrake.multibody.plant import MultibodyPlant
 
+from tests.cli.program import error_of, run
 from tests.control.scripted import ScriptedBridge
 from tests.recording.servo import Servo
 from tests.testbeds import AcrobotScenario
@@ -100,6 +101,17 @@ def test_failed_rollout_is_written_up_to_its_end(tmp_path: Path) -> None:
     assert len(read_mcap(tmp_path / "run.mcap")["/tf"]) == 4
 
 
+def test_command_line_writes_the_scene_of_a_rollout(tmp_path: Path) -> None:
+    scenario, out = "tests.visualization.scenes.shapes:ShapesScenario", tmp_path / "run.mcap"
+    done = run(
+        "rollout", scenario, "--horizon", "0.2", "--sample-period", "0.05", "--set", f"{ANGLE}=0.7", "--scene", out
+    )
+    assert done.exit_code == 0, done.output
+    messages = read_mcap(out)
+    assert len(messages["/tf"]) == 5 and messages["/joint_states"][0][1].joints[0].position == 0.7
+    assert "ends in .mcap or .rrd" in error_of("rollout", scenario, "--horizon", "1", "--scene", tmp_path / "a.bag")
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> ControlLog:
     """Record a whole simulated testbed: 60 cycles of 10 ms."""
@@ -161,6 +173,7 @@ def test_log_without_its_world_has_signals_and_events(tmp_path: Path) -> None:
     assert commands[:10] == log.actuation["velocity"][10:20].tolist() and commands[-1] == [None, 0.0]
     assert [each["value"] for _, each in messages["/variable/u.target"]] == [[0.0, 0.0], [0.5, 1.0 / 3.0]]
     since = [each["value"][0] for _, each in messages["/cycle/since_last"]]
+    assert [each["value"][0] for _, each in messages["/cycle/time"]] == log.times.tolist()
     assert since == np.diff(log.now).tolist() and messages["/cycle/ok"][-1][1]["value"] == [0.0]
     (before, sim), (after, real) = messages["/switches"]
     assert (before, after) == (1000 * log.utimes[0], 1000 * log.utimes[10])
@@ -178,7 +191,7 @@ def test_log_of_another_program_has_its_samples(tmp_path: Path) -> None:
     assert [(time, each["value"]) for time, each in messages["/sense/angle"]] == [
         (round(1e9 * t), [q]) for t, q in zip(times, columns["q"], strict=True)
     ]
-    back = read_table(tmp_path / "run.mcap", sense={"angle": "/sense/angle.value"}, time="time")
+    back = read_table(tmp_path / "run.mcap", sense={"angle": "/sense/angle.value"}, time="log_time")
     assert np.array_equal(back.sense["angle"].values[:, 0], columns["q"])
 
 
@@ -221,11 +234,11 @@ def test_file_that_is_cut_off_gives_what_is_left_and_one_sentence(log: ControlLo
     write_scene(log, whole, world=False)
     content = whole.read_bytes()
     cut.write_bytes(content[: len(content) - 20])
-    back = read_table(cut, sense={"ok": "/cycle/ok.value"}, time="time")
+    back = read_table(cut, sense={"ok": "/cycle/ok.value"}, time="log_time")
     assert len(back.sense["ok"].times) == 60 and f"{cut} is cut off, and was read up to there" in back.remarks
     cut.write_bytes(content[:100])
     with pytest.raises(LogError, match="no column '/cycle/ok.value'; it has: none; .*cut.mcap is cut off"):
-        read_table(cut, sense={"ok": "/cycle/ok.value"}, time="time")
+        read_table(cut, sense={"ok": "/cycle/ok.value"}, time="log_time")
 
 
 def test_mesh_in_gltf_lies_as_in_drake_and_keeps_its_colours(tmp_path: Path) -> None:

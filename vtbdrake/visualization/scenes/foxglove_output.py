@@ -30,7 +30,6 @@ _VALUE_SCHEMA = {
     "title": "vtbdrake.Value",
     "type": "object",
     "properties": {
-        "time": {"type": "number", "description": "in seconds"},
         "value": {"type": "array", "items": {"type": ["number", "null"]}},  # JSON has no NaN.
     },
 }
@@ -129,7 +128,7 @@ class _FoxgloveOutput(SceneOutput):
         self._log(topic, "JointStates", time, timestamp=self._stamp(time), joints=joints)
 
     def write_values(self, topic: str, time: int, values: Sequence[float], names: Sequence[str] = ()) -> None:
-        message = {"time": 1e-9 * time, "value": plain(np.asarray(values, dtype=float))}
+        message = {"value": plain(np.asarray(values, dtype=float))}
         self._value_channel(topic).log(json.dumps(message, allow_nan=False).encode(), log_time=time)
 
     def write_image(self, time: int, image: CameraImage) -> None:

@@ -109,8 +109,8 @@ class SceneModel:
         root = SceneFrame(self._root, WORLD if prefix else "", False, self._shapes.get(world, ()), lambda _: X_WP)
         self.cameras: Mapping[str, System] = {self._below(path): system for path, system in cameras(testbed).items()}
         bodies = () if plant is None else self._body_frames(plant)
-        others = () if scene_graph is None else self._other_frames(scene_graph, plant)
-        self.frames: tuple[SceneFrame, ...] = (root, *bodies, *others, *self._camera_frames())
+        bodiless = () if scene_graph is None else self._other_frames(scene_graph, plant)
+        self.frames: tuple[SceneFrame, ...] = (root, *bodies, *bodiless, *self._camera_frames())
         joints = [] if plant is None else _single_joints(plant)
         self.joints = tuple(self._below(_scoped(plant, joint)) for joint in joints) if plant else ()
         self._positions = np.array([joint.position_start() for joint in joints], dtype=int)

@@ -141,8 +141,8 @@ class SceneWriter(Closing):
 
         Args:
             context: A root context of the testbed, from which the signals are read.
-            world: The root context of the world, if that is another one: what a DPS believes, for example, of which
-                there are no images and scans.
+            world: The root context of the world, if that is another one, without images and scans: the world that a
+                DPS believes in, for example.
             time: The time in ns; None: the one of the context.
         """
         at = round(1e9 * context.get_time()) if time is None else time

@@ -22,7 +22,7 @@ from vtbdrake.recording.recorded_course import RecordedCourse
 from vtbdrake.rollout.runner import RolloutRunner, SimulationError
 from vtbdrake.rollout.testbeds import split
 from vtbdrake.state.archive import PRIVATE, whole_file
-from vtbdrake.visualization.decisions import Ghosts
+from vtbdrake.visualization.decisions import GhostMotions
 from vtbdrake.visualization.drawing import Parts
 from vtbdrake.visualization.film import PosedTestbed
 from vtbdrake.visualization.meshcat import check_motion, motion_looks, motion_states, stage_of
@@ -38,7 +38,14 @@ if TYPE_CHECKING:
     from vtbdrake.testbed import VirtualTestbed
 
 Source = (
-    Motion | ProblemRollout | Mapping[str, Motion | ProblemRollout] | Ghosts | ControlLog | Log | str | os.PathLike[str]
+    Motion
+    | ProblemRollout
+    | Mapping[str, Motion | ProblemRollout]
+    | GhostMotions
+    | ControlLog
+    | Log
+    | str
+    | os.PathLike[str]
 )
 """What a scene is written of; a path is the one of a log."""
 
@@ -88,8 +95,8 @@ def write_scene(
     is drawn once for each scenario.
 
     Args:
-        source: A `Motion`; a rollout of a problem; several of them by label; the `Ghosts` of a decision; or a log, or
-            the path of its file.
+        source: A `Motion`; a rollout of a problem; several of them by label; the `GhostMotions` of a decision; or a
+            log, or the path of its file.
         path: The file. It is written as a whole or not at all.
         rate: States per second at most, of simulated time.
         images: Whether images and scans are written.
@@ -121,8 +128,8 @@ def write_scene(
     elif isinstance(source, Motion):
         write = _motion_writing(source, choice)
     else:
-        looks = source.looks if isinstance(source, Ghosts) else {"colors": colors, "opacity": opacity}
-        motions = source.motions if isinstance(source, Ghosts) else source
+        looks = source.looks if isinstance(source, GhostMotions) else {"colors": colors, "opacity": opacity}
+        motions = source.motions if isinstance(source, GhostMotions) else source
         write = _ghosts_writing(motions, choice, spacing=spacing, **looks)
     _write_file(path, write, calendar=isinstance(source, ControlLog), mode=PRIVATE if is_log and mode is None else mode)
 
@@ -222,13 +229,13 @@ def _motion_writing(motion: Motion, choice: _Choice) -> Callable[[SceneOutput], 
     states = motion_states(motion, stage.testbed, "the scene")
 
     def write(output: SceneOutput) -> None:
-        _write_motions(output, [_Actor(motion, states, stage, SceneModel(stage.testbed))], choice)
+        _write_motions(output, [_Ghost(motion, states, stage, SceneModel(stage.testbed))], choice)
 
     return write
 
 
 @dataclass(frozen=True)
-class _Actor:
+class _Ghost:
     """A motion in a scene: its states, the testbed that takes them, and what is drawn."""
 
     motion: Motion
@@ -256,10 +263,10 @@ def _ghosts_writing(
     if step.shape != (3,):
         raise ValueError(f"spacing is a displacement of shape (3,) in metres, not of shape {step.shape}")
     stages: list[PosedTestbed] = []
-    actors: list[_Actor] = []
+    ghosts: list[_Ghost] = []
     for number, (name, motion) in enumerate(computed.items()):
         check_motion(motion, name, choice.rate)
-        is_drawn = any(actor.motion.scenario == motion.scenario for actor in actors) and not step.any()
+        is_drawn = any(ghost.motion.scenario == motion.scenario for ghost in ghosts) and not step.any()
         stage = stage_of(motion.scenario, stages)
         model = SceneModel(
             stage.testbed,
@@ -269,27 +276,27 @@ def _ghosts_writing(
             parts=Parts.MOVING if is_drawn else Parts.ALL,
             X_WP=RigidTransform(number * step),
         )
-        actors.append(_Actor(motion, motion_states(motion, stage.testbed, name), stage, model))
-    return lambda output: _write_motions(output, actors, choice)
+        ghosts.append(_Ghost(motion, motion_states(motion, stage.testbed, name), stage, model))
+    return lambda output: _write_motions(output, ghosts, choice)
 
 
-def _write_motions(output: SceneOutput, actors: Sequence[_Actor], choice: _Choice) -> None:
+def _write_motions(output: SceneOutput, ghosts: Sequence[_Ghost], choice: _Choice) -> None:
     """Write the samples of motions in the order of time."""
     writers = [
-        choice.writer(actor.stage.testbed, output, model=actor.model, images=False, signals=False, record=())
-        for actor in actors
+        choice.writer(ghost.stage.testbed, output, model=ghost.model, images=False, signals=False, record=())
+        for ghost in ghosts
     ]
     samples = sorted(
-        (float(actor.motion.times[sample]), number, sample)
-        for number, actor in enumerate(actors)
-        for sample in choice.due(np.asarray(actor.motion.times))
+        (float(ghost.motion.times[sample]), number, sample)
+        for number, ghost in enumerate(ghosts)
+        for sample in choice.due(np.asarray(ghost.motion.times))
     )
     for time, number, sample in samples:
-        actor = actors[number]
-        actor.stage.set_state(actor.states[sample])
-        writers[number].write(actor.stage.context, time=round(1e9 * time))
-    for actor in actors:
-        _write_quality(output, actor.model.topic("quality"), actor.motion.times, actor.motion.quality)
+        ghost = ghosts[number]
+        ghost.stage.set_state(ghost.states[sample])
+        writers[number].write(ghost.stage.context, time=round(1e9 * time))
+    for ghost in ghosts:
+        _write_quality(output, ghost.model.topic("quality"), ghost.motion.times, ghost.motion.quality)
 
 
 # -- logs
