@@ -14,6 +14,7 @@ import click
 from vtbdrake.cli.log import opened_log
 from vtbdrake.cli.options import (
     Setting,
+    grouped,
     option,
     package_option,
     parse_url,
@@ -130,8 +131,11 @@ def _is_problem(text: str) -> bool:
 @option("--certificate FILE", "With --tls, a certificate (PEM); one is made if it is left out.", type=_FILE)
 @option("--key FILE", "With --certificate, its private key (PEM).", type=_FILE)
 @package_option
-@option("--foxglove", "Serve what is shown to Foxglove, too, on this machine alone.", is_flag=True)
-@option("--rerun", "Serve what is shown to viewers of Rerun, too, on this machine alone.", is_flag=True)
+@grouped(
+    "viewers",
+    option("--foxglove", "Serve what is shown to Foxglove, too, on this machine alone.", is_flag=True),
+    option("--rerun", "Serve what is shown to viewers of Rerun, too, on this machine alone.", is_flag=True),
+)
 @option("--play", "Let time run at once.", is_flag=True)
 @browser_option
 @json_option
@@ -151,8 +155,7 @@ def view(
     certificate: Path | None,
     key: Path | None,
     packages: tuple[tuple[str, Path], ...],
-    foxglove: bool,
-    rerun: bool,
+    viewers: dict[str, bool],
     play: bool,
     browser: bool,
 ) -> None:
@@ -196,7 +199,7 @@ def view(
                 "a loop is shown as it is: leave --set, --start, --play, --problem, --study and --log out, or --url"
             )
         with view_loop(scenario, url, **page) as watched:
-            _mirror(watched.session, foxglove=foxglove, rerun=rerun)
+            _mirror(watched.session, **viewers)
             serve(watched, browser=browser)
         return
     viewed: Scenario | None = scenario
@@ -211,7 +214,7 @@ def view(
             viewed = None  # The log describes its scenario; fields that were set have to be the recorded ones.
     page |= {"problem": problem, "study": study, "trusted": trusted, "folder": folder}
     with open_view(viewed, start=start, values=settings(values), **page) as running:
-        _mirror(running.session, foxglove=foxglove, rerun=rerun)
+        _mirror(running.session, **viewers)
         serve(running, browser=browser, ready=running.session.play if play else None)
 
 

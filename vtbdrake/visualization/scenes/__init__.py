@@ -4,8 +4,8 @@ from vtbdrake.visualization.scenes.foxglove_output import FoxgloveFile, Foxglove
 from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput
 from vtbdrake.visualization.scenes.rerun_output import RerunFile, RerunServer
 from vtbdrake.visualization.scenes.scene_model import SceneModel
+from vtbdrake.visualization.scenes.scene_sources import write_rollout, write_scene
 from vtbdrake.visualization.scenes.scene_writer import SceneWriter
-from vtbdrake.visualization.scenes.write_scene import write_rollout, write_scene
 
 __all__ = [
     "CameraImage",

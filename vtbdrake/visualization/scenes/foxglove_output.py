@@ -78,22 +78,18 @@ class _FoxgloveOutput(SceneOutput):
     def _stamp(self, time: int) -> Any:
         return self._messages.Timestamp(sec=time // 10**9, nsec=time % 10**9)
 
-    def _transforms(
-        self, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]
-    ) -> dict[str, list[Any]]:
+    def _transforms(self, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> list[Any]:
         stamp, m = self._stamp(time), self._messages
-        return {
-            "transforms": [
-                m.FrameTransform(
-                    timestamp=stamp,
-                    parent_frame_id=frame.parent,
-                    child_frame_id=frame.name,
-                    translation=_vector(m, pose.translation()),
-                    rotation=_quaternion(m, pose),
-                )
-                for frame, pose in zip(frames, poses, strict=True)
-            ]
-        }
+        return [
+            m.FrameTransform(
+                timestamp=stamp,
+                parent_frame_id=frame.parent,
+                child_frame_id=frame.name,
+                translation=_vector(m, pose.translation()),
+                rotation=_quaternion(m, pose),
+            )
+            for frame, pose in zip(frames, poses, strict=True)
+        ]
 
     def add_frames(
         self, topic: str, time: int, frames: Sequence[SceneFrame], fixed: Sequence[tuple[SceneFrame, RigidTransform]]
@@ -102,7 +98,7 @@ class _FoxgloveOutput(SceneOutput):
         hanging = [(frame, pose) for frame, pose in fixed if frame.parent]
         if hanging:
             transforms = self._transforms(time, *zip(*hanging, strict=True))
-            self._log(f"{place}tf_static", "FrameTransforms", time, latch=True, **transforms)
+            self._log(f"{place}tf_static", "FrameTransforms", time, latch=True, transforms=transforms)
         entities = [self._entity(frame, time) for frame in frames if frame.shapes]
         self._log(topic, "SceneUpdate", time, latch=True, entities=entities)
 
@@ -116,7 +112,7 @@ class _FoxgloveOutput(SceneOutput):
         )
 
     def write_poses(self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> None:
-        self._log(topic, "FrameTransforms", time, **self._transforms(time, frames, poses))
+        self._log(topic, "FrameTransforms", time, transforms=self._transforms(time, frames, poses))
 
     def write_joints(
         self, topic: str, time: int, names: Sequence[str], q: NDArray[np.float64], v: NDArray[np.float64]
