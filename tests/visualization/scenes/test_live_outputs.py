@@ -179,6 +179,7 @@ def test_client_of_rerun_gets_the_scene_and_the_poses(testbed: VirtualTestbed, t
             env=os.environ | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "XDG_DATA_HOME": str(tmp_path)},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            start_new_session=True,  # The program in Python starts another one.
         )
         try:
             recording = None
@@ -189,7 +190,7 @@ def test_client_of_rerun_gets_the_scene_and_the_poses(testbed: VirtualTestbed, t
                     with suppress(RuntimeError):  # It ends in the middle of a message: later, then.
                         recording = Recording(saved)
         finally:
-            client.kill()
+            os.killpg(client.pid, signal.SIGKILL)
             client.wait()
     plant = testbed.plant
     times = recording.times("joint_states/position", "Scalars:scalars")
