@@ -48,7 +48,7 @@ _WATCH = """{
 
 
 def first_picture(repeats: int = 5) -> list[Benchmark]:
-    """Time from the address of a live page to the picture of its robot in Chromium, over that of Meshcat's own page.
+    """Time from a live page's address to the picture of its robot in Chromium, over the time of Meshcat's own page.
 
     Both show the same Meshcat, in turns, without anything in a cache. Our page exchanges its ticket for a session
     first, and has the panel beside the scene. Printed beside it: until the panel shows the session's state, too.

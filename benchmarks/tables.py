@@ -22,7 +22,8 @@ _ACT = {"torque": ["u0", "u1", "u2"]}
 def read_table_csv(rows: int = 1_000_000, repeats: int = 5) -> Benchmark:
     """Measure the processor time of `read_table` for a CSV file of ten columns, relative to pyarrow's own reader.
 
-    They run in turns. Both end with numpy's arrays; `read_table` also looks for rows that are not whole, for gaps and repeated times.
+    They run in turns. Both end with numpy's arrays; `read_table` also looks for rows that are not whole, for gaps and
+    repeated times.
     """
     return _against_arrow("read_table_csv", "t.csv", csv.write_csv, csv.read_csv, rows, repeats)
 

@@ -58,7 +58,7 @@ def recorded(
         seconds: Duration.
         center: Distance of the centre of mass from the joint, in m.
         moment: Moment of inertia about the centre of mass, in kg m^2.
-        coulomb: Friction beside that of the law, in N m.
+        coulomb: Friction beside the law's, in N m.
         amplitude: Factor of the torques.
         step: Step of the simulation, in s.
     """

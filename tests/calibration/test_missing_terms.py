@@ -1,4 +1,4 @@
-"""What a model of joints lacks is named: on a machine that is not made of the package's parts."""
+"""Terms that a model of joints lacks are named: on a machine that is not made of the package's parts."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@ r"""What a fitted model of joints lacks: torques that depend on speed, direction
 A disturbance of the torques is part of the filter, and it takes what the friction's law does not have: the innovations
 stay white, and segments that were kept back fit as well. So terms that the model could have are tried one by one, at
 their value zero, beside all parameters that were fitted (a score test; C. R. Rao, Proc. Cambridge Philos. Soc. 44,
-1948): the estimate of a term is one step of Gauss and Newton, and its deviation that of the sandwich estimator.
+1948): the estimate of a term is one step of Gauss and Newton, its deviation comes from the sandwich estimator.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vtbdrake.calibration.fisher import Information
 from vtbdrake.calibration.posterior import block_scores
 from vtbdrake.common.arrays import Array
 
-# A term is missed if it lies so many deviations from zero.
+# A term is missed if it is at least this number of deviations from zero.
 SIGNIFICANT = 6.0
 # Torques below this share of a joint's friction, or its torques if it has no friction, are left to the disturbance.
 SHARE_OF_FRICTION = 0.15
@@ -46,14 +46,14 @@ class MissingTerm:
 
     Attributes:
         joint: Name of the joint.
-        what: What the torque depends on, in words.
+        dependence: Name of the torque's cause, in words.
         size: Root mean square of the torque in N m or N, or the offset in rad or m.
         deviation: Standard deviation of ``size``.
         share: The share of the joint's friction that the torque is; NaN of an offset.
     """
 
     joint: str
-    what: str
+    dependence: str
     size: float
     deviation: float
     share: float = float("nan")
@@ -65,8 +65,8 @@ class MissingTerm:
                 "which the model does not have"
             )
         return (
-            f"the torque of {self.joint} depends on {self.what}, which the model does not have: {self.size:.3g} +- "
-            f"{self.deviation:.2g} N m (or N) in the mean, {self.share:.0%} of its friction"
+            f"the torque of {self.joint} depends on {self.dependence}, which the model does not have: {self.size:.3g} "
+            f"+- {self.deviation:.2g} N m (or N) in the mean, {self.share:.0%} of its friction"
         )
 
 
@@ -94,7 +94,7 @@ def chattering(segments: Segments, start: Array, z: Array) -> list[str]:
 def missing_terms(
     segments: Segments, noise: Noise, z: Array, used: NDArray[np.bool], info: Information
 ) -> list[MissingTerm]:
-    """Return what the model lacks at its estimate, the most significant term of each joint.
+    """Return the most significant term of each joint that the model lacks at its estimate.
 
     Args:
         segments: The recordings, with their filtered trajectories.
@@ -113,32 +113,32 @@ def missing_terms(
     J, G = (fitted * info.scales).reshape(-1, len(z)), tried.reshape(-1, len(terms))
     # What the fitted parameters leave of the terms.
     shared = info.covariance @ (J.T @ G)
-    own = tried - (fitted * info.scales) @ shared
-    power, whole = (own**2).sum(axis=(0, 1, 2)), (G**2).sum(axis=0)
-    gradients = np.einsum("twij,twi->j", own, white)
-    found: dict[str, tuple[float, MissingTerm]] = {}
-    for k, (joint, what, rms, friction, _) in enumerate(terms):
+    distinct = tried - (fitted * info.scales) @ shared
+    power, whole = (distinct**2).sum(axis=(0, 1, 2)), (G**2).sum(axis=0)
+    gradients = np.einsum("twij,twi->j", distinct, white)
+    ranked: dict[str, tuple[float, MissingTerm]] = {}
+    for k, (joint, dependence, rms, friction, _) in enumerate(terms):
         if power[k] <= _OWN * whole[k]:
             continue
         value = -gradients[k] / power[k]
-        # Without the term, the scores are those of a wrong model.
-        scores = block_scores(own[..., [k]], white + value * own[..., k], segments.period)
+        # Scores without the term come from a wrong model.
+        scores = block_scores(distinct[..., [k]], white + value * distinct[..., k], segments.period)
         deviation = max(np.sqrt((scores**2).sum()), _LEAST_DEVIATION * np.sqrt(power[k])) / power[k]
         is_offset = np.isnan(friction)
         size = abs(value) * rms
         large = size > (LEAST_OFFSET if is_offset else SHARE_OF_FRICTION * friction)
         significance = abs(value) / deviation
         rank = significance * (_SIMPLER if is_offset else 1.0)
-        if large and significance > SIGNIFICANT and rank > found.get(joint, (0.0,))[0]:
+        if large and significance > SIGNIFICANT and rank > ranked.get(joint, (0.0,))[0]:
             share = float("nan") if is_offset else size / friction
-            found[joint] = rank, MissingTerm(joint, what, float(size), float(deviation * rms), share)
-    return [term for _, term in found.values()]
+            ranked[joint] = rank, MissingTerm(joint, dependence, float(size), float(deviation * rms), share)
+    return [term for _, term in ranked.values()]
 
 
 def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[tuple[str, str, float, float, Array]]:
-    """Yield joint, dependence, RMS of the torque for a coefficient of 1, that of the friction, and slopes of defects.
+    """Yield joint, dependence, RMS of torque (for a coefficient of 1) and of friction, and slopes of the defects.
 
-    Of the offset of an encoder, the RMS is 1 and the friction NaN.
+    An encoder's offset has an RMS of 1, and NaN for the friction.
     """
     model = segments.model
     n = model.nq
@@ -159,9 +159,9 @@ def _terms(segments: Segments, linearized: Linearization, z: Array) -> Iterator[
                 "its load (load_friction of the drives)": [sign * abs(load)],
                 "its position": [np.sin(q), np.cos(q), np.sin(2.0 * q), np.cos(2.0 * q)],
             }
-            for what, torques in shapes.items():
+            for dependence, torques in shapes.items():
                 for torque in torques:
-                    yield name, what, _rms(torque), rms, linearized.B[..., j] * torque[..., np.newaxis]
+                    yield name, dependence, _rms(torque), rms, linearized.B[..., j] * torque[..., np.newaxis]
         unit = np.zeros(2 * n)
         unit[j] = 1.0
         # The model at q + offset, and back: what the positions become differs from the measured ones by the offset.

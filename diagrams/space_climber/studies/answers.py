@@ -52,8 +52,8 @@ class PayloadAnswer:
 
         The slower gaits are beside the question: they show where the order of the worlds comes from.
         """
-        asked = {name: bound for name, bound in self.boundaries.items() if "stride" not in ENVIRONMENTS[name]}
-        return [name for name, bound in asked.items() if not (isfinite(bound.lower) and isfinite(bound.upper))]
+        walked = {name: bound for name, bound in self.boundaries.items() if "stride" not in ENVIRONMENTS[name]}
+        return [name for name, bound in walked.items() if not (isfinite(bound.lower) and isfinite(bound.upper))]
 
     @property
     def agrees(self) -> bool:

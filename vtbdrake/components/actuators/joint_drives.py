@@ -90,11 +90,10 @@ class JointDrives(AddressedSystem):
             viscous: Viscous friction in N m s/rad; a scalar or shape (n,).
             coulomb: Coulomb friction in N m; a scalar or shape (n,).
             coulomb_velocity: Velocity scale of the Coulomb friction in rad/s; a scalar or shape (n,).
-            stribeck: What friction near rest exceeds Coulomb friction by, in N m; a scalar or shape (n,).
-            stribeck_velocity: Velocity scale of that in rad/s; a scalar or shape (n,).
+            stribeck: Friction near rest beyond Coulomb friction in N m; a scalar or shape (n,).
+            stribeck_velocity: Velocity scale of the friction near rest in rad/s; a scalar or shape (n,).
             load_friction: Friction per torque of the motor; a scalar or shape (n,).
-            asymmetry: What resists motion in positive direction, and helps it in negative one, in N m; a scalar or
-                shape (n,).
+            asymmetry: Torque in N m against positive motion, which helps negative motion; a scalar or shape (n,).
             delay: Delay of the command in whole periods.
             max_delay: The largest delay that can be set in the Context, in whole periods; at least ``delay``.
             initial: The torque in N m before the first sample, both commanded and reached; a scalar or shape (n,).
@@ -103,12 +102,7 @@ class JointDrives(AddressedSystem):
             ValueError: A value is out of range, or a joint has more than one velocity or none.
         """
         super().__init__()
-        for joint in joints:
-            if joint.num_velocities() != 1:
-                raise ValueError(
-                    f"Joint '{joint.name()}' has {joint.num_velocities()} velocities; "
-                    "JointDrives drives joints with exactly one."
-                )
+        _check_joints(joints)
         n = len(joints)
         by_joint = {
             "limit": limit,
@@ -235,6 +229,15 @@ def _kernel(velocities: Sequence[int], states: int, *, period: float) -> Kernel:
     friction = friction_torque(x[velocities], following, by_joint)
     y = casadi.vertcat(following - friction, following, reference)
     return Kernel("drives", [values, memory, u, x], y, compile=False)
+
+
+def _check_joints(joints: Sequence[Joint]) -> None:
+    for joint in joints:
+        if joint.num_velocities() != 1:
+            raise ValueError(
+                f"Joint '{joint.name()}' has {joint.num_velocities()} velocities; "
+                "JointDrives drives joints with exactly one."
+            )
 
 
 def _check(period: float, values: Mapping[str, NDArray[np.float64]]) -> None:

@@ -86,10 +86,10 @@ def judged(state: TrackState, detections: Landmarks, pairs: Indices) -> tuple[bo
     scan = np.array([[len(detections), matched], [expected, again]], dtype=float)
     for k, least_share in enumerate((_LEAST_SHARE, _LEAST_AGAIN)):
         # A scan with many is judged alone: those before it show another place.
-        count, found = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]
+        count, matches = scan[k] if scan[k, 0] >= _JUDGED_FROM else state.unjudged[k] + scan[k]
         if count < _JUDGED_FROM:
-            unjudged[k] = count, found
-        elif found < least_share * count:
+            unjudged[k] = count, matches
+        elif matches < least_share * count:
             fails = True
     return fails, unjudged
 

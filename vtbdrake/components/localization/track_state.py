@@ -36,8 +36,8 @@ class TrackState:
         failures: The number of scans in succession that failed.
         distortion: The test statistic of a distorted map after the last scan that was fused.
         drift: The factor by which the variance of dead reckoning is larger than assumed, at least 1.
-        unjudged: Of the last scans, which together had too few to be judged: the numbers of detections and of those
-            that matched, of landmarks that should be seen again and of those that were, shape (2, 2).
+        unjudged: Numbers of detections and of matched ones, of landmarks that should be seen again and of seen ones,
+            in the last scans, which together had too few to be judged, shape (2, 2).
 
     The last five are the health of the track, see `vtbdrake.components.localization.health`.
     """
