@@ -320,6 +320,27 @@ def test_contact_is_part_of_a_native_fmu(tmp_path: Path) -> None:
         np.testing.assert_array_equal(result[name], batch.outputs[name][0])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["native", "coupled"])
+def test_entries_of_arrays_are_scalars(tmp_path: Path, kind: str) -> None:
+    names = {"inputs": {"first": "u.plan[1]", "second": "u.plan[2]"}, "outputs": {"force": "dps.force"}}
+    scenario = CartPoleScenario()
+    path = export_fmu(scenario, tmp_path / "entries.fmu", kind=kind, **names)
+    result = fmpy.simulate_fmu(
+        str(path), stop_time=0.5, output_interval=0.05, start_values={"first": 30.0, "second": -20.0}
+    )
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {"u.plan": [0.0, 30.0, -20.0, *[0.0] * 8]})
+    simulator = testbed.simulator(context)
+    for instant, force in zip(
+        sample_instants(result["time"], 0.0, testbed.event_timings())[1:], result["force"][1:], strict=True
+    ):
+        simulator.AdvanceTo(instant)
+        np.testing.assert_allclose(force, testbed.read(context, "dps.force").item(), atol=1e-12)
+    assert np.ptp(result["force"]) > 20.0
+
+
 def test_a_scenario_that_no_process_can_import_is_not_coupled(tmp_path: Path) -> None:
     class LocalScenario(WaveScenario):
         """A scenario within a function."""
