@@ -187,8 +187,9 @@ class Instances:
             )
         with self._used(state) as instance, self._explained(instance, time):
             if instance.holds is not state:
-                self._restore(instance, state, time)
+                self._restore(instance, state)
             if changed.any():
+                instance.holds = None
                 self._tunables.write(instance.slave, parameters[self._is_tunable])
             self._inputs.write(instance.slave, inputs)
             instance.holds = None
@@ -206,7 +207,7 @@ class Instances:
         instance.holds = state
         return state
 
-    def _restore(self, instance: _Instance, state: FmuState, time: float) -> None:
+    def _restore(self, instance: _Instance, state: FmuState) -> None:
         if not self.fork:
             raise FmuError(
                 f"{self._fmu.name} has gone on from this state, to which it cannot return (fork=False): simulate from "
