@@ -357,14 +357,28 @@ def _run_tests(project: Path, outcome: Outcome, selection: str) -> None:
 
 
 def table(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield the lines of the table of shares, by source."""
-    yield "| source | models | written | pass their own tests | drive their machine |"
-    yield "|---|---|---|---|---|"
+    """Yield the lines of the table of outcomes, by source."""
+    yield "| source | models | written | pass their tests | drive their machine | refused |"
+    yield "|---|---|---|---|---|---|"
     for source in [*_MODELS, "all"]:
         rows = [o for o in outcomes if source == "all" or o.robot.startswith(f"{source}:")]
         if rows:
-            counts = [sum(getattr(o, field) for o in rows) for field in ("written", "tests", "driven")]
+            counts = [sum(bool(getattr(o, name)) for o in rows) for name in ("written", "tests", "driven", "refused")]
             yield f"| {source} | {len(rows)} | " + " | ".join(map(str, counts)) + " |"
+
+
+def read_outcomes(file: Path, *, again: bool = False) -> list[Outcome]:
+    """Return the outcomes in a file.
+
+    Args:
+        file: The file, with an outcome in JSON on each line.
+        again: Whether the file forgets those that do not pass.
+    """
+    outcomes = [Outcome(**json.loads(line)) for line in file.read_text("utf-8").splitlines()]
+    if again:
+        outcomes = [outcome for outcome in outcomes if not (outcome.refused or outcome.failures)]
+        file.write_text("".join(json.dumps(asdict(outcome)) + "\n" for outcome in outcomes), "utf-8")
+    return outcomes
 
 
 def main() -> None:
@@ -376,13 +390,14 @@ def main() -> None:
     parser.add_argument("--shuffle", metavar="SEED", type=int, help="try them in this random order")
     parser.add_argument("--cache", type=Path, default=CACHE, help="where the packages are kept [%(default)s]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the outcomes there, and go on where it ends")
+    parser.add_argument("--again", action="store_true", help="try again those in FILE that do not pass")
     arguments = parser.parse_args()
     robots = [robot for robot in ROBOTS if not arguments.only or any(text in str(robot) for text in arguments.only)]
     if arguments.shuffle is not None:
         random.Random(arguments.shuffle).shuffle(robots)
     fetch(arguments.cache, sorted({robot.source for robot in robots}))
     file: Path | None = arguments.json
-    outcomes = [Outcome(**json.loads(line)) for line in file.read_text().splitlines()] if file and file.exists() else []
+    outcomes = read_outcomes(file, again=arguments.again) if file and file.exists() else []
     done = {outcome.robot for outcome in outcomes}
     selection = None if arguments.no_tests else OF_THE_ROBOT if arguments.quick else ""
     with tempfile.TemporaryDirectory() as folder:
@@ -400,8 +415,8 @@ def main() -> None:
     for line in table(outcomes):
         print(line)
     for outcome in outcomes:
-        if outcome.refused:
-            print(f"refused: {outcome.refused}")
+        if outcome.refused or outcome.failures:
+            print(f"{outcome.robot}: {outcome.refused or outcome.failures}")
 
 
 if __name__ == "__main__":

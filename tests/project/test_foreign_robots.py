@@ -1,11 +1,23 @@
 """Robots of others: the list of models, and one of them from the file to the driven machine."""
 
+import json
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from tests.project.foreign_robots import CACHE, GYMNASIUM, OF_THE_ROBOT, ROBOTS, Outcome, fetch, table, try_robot
+from tests.project.foreign_robots import (
+    CACHE,
+    GYMNASIUM,
+    OF_THE_ROBOT,
+    ROBOTS,
+    Outcome,
+    fetch,
+    read_outcomes,
+    table,
+    try_robot,
+)
 
 pytestmark = pytest.mark.one_python
 
@@ -25,7 +37,15 @@ def test_table_counts_by_source() -> None:
         Outcome("drake:c.sdf", refused="a sentence"),
     ]
     rows = list(table(outcomes))[2:]
-    assert rows == ["| gymnasium | 2 | 2 | 1 | 2 |", "| drake | 1 | 0 | 0 | 0 |", "| all | 3 | 2 | 1 | 2 |"]
+    assert rows == ["| gymnasium | 2 | 2 | 1 | 2 | 0 |", "| drake | 1 | 0 | 0 | 0 | 1 |", "| all | 3 | 2 | 1 | 2 | 1 |"]
+
+
+def test_those_that_fail_are_tried_again(tmp_path: Path) -> None:
+    good, failed, refused = Outcome("a", written=True), Outcome("b", failures="it falls"), Outcome("c", refused="no")
+    file = tmp_path / "robots.json"
+    file.write_text("".join(json.dumps(asdict(outcome)) + "\n" for outcome in (failed, good, refused)))
+    assert read_outcomes(file) == [failed, good, refused]
+    assert read_outcomes(file, again=True) == read_outcomes(file) == [good]
 
 
 @pytest.mark.slow
