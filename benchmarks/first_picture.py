@@ -29,7 +29,7 @@ PICTURE_GOAL = 1.2  # what our server and our panel may add to Meshcat's own pag
 _DRAWN = "body[data-session=open][data-frame]"
 
 _PATIENCE = 120_000  # ms
-# Notes when the scene has got its last mesh, and has been drawn: the page's clock begins with its address.
+# Notes when the scene has got its last mesh, and has been drawn.
 _WATCH = """{
   const draw = window.requestAnimationFrame.bind(window);
   window.drawn = { meshes: 0, at: 0 };
@@ -37,8 +37,8 @@ _WATCH = """{
     let meshes = 0;
     if (typeof viewer !== "undefined") viewer.scene.traverse((object) => (meshes += object.isMesh ? 1 : 0));
     if (meshes !== window.drawn.meshes) {
-      window.drawn.meshes = meshes;
-      draw(() => draw(() => (window.drawn.at = Date.now())));
+      const drawn = (window.drawn = { meshes, at: 0 });
+      draw(() => draw(() => (drawn.at = Date.now())));
     }
     draw(count);
   };
