@@ -229,6 +229,20 @@ def test_planar_base_that_falls_is_held(tmp_path: Path, joints: str, held: tuple
     assert any("which would fall" in note for note in robot.notes) == bool(held)
 
 
+def test_a_joint_that_damping_holds_is_fixed(tmp_path: Path) -> None:
+    further = f'<link name="tip">{INERTIA}</link><joint name="second" type="revolute"><parent link="arm"/>'
+    further += f'<child link="tip"/><axis xyz="1 0 0"/><dynamics damping="{{}}"/>{LIMIT}</joint>'
+    path = urdf(tmp_path, further=further.format("1e11"))
+    robot = read_robot(path)
+    assert (robot.held, robot.driven) == (("second",), ("hinge",))
+    assert any("robot.urdf:6: the damping of second holds them" in note for note in robot.notes)
+    assert read_robot(urdf(tmp_path, further=further.format("1"))).held == ()
+    drives = DRIVE + DRIVE.replace("hinge", "second").replace('"t"', '"u"').replace('"a"', '"b"')
+    robot = read_robot(urdf(tmp_path, further=further.format("1e4") + drives))
+    slow = {joint.name: joint.speed for joint in robot.joints}["second"]
+    assert robot.held == () and abs(robot.away[1]) <= 5.0 * slow  # what its speed allows within 5 s
+
+
 def test_a_weight_beyond_the_drive_is_noted(tmp_path: Path) -> None:
     """The range begins at home, so that the other posture is on one side."""
     heavy = INERTIA.replace("<mass", '<origin xyz="1 0 0"/><mass')

@@ -57,6 +57,11 @@ _DAMPED = 0.5
 _STEP = {REVOLUTE: 0.4, PRISMATIC: 0.1}
 _SHARE = 0.15
 
+# A joint that would need more than this time to cross its range, for its damping, counts as fixed, in s.
+_LONGEST_RANGE = 100.0
+# At its speed, a joint reaches the other posture of examples within this time, in s.
+_LONGEST_WAY = 5.0
+
 # The other posture is moved closer to home, and to its other sides, until nothing touches on the way and the drives
 # carry it.
 _SHARES_OF_THE_WAY = (1.0, 0.5, 0.2)
@@ -129,7 +134,7 @@ class ProjectRobot:
         away: Another posture of the driven joints, for examples.
         packages: The packages to which the model refers, by name: their folders in ``models``.
         welded: The bodies that are free in the file, and where they are welded to the world.
-        held: The joints of a base that would fall, which are held where they are.
+        held: The joints of a base that would fall, and joints that damping holds: they are held where they are.
         added_drives: The joints without an actuator that Drake reads, which get one.
         servos: The names of actuators of the file with position or velocity controllers, which are left out.
         without_drive: The names of actuators of the file that are left out, with their joints' drives.
@@ -218,8 +223,9 @@ def read_robot(path: Path, packages: Mapping[str, Path] = MappingProxyType({})) 
 class _ModelReader:
     """Reads one model file, by the copy that a project gets."""
 
-    def __init__(self, path: Path, packages: Mapping[str, Path], folder: Path) -> None:
+    def __init__(self, path: Path, packages: Mapping[str, Path], folder: Path, *, stuck: tuple[str, ...] = ()) -> None:
         self._path = path = path.resolve()
+        self._packages, self._stuck = packages, stuck
         self._shown = min(str(path), os.path.relpath(path), key=len)
         self._text = path.read_text(encoding="utf-8", errors="replace")
         self._copy = copy_model(path, self._shown, packages)
@@ -228,6 +234,11 @@ class _ModelReader:
         self._parser_notes = _Grouped()
         self._notes: list[str] = list(self._copy.notes)
         self._folder = folder
+        if stuck:
+            self._notes.append(
+                f"{self._place(stuck[0])}: the damping of {_listed(stuck)} holds them against drives that could carry "
+                "the robot: they are fixed at zero (hold_joint in robot.py)"
+            )
         self._home_notes: list[str] = []  # they do not matter where a robot stands in another posture
 
     def robot(self) -> ProjectRobot:
@@ -241,13 +252,15 @@ class _ModelReader:
             robot.notes = [*self._notes, *self._parser_notes.sentences()]
             return robot
         joints = self._joints(plant)
-        robot.held = self._falling_base(plant, joints)
+        robot.held = (*self._falling_base(plant, joints), *self._stuck)
         joints = [joint for joint in joints if joint.name() not in robot.held]
         robot.welded = self._free_bodies(plant)
         robot.couplings = self._couplings(joints)
         self._choose_drives(plant, joints, robot)
         plant, scene_graph, diagram = self._as_in_project(robot)
         self._read_limits(plant, joints, robot)
+        if stuck := self._stuck_joints(robot):
+            return _ModelReader(self._path, self._packages, self._folder, stuck=(*self._stuck, *stuck)).robot()
         self._find_legs(robot)
         if robot.standing is None:
             self._let_drives_carry(plant, robot)
@@ -619,6 +632,16 @@ class _ModelReader:
         robot.joints = tuple(result)
         robot.assumptions += self._assumptions(result)
 
+    @staticmethod
+    def _stuck_joints(robot: ProjectRobot) -> tuple[str, ...]:
+        """Return the joints without an actuator in the file that damping holds: authors write it for a fixed joint."""
+        stuck = tuple(
+            joint.name
+            for joint in robot.joints
+            if joint.name in robot.added_drives and joint.upper - joint.lower > _LONGEST_RANGE * joint.speed
+        )
+        return stuck if len(stuck) < len(robot.driven) else ()
+
     def _let_drives_carry(self, plant: MultibodyPlant, robot: ProjectRobot) -> None:
         """Move the home of a robot whose drives cannot hold it there to the nearest posture in which they can."""
         homes = np.array([joint.home for joint in robot.joints])
@@ -987,7 +1010,7 @@ def _rounded_up(value: float) -> float:
 def _away(joint: RobotJoint) -> float:
     """Return another position of a joint, towards its farther end."""
     end = joint.upper if joint.upper - joint.home > joint.home - joint.lower else joint.lower
-    step = min(_SHARE * abs(end - joint.home), _STEP[joint.kind])
+    step = min(_SHARE * abs(end - joint.home), _STEP[joint.kind], _LONGEST_WAY * joint.speed)
     return float(f"{joint.home + math.copysign(step, end - joint.home):.4g}")
 
 

@@ -360,7 +360,7 @@ def _add_robot(robot: ProjectRobot) -> list[str]:
     if robot.held:
         lines += [
             f"for name in [{', '.join(json.dumps(name) for name in robot.held)}]:",
-            "    hold_joint(plant, name)  # The base would fall: nothing drives it.",
+            "    hold_joint(plant, name)  # Nothing drives it.",
         ]
     if robot.standing is not None:
         lines += [
