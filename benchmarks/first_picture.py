@@ -150,8 +150,8 @@ def bare_to_browser() -> list[Benchmark]:
             page.close()
         subprocess.run([*pip, "--no-deps", "--force-reinstall", str(wheels[-1])], env=_variables(), check=True)
         alone = time.perf_counter() - shown
+        unpacking = installation_time(log.read_text("utf-8"))
     ours = alone + shown - installed
-    unpacking = installation_time(log.read_text("utf-8"))
     note = f"environment {made - begin:.1f} s; dependencies: download {installed - made - unpacking:.1f} s, "
     note += f"installation {max(unpacking - alone, 0.0):.1f} s; ours: the wheel alone {alone:.1f} s, "
     note += f"command to picture {shown - installed:.1f} s"
