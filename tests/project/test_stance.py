@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 
 from vtbdrake.project import ProjectRobot, read_robot
+from vtbdrake.project.stance import StanceFinder
 
 pytestmark = pytest.mark.one_python
 
@@ -78,6 +80,26 @@ def changed(folder: Path, change: Callable[[str], str]) -> ProjectRobot:
     path = folder / "quadruped.urdf"
     path.write_text(change((MODELS / "quadruped.urdf").read_text()))
     return read_robot(path)
+
+
+def test_soles_may_be_taken_for_points(tmp_path: Path) -> None:
+    """Legs of three joints may not be able to keep soles level: with boxes for feet they stand on points."""
+    text = (MODELS / "quadruped.urdf").read_text()
+    file = tmp_path / "boxes.urdf"
+    file.write_text(text.replace('<sphere radius="0.02"/>', '<box size="0.04 0.04 0.04"/>'))
+    joints = read_robot(file).joints
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    Parser(plant).AddModels(str(file))
+    plant.Finalize()
+    context = plant.GetMyMutableContextFromRoot(builder.Build().CreateDefaultContext())
+    inspector, base = scene_graph.model_inspector(), plant.GetBodyByName("trunk")
+    shapes = {}
+    for soles in (True, False):
+        standing = StanceFinder(plant, context, inspector, base=base, joints=joints, soles=soles).stance([])
+        assert standing is not None and bool(standing.soles) == soles
+        shapes[soles] = {points.shape for points in standing.feet.values()}
+    assert shapes == {True: {(4, 3)}, False: {(1, 3)}}
 
 
 def without_hind_feet(text: str) -> str:

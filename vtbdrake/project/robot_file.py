@@ -26,7 +26,7 @@ from scipy.optimize import least_squares
 
 from vtbdrake.common.failures import one_line
 from vtbdrake.components.compiled_plant import PlantDynamics, UnsupportedPlantError
-from vtbdrake.components.standing import WholeBodyModel
+from vtbdrake.components.standing import Stance, WholeBodyModel
 from vtbdrake.project.model_copy import MJCF, URDF, ModelCopy, copy_model
 from vtbdrake.project.rotors import FlyingRobot, flying_robot
 from vtbdrake.project.stance import StanceError, StanceFinder, StandingRobot, named_postures, with_shift
@@ -73,6 +73,9 @@ _POSTURES = 12
 _AROUND_HOME = 0.02
 # The postures around home that are looked at.
 _NEIGHBOURS = 8
+
+# A robot that reaches less of a shift of its weight does not stand well, as a share of the shift.
+_LEAST_REACHED = 0.1
 
 # The file and the line with which a message of Drake's parser begins.
 _PLACE = re.compile(r"([^\s:]*:\d+): ")
@@ -419,10 +422,14 @@ class _ModelReader:
         self._finalize(plant)
         diagram = builder.Build()
         context = plant.GetMyMutableContextFromRoot(diagram.CreateDefaultContext())
-        finder = StanceFinder(
-            plant, context, scene_graph.model_inspector(), base=plant.GetBodyByName(base), joints=robot.joints
-        )
-        standing = finder.stance(list(named_postures(self._path, self._text)))
+        base_body, inspector = plant.GetBodyByName(base), scene_graph.model_inspector()
+        postures = list(named_postures(self._path, self._text))
+
+        def stance(*, soles: bool) -> StandingRobot | None:
+            finder = StanceFinder(plant, context, inspector, base=base_body, joints=robot.joints, soles=soles)
+            return finder.stance(postures)
+
+        standing = stance(soles=True)
         if standing is None:
             return None
         if robot.has_constraints and plant.num_constraints() > len(robot.couplings):
@@ -441,9 +448,16 @@ class _ModelReader:
             model.Finalize()
             return model
 
-        return with_shift(
-            standing, lambda stance: WholeBodyModel(make_plant, stance, motions=motions, limit=limit), names
-        )
+        def model(stance: Stance) -> WholeBodyModel:
+            return WholeBodyModel(make_plant, stance, motions=motions, limit=limit)
+
+        standing = with_shift(standing, model, names)
+        if standing.reached < _LEAST_REACHED and (on_points := stance(soles=False)) is not None:
+            # Legs of three joints cannot keep a sole level: their feet are balls, drawn by meshes.
+            standing = with_shift(on_points, model, names)
+        if standing.reached < _LEAST_REACHED:
+            raise StanceError("it cannot shift its weight within the limits of its drives and joints")
+        return standing
 
     def _falling_base(self, plant: MultibodyPlant, joints: list[Joint]) -> tuple[str, ...]:
         """Return the joints between the world and the first drive, if none of them carries the robot's weight.

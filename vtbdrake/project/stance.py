@@ -225,6 +225,7 @@ class StanceFinder:
         inspector: What knows its geometries.
         base: The free base.
         joints: The joints with one degree of freedom.
+        soles: Whether feet may have soles, which stay level; otherwise each touches the ground in a point.
     """
 
     def __init__(
@@ -235,8 +236,10 @@ class StanceFinder:
         *,
         base: RigidBody,
         joints: Sequence[RobotJoint],
+        soles: bool = True,
     ) -> None:
         self._plant, self._context, self._base, self._joints = plant, context, base, joints
+        self._soles = soles
         self._home = np.array([joint.home for joint in joints])
         self._q = np.array([plant.GetJointByName(joint.name).position_start() for joint in joints])
         self._up = _inboard_joints(plant)
@@ -354,7 +357,7 @@ class StanceFinder:
         heights = shape.centers @ normal - shape.radii
         low = np.flatnonzero(heights <= heights.min() + _SOLE)
         lowest = shape.centers[low]
-        is_sole = float(np.ptp(lowest, axis=0).max()) > _LEAST_SOLE
+        is_sole = self._soles and float(np.ptp(lowest, axis=0).max()) > _LEAST_SOLE
         if is_sole:
             level = lowest @ R_LW.matrix()[:, :2]
             ends = {int(low[np.argmax(level @ direction)]) for direction in ((1, 1), (1, -1), (-1, 1), (-1, -1))}
