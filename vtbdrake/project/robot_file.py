@@ -491,7 +491,7 @@ class _ModelReader:
         return tuple(c for c in _mimics(self._copy.xml) if c.joint in names and c.leader in names)
 
     def _transmitted(self, joints: list[Joint]) -> list[str]:
-        """Return the joints that the transmissions of a URDF name, also those of types that Drake leaves out.
+        """Return the joints that the transmissions of a URDF name, also transmissions that Drake leaves out.
 
         A differential has two joints, and some types have tags of their own, such as ``<flexJoint>``.
         """

@@ -57,7 +57,7 @@ _STATION = {
     **{f"station/{file}.py": f"{{name}}/{file}.py" for file in ("dps", "scenario", "optimize")},
 }
 _LONGEST_LINE = 120
-# What a channel's name begins with: LCM's longest name, without that of the longest signal, _EFFORT_MEASURED.
+# A project's LCM channels begin with at most this many bytes: LCM takes 63, the longest signal is _EFFORT_MEASURED.
 _LONGEST_CHANNEL = 63 - 16
 
 
@@ -133,7 +133,7 @@ def write_project(folder: Path, name: str, source: ProjectRobot | StationFile) -
 
 
 def _channel(name: str) -> str:
-    """Return what the names of a project's LCM channels begin with; they have 63 bytes at most.
+    """Return the beginning of the names of a project's LCM channels, which have 63 bytes at most.
 
     A long name is cut, and a checksum keeps it from being another long one's.
     """
