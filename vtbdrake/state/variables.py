@@ -154,7 +154,7 @@ def entry_units(unit: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     """Return the unit of each entry of an array, row by row.
 
     A unit such as ``"rad/s, m/s"`` lists the units of equal groups of the entries of a row. A pose whose orientation is
-    a quaternion has groups of one entry: ``"1, 1, 1, 1, m, m, m"``. If no equal groups can be made, the list is the unit
+    a quaternion has groups of one entry: ``"1, 1, 1, 1, m, m, m"``. If there are no equal groups, the list is the unit
     of every entry.
 
     Args:
