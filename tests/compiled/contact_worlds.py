@@ -160,9 +160,14 @@ def gripper(approximation: str) -> ContactWorld:
     return ContactWorld(diagram, plant, 0.6, randomize, outcome)
 
 
-def pushed_quadruped(approximation: str) -> ContactWorld:
+def climbing_quadruped(approximation: str) -> ContactWorld:
+    """Return the pushed quadruped on convex pieces of terrain."""
+    return pushed_quadruped(approximation, terrain=True)
+
+
+def pushed_quadruped(approximation: str, *, terrain: bool = False) -> ContactWorld:
     """Return a quadruped with joint stops and PD controllers, which begins with a push."""
-    diagram, plant = quadruped(approximation, stops=True, drives=True)
+    diagram, plant = quadruped(approximation, stops=True, drives=True, terrain=terrain)
 
     def randomize(plant: MultibodyPlant, context: Context, random: np.random.Generator) -> None:
         plant.SetPositions(context, plant.GetDefaultPositions())
@@ -201,4 +206,4 @@ def _places(plant: MultibodyPlant, context: Context, states: np.ndarray, name: s
     return states[:, start : start + 3]
 
 
-WORLDS = {"puck": puck, "gripper": gripper, "quadruped": pushed_quadruped}
+WORLDS = {"puck": puck, "gripper": gripper, "quadruped": pushed_quadruped, "terrain": climbing_quadruped}

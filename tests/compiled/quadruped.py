@@ -7,6 +7,7 @@ from pydrake.geometry import (
     AddContactMaterial,
     Box,
     CollisionFilterDeclaration,
+    Convex,
     GeometrySet,
     HalfSpace,
     ProximityProperties,
@@ -62,6 +63,7 @@ def quadruped(
     playground: bool = False,
     stops: bool = False,
     drives: bool = False,
+    terrain: bool = False,
     contact_period: float | None = None,
     sampled: bool = False,
 ) -> tuple[Diagram, MultibodyPlant]:
@@ -72,6 +74,7 @@ def quadruped(
         time_step: The time step of the plant, and the period of the controller, in s.
         playground: The ground is a slope, feet touch each other, there are a box and two balls, and materials differ.
         stops: The joints have stops.
+        terrain: The ground is made of convex pieces of uneven height, 0.4 m long and broad, instead of a plane.
         contact_period: Period of contact switches of the feet, ``switches``, in s; None: there are none.
         sampled: The plant's outputs show its last step.
         drives: The actuators have the joint PD, with effort limits, instead of the DPS; there is a feed-forward.
@@ -104,6 +107,8 @@ def quadruped(
             ball = plant.AddRigidBody(f"ball_{number}", inertia(0.5, 0.01, (0.001, 0.0012, 0.0011)))
             offset = RigidTransform([0.01, 0, 0])
             plant.RegisterCollisionGeometry(ball, offset, Sphere(0.08), f"ball_{number}", surface(0.4, 5e4, 0.03, 0.5))
+    elif terrain:
+        _add_terrain(plant)
     else:
         plant.RegisterCollisionGeometry(world, RigidTransform(), HalfSpace(), "ground", surface(0.8))
     plant.SetDefaultFloatingBaseBodyPose(trunk, RigidTransform([0, 0, HEIGHT]))
@@ -126,6 +131,25 @@ def quadruped(
         builder.Connect(plant.get_state_output_port(), law.get_input_port())
     builder.Connect(law.get_output_port(), plant.get_actuation_input_port())
     return builder.Build(), plant
+
+
+def _add_terrain(plant: MultibodyPlant) -> None:
+    """Add eight convex pieces to the world, whose upper sides are triangles between heights of at most 3 cm."""
+    random = np.random.default_rng(5)
+    heights = random.uniform(-0.03, 0.0, (3, 3))
+    for i in range(2):
+        for j in range(2):
+            corners = np.array(
+                [[0.4 * (i + a - 1), 0.4 * (j + b - 1), heights[i + a, j + b]] for a in (0, 1) for b in (0, 1)]
+            )
+            for k, triangle in enumerate(([0, 1, 3], [0, 3, 2])):
+                top = corners[triangle]
+                points = np.vstack([top, top * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.3]])
+                piece = Convex(points=points.T, label=f"piece_{i}_{j}_{k}")
+                material = surface(0.8, 1e5, 0.02, 0.5)
+                plant.RegisterCollisionGeometry(
+                    plant.world_body(), RigidTransform(), piece, f"ground_{i}_{j}_{k}", material
+                )
 
 
 def _leg(

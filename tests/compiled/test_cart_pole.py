@@ -269,7 +269,10 @@ def test_refuses_to_vary_what_is_compiled_in(address: str, reason: str) -> None:
         ({"workers": 1.5}, "a whole number, not 1.5"),
         ({"compile": "yes"}, "compile must be True or False, not 'yes'"),
         ({"check": "no"}, "check must be True or False, not 'no'"),
-        ({"outputs": ["plant.generalized_acceleration"]}, "generalized_acceleration, which is not compiled: use its state"),
+        (
+            {"outputs": ["plant.generalized_acceleration"]},
+            "generalized_acceleration, which is not compiled: use its state",
+        ),
     ],
 )
 def test_refuses_arguments_that_make_no_sense(options: dict, reason: str) -> None:

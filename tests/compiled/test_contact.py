@@ -202,7 +202,8 @@ def steps_of(approximation: str, *, driven: bool = False) -> Steps:
     return Steps(diagram, plant, approximation == "lagged")
 
 
-@pytest.mark.parametrize("driven", [False, True], ids=["", "stops and drives"])
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("driven", [True, False], ids=["stops and drives", ""])
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
 def test_steps_are_drakes_on_a_playground(approximation: str, driven: bool) -> None:
     """Contact, joint stops, and PD controllers, some at their effort limits, some stiffer than a step resolves."""
@@ -312,6 +313,7 @@ def wedge(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(file)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("one", "other"),
     [
@@ -323,6 +325,9 @@ def wedge(tmp_path_factory: pytest.TempPathFactory) -> str:
         (Cylinder(0.05, 0.2), HalfSpace()),
         ("convex", HalfSpace()),
         ("mesh", HalfSpace()),
+        ("convex", Sphere(0.2)),
+        ("mesh", Sphere(0.05)),
+        (Capsule(0.05, 0.2), Capsule(0.1, 0.3)),
     ],
     ids=lambda shape: shape if isinstance(shape, str) else type(shape).__name__,
 )
@@ -331,21 +336,26 @@ def test_other_shapes_touch_as_in_drake(one: Shape | str, other: Shape, wedge: s
     if isinstance(one, str):
         one = (Convex if one == "convex" else Mesh)(wedge, 1.5)
     steps, random = Steps(*ball_on(other, of_ball=one), False), np.random.default_rng(0)
-    touching = 0
+    touching, apart = 0, []
     for trial in range(60):
         angles = random.uniform(-np.pi, np.pi, 3)
         if trial < 20:
             angles = np.pi / 2 * random.integers(0, 4, 3) + 10.0 ** random.uniform(-9, -3) * random.uniform(-1, 1, 3)
-        steps.put(
-            "ball", RigidTransform(RollPitchYaw(angles), random.uniform(-0.3, 0.3, 3)), random.uniform(0.001, 0.02)
-        )
+        pose = RigidTransform(RollPitchYaw(angles), random.uniform(-0.15, 0.15, 3))
+        if steps.contact.is_iterated():
+            steps.plant.SetFreeBodyPose(steps.context, steps.plant.GetBodyByName("ball"), pose)
+        else:
+            steps.put("ball", pose, random.uniform(0.001, 0.02))
         steps.plant.SetVelocities(steps.context, random.standard_normal(6))
         expected, (v, forces, doubt) = steps.drake(), steps.compiled()
         assert doubt == 0.0
         touching += np.any(forces)
-        # Below the middle of what lies flat, the problem is nearly degenerate, and rounding grows in its iteration.
-        np.testing.assert_allclose(v, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))
-    assert touching > 40
+        apart.append(np.abs(v - expected).max() / max(1.0, np.abs(expected).max()))
+    # Below the middle of what lies flat, the problem is nearly degenerate, and rounding grows in its iteration. Where
+    # Drake iterates for the geometry, its end depends on rounding.
+    assert np.max(apart) < (1e-3 if steps.contact.is_iterated() else 1e-6)
+    assert np.median(apart) < 1e-9
+    assert touching > 25
 
 
 def test_other_shapes_are_refused_by_name() -> None:
@@ -426,7 +436,7 @@ def test_a_step_that_does_not_converge_ends_its_rollout_with_reason_and_time() -
 def test_outcomes_are_drakes(name: str) -> None:
     """Steps agree to rounding, and outcomes where Drake's do not depend on noise of 1e-9 at the begin."""
     world = WORLDS[name]("lagged")
-    assert step_errors(world, 100).max() < 1e-6
+    assert step_errors(world, 100).max() < (1e-5 if name == "terrain" else 1e-9)
     shares = outcome_shares(world, 10, seed=1)
     assert shares.repeatable >= 8
     assert shares.alike == shares.repeatable

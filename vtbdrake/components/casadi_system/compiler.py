@@ -77,6 +77,25 @@ def compiled_kernel(name: str, source: str) -> casadi.Function:
     return function
 
 
+def kernel_signature(name: str, shapes_in: Sequence[tuple[int, int]], shapes_out: Sequence[tuple[int, int]]) -> str:
+    """Return the C functions that describe a kernel of dense matrices to CasADi.
+
+    Args:
+        name: The name of the kernel.
+        shapes_in: The shapes of its arguments.
+        shapes_out: The shapes of its results.
+    """
+    parts = []
+    for kind, shapes in (("in", shapes_in), ("out", shapes_out)):
+        table = ", ".join(f"{{{rows}, {columns}, 1}}" for rows, columns in shapes)
+        parts.append(
+            f"long long int {name}_n_{kind}(void) {{ return {len(shapes)}; }}\n"
+            f"const long long int *{name}_sparsity_{kind}(long long int i) {{\n"
+            f"    static const long long int dense[][3] = {{{table}}};\n    return dense[i];\n}}\n"
+        )
+    return "\n" + "".join(parts)
+
+
 def _kernels_in(source: str) -> tuple[Path, ...]:
     """Return the libraries of the kernels that a function calls."""
     return tuple(library for library, _ in _called_kernels(source))

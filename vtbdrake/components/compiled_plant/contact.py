@@ -22,7 +22,7 @@ from vtbdrake.components.compiled_plant.links import (
     rounding_beside,
     times,
 )
-from vtbdrake.components.compiled_plant.touching import can_touch, touch
+from vtbdrake.components.compiled_plant.touching import can_touch, is_iterated, touch
 
 Expression = Any  # casadi.SX
 
@@ -98,7 +98,8 @@ def contact_pairs(plant: MultibodyPlant, context: Context) -> tuple[Pair, ...]:
             "'sap' or 'lagged'"
         )
     reader = _SurfaceReader(plant, plant.get_geometry_query_input_port().Eval(context).inspector())
-    in_order = sorted(candidates, key=lambda pair: [geometry.get_value() for geometry, _ in pair])
+    ordered = (sorted(pair, key=lambda each: each[0].get_value()) for pair in candidates)
+    in_order = sorted(ordered, key=lambda pair: [geometry.get_value() for geometry, _ in pair])
     return tuple(_pair(*(reader.surface(geometry, body) for geometry, body in pair)) for pair in in_order)
 
 
@@ -141,8 +142,8 @@ def _pair(first: Surface, second: Surface) -> Pair:
             return pair
     raise UnsupportedPlantError(
         f"contact of {first.name} ({type(first.shape).__name__}) and {second.name} ({type(second.shape).__name__}) "
-        "is not compiled: let a Sphere touch a Sphere, Box, Cylinder, Capsule or HalfSpace, or let a Box, Cylinder, "
-        "Capsule, Convex or Mesh touch a HalfSpace, or exclude the two by a CollisionFilterDeclaration"
+        "is not compiled: let a Sphere touch any shape but an Ellipsoid, a HalfSpace a Box, Cylinder, Capsule, Convex "
+        "or Mesh, or a Capsule another one, or exclude the two by a CollisionFilterDeclaration"
     )
 
 
@@ -166,6 +167,10 @@ class PointContact:
     def __init__(self, plant: MultibodyPlant, model: PlantDynamics, pairs: Sequence[Pair]) -> None:
         self._model, self.pairs = model, tuple(pairs)
         self._is_lagged = is_lagged(plant)
+
+    def is_iterated(self) -> bool:
+        """Return whether Drake iterates for a pair, and ends elsewhere if a pose is rounded otherwise."""
+        return any(is_iterated(pair.first.shape, pair.second.shape) for pair in self.pairs)
 
     def materials(self) -> np.ndarray:
         """Return stiffness, dissipation and friction of each pair, shape (n, 3); see `Pair.material`."""
@@ -194,7 +199,7 @@ class PointContact:
         """Return the point of contact and the normal from the first to the second, in the world, and the distance."""
         first, second = pair.first, pair.second
         poses = self._pose(first, q), self._pose(second, q)
-        on_first, n, distance = touch(first.shape, poses[0], second.shape, poses[1], first.vertices)
+        on_first, n, distance = touch(first.shape, poses[0], second.shape, poses[1], (first.vertices, second.vertices))
         on_second = on_first - distance * n
         share = np.array([first.stiffness, second.stiffness]) / (first.stiffness + second.stiffness)
         return share[0] * on_first + share[1] * on_second, -n, distance

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointActuator
 
-from vtbdrake.components.casadi_system.compiler import compiled_kernel
+from vtbdrake.components.casadi_system.compiler import compiled_kernel, kernel_signature
 from vtbdrake.components.compiled_plant.contact import PointContact, is_lagged
 from vtbdrake.components.compiled_plant.dynamics import PlantDynamics
 from vtbdrake.state.multibody import bodies
@@ -193,12 +193,12 @@ class SapSolver:
         shapes_in = [(nv, nv), (nv, 1), (nv, 1), (3 * n, nv), (3, n), *[(n, 1)] * 4, (len(stops), 1), (m, 1), (m, 1)]
         shapes_out = [(nv, 1), (3, n), (m, 1), (1, 1)]
         name = f"sap_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
-        source = f"#define NAME {name}\n{text}{_signature(name, shapes_in, shapes_out)}"
+        source = f"#define NAME {name}\n{text}{kernel_signature(name, shapes_in, shapes_out)}"
         if n:
             return name, source
         jacobian = files(__package__).joinpath("sap_jacobian.c").read_text(encoding="utf-8")
         blocks = [(a * b, c * d) for a, b in shapes_out for c, d in shapes_in]
-        signature = _signature(f"jac_{name}", [*shapes_in, *shapes_out], blocks)
+        signature = kernel_signature(f"jac_{name}", [*shapes_in, *shapes_out], blocks)
         return name, f"{source}\n#define JACOBIAN jac_{name}\n{jacobian}{signature}"
 
     def _trees(self) -> list[int]:
@@ -247,16 +247,3 @@ def _row(numbers: ArrayLike) -> str:
 def _table(declarator: str, numbers: Sequence[float]) -> str:
     """Return the C definition of a constant array, with a 0 at its end."""
     return f"static const {declarator}[{len(numbers) + 1}] = {_row([*numbers, 0])};\n"
-
-
-def _signature(name: str, shapes_in: Sequence[tuple[int, int]], shapes_out: Sequence[tuple[int, int]]) -> str:
-    """Return the C functions that describe a function of dense matrices to CasADi."""
-    parts = []
-    for kind, shapes in (("in", shapes_in), ("out", shapes_out)):
-        table = ", ".join(f"{{{rows}, {columns}, 1}}" for rows, columns in shapes)
-        parts.append(
-            f"long long int {name}_n_{kind}(void) {{ return {len(shapes)}; }}\n"
-            f"const long long int *{name}_sparsity_{kind}(long long int i) {{\n"
-            f"    static const long long int dense[][3] = {{{table}}};\n    return dense[i];\n}}\n"
-        )
-    return "\n" + "".join(parts)

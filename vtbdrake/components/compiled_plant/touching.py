@@ -1,8 +1,10 @@
 """Where two shapes touch in Drake's point contact, as expressions: the deepest point of one, seen by the other.
 
 Compiled is what Drake computes in closed form: a sphere against the nearest point of another shape, and the deepest
-point of any shape against a half-space. For all other pairs Drake iterates (MPR, of libccd); the normals that come out
-may be far from those at the nearest points.
+point of any shape against a half-space. For all other pairs Drake iterates (MPR, of libccd), and the normals that come
+out may be far from those at the nearest points. Compiled are a sphere against a mesh's hull, and two capsules, whose
+results do not jump. Edges and faces of other pairs make facets of their Minkowski difference, and rounding decides in
+which triangle of a facet the iteration ends.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Box, Capsule, Convex, Cylinder, HalfSpace, Mesh, Shape, Sphere
 
 from vtbdrake.components.compiled_plant.links import Pose
+from vtbdrake.components.compiled_plant.mpr import penetration
 
 Expression = Any  # casadi.SX
 Touch = tuple[Expression, Expression, Expression]
@@ -28,15 +31,29 @@ def can_touch(first: Shape, second: Shape) -> bool:
     """Return whether contact of one shape with another is compiled.
 
     Args:
-        first: A sphere, or any shape with a deepest point if the second one is a half-space.
+        first: A sphere, or any shape with a deepest point if the second one is a half-space. The shape whose geometry
+            has the smaller id if Drake iterates.
         second: The other shape.
     """
+    if is_iterated(first, second):
+        return True
     if isinstance(first, Sphere):
         return type(second) in (HalfSpace, *_NEAREST)
     return isinstance(second, HalfSpace) and type(first) in _DEEPEST
 
 
-def touch(first: Shape, X_WA: Pose, second: Shape, X_WB: Pose, vertices: NDArray[np.float64]) -> Touch:
+def is_iterated(first: Shape, second: Shape) -> bool:
+    """Return whether Drake iterates for the contact of two shapes, in a way that is compiled.
+
+    Args:
+        first: A shape.
+        second: The other shape.
+    """
+    kinds = {type(first), type(second)}
+    return kinds in ({Capsule}, {Sphere, Convex}, {Sphere, Mesh})
+
+
+def touch(first: Shape, X_WA: Pose, second: Shape, X_WB: Pose, hulls: tuple[NDArray[np.float64], ...]) -> Touch:
     """Return the deepest point of one shape in the other.
 
     Args:
@@ -44,7 +61,7 @@ def touch(first: Shape, X_WA: Pose, second: Shape, X_WB: Pose, vertices: NDArray
         X_WA: Its pose in the world.
         second: The shape B.
         X_WB: Its pose in the world.
-        vertices: The vertices of A's convex hull in its frame, shape (n, 3), if it is a mesh.
+        hulls: The vertices of the convex hulls of A and B in their frames, shape (n, 3), if they are meshes.
 
     Returns:
         The point on A, shape (3, 1); B's normal there, out of B, shape (3, 1), both in the world; and the distance
@@ -52,6 +69,10 @@ def touch(first: Shape, X_WA: Pose, second: Shape, X_WB: Pose, vertices: NDArray
     """
     R_A, p_A = X_WA
     R_B, p_B = X_WB
+    if is_iterated(first, second):
+        poses = (casadi.densify(each) for each in (R_A, p_A, R_B, p_B))
+        distance, normal, middle = penetration(first, second, hulls)(*poses)
+        return middle - distance / 2 * normal, -normal, distance
     if isinstance(first, Sphere):
         if isinstance(second, HalfSpace):
             n, distance = R_B[:, 2], casadi.dot(R_B[:, 2], p_A - p_B)
@@ -60,7 +81,7 @@ def touch(first: Shape, X_WA: Pose, second: Shape, X_WB: Pose, vertices: NDArray
             n = R_B @ n
         return p_A - first.radius() * n, n, distance - first.radius()
     n = R_B[:, 2]
-    point, height = _DEEPEST[type(first)](first, R_A.T @ n, vertices)
+    point, height = _DEEPEST[type(first)](first, R_A.T @ n, hulls[0])
     return p_A + R_A @ point, n, casadi.dot(n, p_A - p_B) + height
 
 
