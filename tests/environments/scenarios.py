@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlantConfig
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
+from pydrake.symbolic import Variable, exp, max
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, ZeroOrderHold
+from pydrake.systems.primitives import MatrixGain, SymbolicVectorSystem, ZeroOrderHold
 
 import vtbdrake as vtb
 from vtbdrake.testbed import Interface, Scenario, Signal, VirtualTestbedBuilder
@@ -44,7 +45,9 @@ def falling(**changes: Any) -> vtb.Problem:
 
 @dataclass
 class SliderScenario(Scenario):
-    """A mass of 1 kg on a rail without gravity, between stops at 5 cm."""
+    """A mass of 1 kg on a rail, between stops at 5 cm. A drive that bursts makes infinity of more than 4 N."""
+
+    bursts: bool = False
 
     def interface(self) -> Interface:
         return Interface(
@@ -68,4 +71,11 @@ class SliderScenario(Scenario):
         sensor = builder.add("sense", "state", ZeroOrderHold(0.01, 2))
         builder.connect(plant.get_state_output_port(), sensor.get_input_port())
         builder.sim_sensor("state", sensor.get_output_port())
-        builder.sim_actuator("force", plant.get_actuation_input_port())
+        force = plant.get_actuation_input_port()
+        if self.bursts:
+            u = Variable("u")
+            burst = SymbolicVectorSystem(input=[u], output=[u + exp(1e4 * max(u - 4.0, 0.0)) - 1.0])
+            drive = builder.add("act", "drive", burst)
+            builder.connect(drive.get_output_port(), force)
+            force = drive.get_input_port()
+        builder.sim_actuator("force", force)

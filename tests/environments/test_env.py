@@ -221,8 +221,9 @@ def test_wrong_options_are_refused(env: TestbedEnv, options: dict[str, Any], mes
     [
         ([np.nan], r"the action's entry force is nan, not in \[-60, 60\] N: look for what made it so in the policy"),
         ([61.0], r"the action's entry force is 61, not in \[-60, 60\] N: clip it, as gymnasium.wrappers.ClipAction"),
-        ([1.0, 2.0], r"an action is an array of 1 numbers: force, but this one has the shape \(2,\)"),
-        ("left", "an action is an array of 1 numbers: force, not 'left'"),
+        ([1.0, 2.0], r"an action takes numbers for force, in the shape \(1,\), not \(2,\)"),
+        ([[1.0]], r"in the shape \(1,\), not \(1, 1\)"),
+        ("left", "an action takes numbers for force, not 'left'"),
     ],
 )
 def test_wrong_actions_are_refused_and_nothing_happens(env: TestbedEnv, action: Any, message: str) -> None:

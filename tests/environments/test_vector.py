@@ -23,7 +23,7 @@ from tests.rollout.scenarios import child_pids
 from tests.testbeds import AcrobotScenario
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.environments import ActionError, CompiledVectorEnv, FailedEpisodeError, ProcessVectorEnv
-from vtbdrake.rollout import WorkerError
+from vtbdrake.rollout import QualityError, WorkerError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 NOISE = ErrorModel(noise=0.01, dropout=0.1, latency=1)
@@ -162,6 +162,38 @@ def failing(**options: Any) -> Any:
     return vtb.gymnasium_vector_env(scenario, num_envs=3, **arguments, executor="processes", workers=2)
 
 
+def test_a_failure_of_compiled_environments_is_that_of_single_ones() -> None:
+    reward = vtb.Reward(lambda state: 1.0 if state[0] >= 0.0 else 2.0, of="plant.state")
+    scenario = SliderScenario(bursts=True)
+    arguments = {**of_slider(), "problem": scenario, "reward": reward}
+    worth = {**arguments, "failure_reward": -1.0}
+    single = vtb.gymnasium_env(**worth)
+    envs, strict = (vtb.gymnasium_vector_env(**each, num_envs=2, executor="compiled") for each in (worth, arguments))
+    for each in (single, envs, strict):
+        each.reset(seed=0)
+    forces = np.array([[5.0], [0.0]])
+    before, *_ = envs.step(0.0 * forces)
+    single.step(0.0 * forces[0])
+    _, expected, *ends, info = single.step(forces[0])
+    observed, rewards, terminated, truncated, infos = envs.step(forces)
+    assert (expected, ends) == (rewards[0], [terminated[0], truncated[0]]) == (-1.0, [True, False])
+    assert infos["failure"][0] == info["failure"] and infos["failure"][1] is None
+    assert observed[0].tolist() == before[0].tolist() and rewards[1] in (1.0, 2.0) and not terminated[1]
+    with pytest.raises(
+        FailedEpisodeError, match=r"environment 0: the simulation fails in step 1, after the action \[5"
+    ):
+        strict.step(forces)
+    with pytest.raises(ResetNeeded, match="a simulation has failed: call reset"):
+        strict.step(forces)
+
+
+def test_a_start_whose_quality_is_none_is_told_by_drake() -> None:
+    quality = vtb.Quality(lambda state: state[0] - 1.0, of="plant.state", reading="integral")
+    envs = vtb.gymnasium_vector_env(**{**of_slider(), "reward": quality}, num_envs=2, executor="compiled")
+    with pytest.raises(QualityError, match="but a quality is finite and not negative"):
+        envs.reset(seed=0)
+
+
 @pytest.mark.slow
 def test_a_failure_on_a_worker_process_names_the_environment_or_terminates_it() -> None:
     envs = failing()
@@ -226,7 +258,7 @@ def test_wrong_calls_are_refused(compiled: Any) -> None:
     wrong[1] = np.nan
     with pytest.raises(ActionError, match=r"environment 1: the action's entry force is nan, not in \[-60, 60\] N"):
         compiled.step(wrong)
-    with pytest.raises(ValueError, match=r"3 environments take actions of the shape \(3, 1\), not \(2, 1\)"):
+    with pytest.raises(ValueError, match=r"3 environments take numbers for force, in the shape \(3, 1\), not \(2, 1\)"):
         compiled.step(np.zeros((2, 1)))
     with pytest.raises(ValueError, match="give one seed, or one for each of the 3 environments, not 2"):
         compiled.reset(seed=[1, 2])

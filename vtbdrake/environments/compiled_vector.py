@@ -14,6 +14,7 @@ from vtbdrake.common.arrays import Array
 from vtbdrake.compiled import CompiledRollouts
 from vtbdrake.compiled.segmented_rollouts import SegmentedRollouts
 from vtbdrake.compiled.tracing import traced
+from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.environments.episodes import Episodes, FailedEpisodeError, seed_addresses
 from vtbdrake.environments.rewards import first_score, next_score, step_reward
 from vtbdrake.environments.spaces import Channels, switch_values
@@ -174,6 +175,13 @@ class CompiledVectorEnv(TestbedVectorEnv):
             arrays = {a: np.array([drawn[k][a] for k in indices], dtype=float) for a in addresses}
             self._z[rows[indices]] = self._rollouts.filled(self._z0, arrays)
         records = self._segments.begin(self._z[rows])[:, np.newaxis]
+        for k in self._departed(records):
+            try:
+                _, records[k] = self._in_drake(self._z[rows[k]], 0, steps=0)
+            except SimulationError as failure:
+                raise FailedEpisodeError(
+                    f"environment {rows[k]}: the simulation fails at the start of an episode: {failure}"
+                ) from failure
         samples = self._samples(records, np.broadcast_to(self._times[0], (len(rows), 1)))
         first = samples[self.episodes.reward_index][:, 0]
         self._last[rows], self._score[rows] = first, first_score(self.episodes.reward, first)
@@ -187,24 +195,25 @@ class CompiledVectorEnv(TestbedVectorEnv):
         steps = self._steps[rows]
         after, records = self._segments.advance(z, steps)
         failures: dict[int, str] = {}
-        for k in np.flatnonzero(~(records[:, :, -1] <= 0.0).all(axis=1) | ~self._accepted(records)).tolist():
+        for k in self._departed(records):
             try:
                 after[k], records[k] = self._in_drake(z[k], int(steps[k]))
             except SimulationError as failure:
-                failures[int(rows[k])] = str(failure)
+                failures[k] = str(failure)
                 self._refuse_failure(int(rows[k]), actions[k], failure)
-                after[k], records[k] = z[k], 0.0
+                # So that all functions can be computed: these values do not count.
+                after[k], records[k] = z[k], self._segments.begin(self._z0[np.newaxis])
         every = self.episodes.every
         samples = self._samples(records, self._times[steps[:, np.newaxis] * every + np.arange(1, every + 1)])
         before = self._score[rows]
         terminated, ends = self._add_up(rows, samples, steps)
         rewards = step_reward(self.episodes.reward, before, self._score[rows], self._last[rows])
         observed = records[np.arange(len(rows)), ends][:, self._observed_entries]
-        for k in [k for k, row in enumerate(rows.tolist()) if row in failures]:
+        for k in failures:
             rewards[k], terminated[k] = self.episodes.failure_reward or 0.0, True
             observed[k], self._score[rows[k]] = self._observed[rows[k]], before[k]
         self._z[rows], self._observed[rows], self._steps[rows] = after, observed, steps + 1
-        return rewards, terminated, failures
+        return rewards, terminated, {int(rows[k]): failure for k, failure in failures.items()}
 
     def _add_up(self, rows: Rows, samples: Sequence[Array], steps: Rows) -> tuple[Flags, Rows]:
         """Add the samples of a step to the scores; return whether, and at which sample, episodes terminate."""
@@ -237,13 +246,13 @@ class CompiledVectorEnv(TestbedVectorEnv):
             samples.append(values)
         return samples
 
-    def _accepted(self, records: Array) -> Flags:
-        """Return a mask of the rows whose samples of all compiled measures are valid."""
-        accepted = np.ones(len(records), dtype=bool)
+    def _departed(self, records: Array) -> list[int]:
+        """Return the rows of records of shape (n, m, ny) that are not Drake's, or in which a measure is not valid."""
+        departed = ~(records[:, :, -1] <= 0.0).all(axis=1)
         for k, measure in enumerate(self.episodes.measures):
             if (name := _measure_name(k)) in self._rollouts.columns:
-                accepted &= measure.accepts(records[:, :, self._entries(name)[0]]).all(axis=1)
-        return accepted
+                departed |= ~measure.accepts(records[:, :, self._entries(name)[0]]).all(axis=1)
+        return np.flatnonzero(departed).tolist()
 
     def _refuse_failure(self, row: int, action: Array, failure: SimulationError) -> None:
         if self.episodes.failure_reward is None:
@@ -270,12 +279,13 @@ class _StepInDrake:
         self._switches, self._acted = switch_values(testbed, channels), channels.addresses
         self._runner: RolloutRunner | None = None
 
-    def __call__(self, z: Array, number: int) -> tuple[Array, Array]:
+    def __call__(self, z: Array, number: int, *, steps: int = 1) -> tuple[Array, Array]:
         """Return z at the end of a step, shape (nz,), and the records of its samples, shape (every, ny).
 
         Args:
             z: State and parameters at the begin of the step, with the action, shape (nz,).
             number: The number of the step in the episode.
+            steps: 1; or 0 for the record of the begin alone, shape (1, ny).
 
         Raises:
             SimulationError: The simulation fails.
@@ -289,8 +299,10 @@ class _StepInDrake:
         walker.write(z, begin)
         values = {address: testbed.read(begin, address) for address in self._acted} | self._switches
         samples = self._runner.simulate(values, start=Start.of(testbed, begin), begun=float(instants[0]))
-        next(samples)
-        records = np.array([self._record(next(samples)) for _ in range(self._episodes.every)])
+        with Interruptible():
+            time = next(samples)
+            times = [time] if steps == 0 else (next(samples) for _ in range(self._episodes.every))
+            records = np.array([self._record(time) for time in times])
         return walker.read(self._runner.context), records
 
     def _record(self, time: float) -> Array:

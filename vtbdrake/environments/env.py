@@ -116,9 +116,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         start, begin_values = (None, {}) if beginning.start is None else self._start_at(beginning.start)
         self._needs_reset = "its reset has failed"
         self._samples = self._runner.simulate({**begin_values, **beginning.values, **self._switches}, start=start)
-        self._take_first_sample()
+        self._last = self._first_sample()
         self._begun, self._step = self._runner.context.get_time(), 0
-        self._last = self._runner.measured(0.0)[self._place]
         self._score = float(first_score(self._reward, self._last))
         self._needs_reset = ""
         return self._observation(), {"values": dict(beginning.values), **self._quality()}
@@ -142,7 +141,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         """
         if self._needs_reset:
             raise ResetNeeded(f"{self._needs_reset}: call reset() before step()")
-        self._write(self._actions.checked(action, where=""))
+        self._write(self._actions.checked(action))
         score, self._step = self._score, self._step + 1
         terminated, info = False, {}
         try:
@@ -198,7 +197,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         start, values = self._start_at(state)
         self._needs_reset = "its restore has failed"
         self._samples = self._runner.simulate({**values, **self._switches}, start=start, begun=note["begun"])
-        self._take_first_sample()
+        self._first_sample()
         for name in ("step", "begun", "score", "last", "time"):
             setattr(self, f"_{name}", note[name])
         self.np_random.bit_generator.state = note["random"]
@@ -214,10 +213,11 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         values = {address: self.testbed.read(context, address) for address in self._actions.addresses}
         return Start.of(self.testbed, context), values
 
-    def _take_first_sample(self) -> None:
+    def _first_sample(self) -> float:
         try:
             with self._interruptible:
                 self._time = next(self._samples)
+                return self._runner.measured(self._time)[self._place]
         except SimulationError as failure:
             raise FailedEpisodeError(f"the simulation fails at the start of an episode: {failure}") from failure
 

@@ -93,27 +93,28 @@ class Channels:
         """Return the channels, each with its entries in the vector."""
         return list(zip(self._channels, self._slices, strict=True))
 
-    def checked(self, action: Any, *, where: str) -> Array:
-        """Return an action, or a row of several, as an array; single precision may round a limit.
+    def checked(self, actions: Any, *, count: int | None = None) -> Array:
+        """Return an action, or one for each of several environments, as an array; single precision may round a limit.
 
         Args:
-            action: Numbers of shape (size,) or (n, size).
-            where: What comes before the numbers' names in an error, such as ``environment 3: ``.
+            actions: Numbers of shape (size,), or (count, size).
+            count: The number of environments; None: the action is for one, which is no vector.
 
         Raises:
             ActionError: It is none; the entry is named.
         """
+        shape = self.lower.shape if count is None else (count, *self.lower.shape)
         try:
-            array = np.asarray(action, dtype=float)
+            array = np.asarray(actions, dtype=float)
         except (TypeError, ValueError):
-            raise ActionError(f"{where}an action is {self._shape_text()}, not {action!r}") from None
-        if array.shape[-1:] != self.lower.shape:
-            raise ActionError(f"{where}an action is {self._shape_text()}, but this one has the shape {array.shape}")
+            raise ActionError(f"{self._shape_text(count)}, not {actions!r}") from None
+        if array.shape != shape:
+            raise ActionError(f"{self._shape_text(count)}, in the shape {shape}, not {array.shape}")
         if self._is_within(array):
             return array
         if ((array >= self._lowest) & (array <= self._highest)).all():
             return np.clip(array, self.lower, self.upper)
-        raise ActionError(self._refusal(array, where))
+        raise ActionError(self._refusal(array))
 
     def _is_within(self, array: Array) -> bool:
         if array.ndim == 1:  # For few numbers, Python takes less time than numpy.
@@ -121,11 +122,11 @@ class Channels:
             return all(map(le, self._limits[0], values)) and all(map(le, values, self._limits[1]))
         return bool(((array >= self.lower) & (array <= self.upper)).all())
 
-    def _shape_text(self) -> str:
+    def _shape_text(self, count: int | None) -> str:
         names = ", ".join(f"{c.name} ({c.size})" if c.size > 1 else c.name for c in self._channels)
-        return f"an array of {len(self.lower)} numbers: {names}"
+        return f"{'an action takes' if count is None else f'{count} environments take'} numbers for {names}"
 
-    def _refusal(self, array: Array, where: str) -> str:
+    def _refusal(self, array: Array) -> str:
         rows = array.reshape(-1, len(self.lower))
         row, index = np.argwhere(~((rows >= self._lowest) & (rows <= self._highest)))[0].tolist()
         channel, entries = next((c, s) for c, s in self.parts() if index < s.stop)
@@ -137,7 +138,7 @@ class Channels:
             else "clip it, as gymnasium.wrappers.ClipAction does, or rescale it, as RescaleAction does"
         )
         of_row = f"environment {row}: " if array.ndim > 1 else ""
-        return f"{where}{of_row}the action's entry {channel.entry_text(place)} is {value:g}, not in {allowed}: {remedy}"
+        return f"{of_row}the action's entry {channel.entry_text(place)} is {value:g}, not in {allowed}: {remedy}"
 
 
 def action_channels(testbed: VirtualTestbed, action: Action) -> Channels:

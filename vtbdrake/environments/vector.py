@@ -82,12 +82,7 @@ class TestbedVectorEnv(gymnasium.vector.VectorEnv[Array, Array, Array]):
 
     def _checked(self, actions: Any) -> Array:
         """Return the actions of all environments, shape (num_envs, size)."""
-        checked = self._actions.checked(actions, where="")
-        if checked.shape != self.action_space.shape:
-            raise ValueError(
-                f"{self.num_envs} environments take actions of the shape {self.action_space.shape}, not {checked.shape}"
-            )
-        return checked
+        return self._actions.checked(actions, count=self.num_envs)
 
 
 def checked_count(num_envs: int) -> int:
