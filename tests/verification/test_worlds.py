@@ -284,16 +284,16 @@ SOLVERS = ["sap", "lagged", "sap, compiled", "lagged, compiled"]
 def test_load_hits_a_stop(verify: Verify, settings: str) -> None:
     """Stop of a joint: a load of 1 kg slides at 1 m/s on a resting cart of 2 kg, and hits a stop of its joint.
 
-        m_load v = (m_cart + m_load) v',   and the load stays at the stop: it rebounds by less than e^-2 in a step
+        m_load v = (m_cart + m_load) v',   and the load rests against the cart, at the stop
 
-    Drake's stops are near-rigid and dissipate within a time step. Reference: the plastic impact: v' = 1/3 m/s.
-    Tolerance: rounding for the momentum; for the velocity of the load against the cart, 1e-3 m/s, 0.2 s after the hit.
+    Drake's stops are near-rigid, and dissipate within some time steps. Reference: the plastic impact, v' = 1/3 m/s, 0.2 s
+    after the hit. Tolerance: rounding.
     """
     run = Run(_with_contact(Carts, settings), {"load_slider.velocity": 1.0}).to(0.3)
     cart, load = float(run["cart_slider.velocity"]), float(run["load_slider.velocity"])
     verify("momentum", 2.0 * cart + (cart + load), 1.0, tolerance=1e-12, unit="N s")
-    verify("velocity of the cart", cart, 1.0 / 3.0, tolerance=1e-3, unit="m/s")
-    verify("position of the load", float(run["load_slider.position"]), 0.1, tolerance=1e-3, unit="m")
+    verify("velocity of the cart", cart, 1.0 / 3.0, tolerance=1e-12, unit="m/s")
+    verify("position of the load", float(run["load_slider.position"]), 0.1, tolerance=1e-12, unit="m")
 
 
 @pytest.mark.parametrize("settings", SOLVERS)
