@@ -52,7 +52,9 @@ def export_fmu(
     kind: str,
     step: float | None,
 ) -> None:
-    """Write a testbed, its DPS or its world as an FMU: FMI 3.0, co-simulation.
+    """Write a testbed, its DPS or its world as an FMU.
+
+    The FMU is for co-simulation by FMI 3.0.
 
     Without --input, the inputs are the commands u, the sensor signals of the DPS alone, and the actuator signals of the
     world alone. Without --output, the outputs are the actuator signals of the DPS, and the sensor signals of the world.
