@@ -390,8 +390,8 @@ def test_the_process_of_a_coupled_fmu_ends_with_it_and_its_death_is_an_error(cou
         assert "the Python process of the FMU has ended" in said[-1]
     with slave(coupled, {}) as (instance, reference, _):
         steps(instance, reference, 0, 1)
-        assert len(children() - before) == 1
-    assert children() == before
+        (child,) = children() - before
+    assert child not in children()
 
 
 @pytest.mark.slow
