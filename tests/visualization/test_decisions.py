@@ -7,10 +7,18 @@ from pydrake.geometry import Meshcat
 
 from tests.reasoning.scenarios import MassScenario, SwingUpScenario
 from tests.visualization.meshcat_page import messages
+from tests.visualization.scenes.reading import read_mcap
 from vtbdrake.optimization import Parameter
 from vtbdrake.reasoning import Belief, Budget, Reasoner, SearchConfig
 from vtbdrake.rollout import Constraint, Quality
-from vtbdrake.visualization import make_meshcat, plot_decision, show_decision, show_poses
+from vtbdrake.visualization import (
+    decision_ghosts,
+    make_meshcat,
+    plot_decision,
+    show_decision,
+    show_poses,
+    write_scene,
+)
 
 ANGLE = "sim.sys.Pendulum.theta.position"
 UPRIGHT = Quality(lambda q: 1.0 - np.cos(q), of=ANGLE)
@@ -126,3 +134,24 @@ def test_a_scene_without_instants_or_candidates_is_refused(swung_up, meshcat):
         show_decision(meshcat, reasoner, decision, most=0)
     with pytest.raises(ValueError, match="at one instant at least, not at 0"):
         show_poses(meshcat, {"swing": reasoner.motion(decision, 1)}, count=0)
+
+
+def test_candidates_are_ghosts_in_a_scene_in_their_colours(swung_up, tmp_path):
+    reasoner, decision = swung_up
+    write_scene(decision_ghosts(reasoner, decision, most=3), tmp_path / "decision.mcap")
+    messages = read_mcap(tmp_path / "decision.mcap")
+    scenes = {
+        topic.split("/")[1]: message.entities
+        for topic in messages
+        for _, message in messages[topic][:1]
+        if topic.endswith("/scene")
+    }
+    assert len(scenes) == 3 and str(decision.chosen) in scenes and "0 (plan in use)" in scenes
+    opacities = {}
+    for label, entities in scenes.items():
+        [arm] = [entity for entity in entities if entity.id == f"{label}/Pendulum/arm"]
+        opacities[label] = arm.cylinders[0].color.a
+        motion = reasoner.motion(decision, int(label.partition(" ")[0]))
+        positions = [message.joints[0].position for _, message in messages[f"/{label}/joint_states"]]
+        assert positions == motion.states[:, 0].tolist()
+    assert opacities == pytest.approx({label: 1.0 if label == str(decision.chosen) else 0.35 for label in scenes})

@@ -239,10 +239,18 @@ def _boxes(inspector: SceneGraphInspector, frame: FrameId) -> NDArray[np.float64
     """Return the corners of the boxes around the shapes of a frame, in that frame, shape (3, n)."""
     corners = [np.empty((3, 0))]
     for geometry in inspector.GetGeometries(frame, Role.kIllustration):
-        if (box := CalcObb(inspector.GetShape(geometry))) is not None:
-            X_FB = inspector.GetPoseInFrame(geometry) @ box.pose()
-            corners.append(X_FB @ (_CORNERS * box.half_width()).T)
+        corners.append(inspector.GetPoseInFrame(geometry) @ box_corners(inspector.GetShape(geometry)))
     return np.hstack(corners)
+
+
+def box_corners(shape: Shape) -> NDArray[np.float64]:
+    """Return the corners of the box around a shape, in its own frame in m, shape (3, 8); (3, 0) if it has no end.
+
+    Args:
+        shape: The shape.
+    """
+    box = CalcObb(shape)
+    return np.empty((3, 0)) if box is None else box.pose() @ (_CORNERS * box.half_width()).T
 
 
 def is_anchored(plant: MultibodyPlant | None, frame: FrameId) -> bool:

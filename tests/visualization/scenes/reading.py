@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
-from rerun.chunk import RrdReader
+from rerun.chunk import McapReader, RrdReader
 
 WORLD = "world"
 
@@ -61,7 +61,7 @@ class Recording:
     """A recording of Rerun: columns by entity; static ones have one row.
 
     Args:
-        path: Its file.
+        path: Its file, or one of MCAP, which Rerun imports.
 
     Raises:
         RuntimeError: The file ends in the middle of a message.
@@ -70,7 +70,7 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self._times: dict[tuple[str, str], list[int]] = defaultdict(list)
         self.rows: dict[tuple[str, str], list[Any]] = defaultdict(list)
-        for chunk in RrdReader(path).stream():
+        for chunk in (McapReader if path.suffix == ".mcap" else RrdReader)(path).stream():
             batch, entity = chunk.to_record_batch(), str(chunk.entity_path).removeprefix("/")
             times = batch.column("time").cast("int64").to_pylist() if "time" in batch.schema.names else []
             for name in batch.schema.names:

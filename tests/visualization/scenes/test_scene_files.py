@@ -15,6 +15,7 @@ from tests.visualization.scenes.shapes import CAMERA, SHAPES, X_LINK, ShapesScen
 from vtbdrake.components.ray_casting import shape_surface
 from vtbdrake.state.systems import leaves
 from vtbdrake.visualization import SceneWriter
+from vtbdrake.visualization.scenes import SceneModel
 
 RATE = 10.0
 END = 0.45
@@ -42,6 +43,7 @@ class Written:
     truth: Truth
     messages: dict[str, list[tuple[int, Any]]]
     recording: Recording
+    imported: Recording  # the MCAP, as Rerun imports it
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +86,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
             note()
     done = {name: np.array(values) for name, values in columns.items()}
     truth = Truth(truth.times, truth.poses, **done, images=truth.images, points=truth.points, X_WC=truth.X_WC)
-    return Written(truth, read_mcap(folder / "run.mcap"), Recording(folder / "run.rrd"))
+    return Written(truth, read_mcap(folder / "run.mcap"), Recording(folder / "run.rrd"), Recording(folder / "run.mcap"))
 
 
 def close(X: RigidTransform, Y: RigidTransform, tolerance: float = 1e-12) -> bool:
@@ -107,6 +109,18 @@ def test_transforms_of_rerun_are_drakes_poses(written: Written) -> None:
     for time, expected in zip(written.truth.times, written.truth.poses, strict=True):
         for body, path in paths.items():
             assert close(written.recording.world_pose(path, time), expected[body], 1e-6), body  # 32 bits
+
+
+def test_rerun_imports_the_transforms_of_the_mcap(written: Written) -> None:
+    rows = {
+        name: written.imported.array("tf", f"Transform3D:{name}").tolist()
+        for name in ("child_frame", "parent_frame", "translation")
+    }
+    sent = [each for _, message in written.messages["/tf"] for each in message.transforms]
+    assert rows["child_frame"] == [each.child_frame_id for each in sent]
+    assert rows["parent_frame"] == [each.parent_frame_id for each in sent]
+    expected = [[each.translation.x, each.translation.y, each.translation.z] for each in sent]
+    assert np.array(rows["translation"]) == pytest.approx(np.array(expected), abs=1e-6)
 
 
 def entity(written: Written, frame: str) -> Any:
@@ -227,3 +241,15 @@ def test_joints_signals_and_recorded_variables_are_the_testbeds(written: Written
         assert recording.times(topic, "Scalars:scalars") == truth.times
     assert recording.rows["sense/joint_position", "SeriesLines:names"] == [["turn", "slide"]]
     assert [each["value"] for _, each in messages["/variable/sim.sense.scanner.frequency"]] == [[10.0]] * 5
+
+
+def test_a_viewer_begins_with_all_that_moves_in_view() -> None:
+    testbed = ShapesScenario().build()
+    context = testbed.default_context()
+    camera = SceneModel(testbed).fitting_camera(context)
+    assert camera is not None
+    plant_context = testbed.plant.GetMyContextFromRoot(context)
+    for body in ("link", "slider", "tool", "ball"):
+        X_WB = testbed.plant.EvalBodyPoseInWorld(plant_context, testbed.plant.GetBodyByName(body))
+        x, y, z = camera.pose.inverse() @ X_WB.translation()
+        assert z > 0.0 and max(abs(x), abs(y)) < np.tan(np.deg2rad(37.5)) * z

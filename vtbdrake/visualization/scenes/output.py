@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pydrake.systems.sensors import CameraInfo
 
     from vtbdrake.visualization.scenes.scene_model import SceneFrame
+    from vtbdrake.visualization.viewpoint import Viewpoint
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,13 @@ class SceneOutput(Closing, ABC):
             time: The time at which they appear.
             frames: All frames of the scene; each one stands after its parent.
             fixed: Those that do not move in their parents, with their poses there.
+        """
+
+    def look_from(self, camera: Viewpoint) -> None:
+        """Let viewers begin with a camera, if what is written can say so.
+
+        Args:
+            camera: The camera.
         """
 
     @abstractmethod

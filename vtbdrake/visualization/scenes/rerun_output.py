@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pydrake.math import RigidTransform
 
     from vtbdrake.visualization.scenes.scene_model import SceneFrame, VisualShape
+    from vtbdrake.visualization.viewpoint import Viewpoint
 
 RERUN_PORT = 9876
 """The port at which Rerun's viewer looks for a server by default."""
@@ -82,6 +83,7 @@ class _RerunOutput(SceneOutput):
         self._stream.set_sinks(sink)
         self._paths = {WORLD: WORLD}  # of the entities, by frame
         self._buffers: dict[str, _Rows] = {}
+        self._has_camera = False
         self._instants = 0
         self._last: int | None = None
         self._pinholes: dict[str, tuple[Any, ...]] = {}
@@ -155,6 +157,16 @@ class _RerunOutput(SceneOutput):
                 break
             parts = parts[1:]
         return "/".join([self._paths[frame.parent], *map(self._rr.escape_entity_path_part, parts)])
+
+    def look_from(self, camera: Viewpoint) -> None:
+        """Show the world large, from a camera, and other views in tabs beside it; the first scene counts."""
+        if self._has_camera:
+            return
+        self._has_camera = True
+        views = extra_module("rerun.blueprint", purpose="a scene for Rerun", extra="rerun")
+        eye = views.EyeControls3D(position=camera.position, look_target=camera.target, eye_up=(0.0, 0.0, 1.0))
+        world = views.Spatial3DView(origin=WORLD, name=WORLD, eye_controls=eye)
+        self._stream.send_blueprint(views.Blueprint(world, auto_views=True, auto_layout=True))
 
     def write_poses(self, topic: str, time: int, frames: Sequence[SceneFrame], poses: Sequence[RigidTransform]) -> None:
         for frame, pose in zip(frames, poses, strict=True):

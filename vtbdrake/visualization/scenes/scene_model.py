@@ -13,7 +13,8 @@ from pydrake.geometry import FrameId, HalfSpace, Role
 from pydrake.math import RigidTransform
 
 from vtbdrake.visualization.cameras import camera_view, cameras
-from vtbdrake.visualization.drawing import Parts, illustration_color, is_anchored, tinted_color
+from vtbdrake.visualization.drawing import Parts, box_corners, illustration_color, is_anchored, tinted_color
+from vtbdrake.visualization.viewpoint import Viewpoint, fitting_camera
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 WORLD = "world"
 """The name of the world frame, the root of all frames."""
+
+# What moves gets a field of view that is larger than it needs by this factor: Rerun's is narrower than Meshcat's.
+_ROOM = 2.5
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,22 @@ class SceneModel:
             name: The name of the stream within the scene.
         """
         return f"/{self._below(name)}"
+
+    def fitting_camera(self, context: Context) -> Viewpoint | None:
+        """Return a camera that shows what moves in the world; None if nothing does.
+
+        Args:
+            context: A root context of the testbed.
+        """
+        poses, moving = {WORLD: RigidTransform()}, set[str]()
+        corners = [np.empty((3, 0))]
+        for frame in self.frames:
+            poses[frame.name] = X_WF = poses[frame.parent or WORLD] @ frame.pose(context)
+            if frame.moves or frame.parent in moving:
+                moving.add(frame.name)
+                corners += [X_WF @ visual.X_FG @ box_corners(visual.shape) for visual in frame.shapes]
+        points_W = np.hstack(corners)
+        return fitting_camera(points_W, margin=_ROOM) if points_W.size and np.isfinite(points_W).all() else None
 
     def joint_state(self, context: Context) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions and velocities of `joints`, shape (n,) each, in rad or m and their rates.

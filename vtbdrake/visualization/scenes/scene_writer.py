@@ -167,6 +167,8 @@ class SceneWriter(Closing):
         if self._last_time is None:
             fixed = [(frame, frame.pose(context)) for frame in self.model.frames if not frame.moves]
             self.output.add_frames(self.model.topic("scene"), time, self.model.frames, fixed)
+            if (camera := self.model.fitting_camera(context)) is not None:
+                self.output.look_from(camera)
         elif time < self._last_time:
             self.output.restart()
         self._last_time = time
