@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, DiscreteValues, System
 
 import vtbdrake as vtb
 from tests.environments.scenarios import BALANCING, COST, POLE, SIGNALS, START, falling
 from tests.rollout.nonfinite import NonfiniteScenario
-from tests.testbeds import PendulumScenario
+from tests.testbeds import AcrobotScenario, PendulumScenario, SampledFeedback
 from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.environments import ActionError, FailedEpisodeError, TestbedEnv
 from vtbdrake.state import SnapshotError
@@ -277,6 +278,31 @@ def test_a_failed_simulation_is_an_error_or_terminates_with_what_it_is_worth() -
     observation, reward, terminated, truncated, info = ends[-1]
     assert (reward, terminated, truncated) == (-10.0, True, False) and "finite" in info["failure"]
     assert np.isfinite(observation).all() and [end[1] for end in ends[:-1]] == [1.0] * (len(ends) - 1)
+
+
+class Interrupted(SampledFeedback):
+    """Fails as pydrake lets it fail when it has dropped a Ctrl-C."""
+
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+        if context.get_time() > 0.05:
+            raise TypeError("incompatible function arguments")
+
+
+@dataclass
+class InterruptedScenario(AcrobotScenario):
+    """An acrobot with such a DPS."""
+
+    def make_dps(self) -> System:
+        return Interrupted(self.period)
+
+
+def test_an_interruption_that_pydrake_drops_is_no_outcome() -> None:
+    reward = vtb.Reward(lambda state: 1.0, of="plant.state")
+    signals: dict[str, Any] = {"action": ["torque"], "observation": ["joint_state"], "reward": reward}
+    env = vtb.gymnasium_env(InterruptedScenario(), **signals, period=0.1, horizon=1.0, failure_reward=-1.0)
+    env.reset()
+    with pytest.raises(FailedEpisodeError, match="in step 1, after .*TypeError: incompatible function arguments"):
+        env.step([0.0])
 
 
 def test_a_state_of_something_else_is_refused(env: TestbedEnv) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +13,6 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from vtbdrake.common.arrays import Array
-from vtbdrake.drake_workarounds.lost_interrupts import Interruptible
 from vtbdrake.environments.episodes import Episodes, FailedEpisodeError, seed_addresses
 from vtbdrake.environments.rewards import first_score, next_score, step_reward
 from vtbdrake.environments.spaces import (
@@ -80,8 +78,6 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self._can_terminate = len(episodes.measures) > 1 or episodes.task.threshold is not None
         self._variables = self.testbed.variables()
         self._seeds = seed_addresses(self._variables)
-        # Without a system in Python, pydrake has nothing to convert, and loses no Ctrl-C.
-        self._interruptible = Interruptible() if self.testbed.python_systems else nullcontext()
         self._samples: Iterator[float] = iter(())
         self._needs_reset = "the environment is new"
         self._step, self._begun = 0, 0.0
@@ -136,7 +132,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
         Raises:
             ActionError: The action has another shape, is not finite, or lies beyond the limits; nothing happened.
-            FailedEpisodeError: The simulation fails, and there is no ``failure_reward``.
+            FailedEpisodeError: The simulation fails, and there is no ``failure_reward``, or it fails by a TypeError.
             ResetNeeded: The episode has ended, or none has begun.
         """
         if self._needs_reset:
@@ -145,8 +141,7 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         score, self._step = self._score, self._step + 1
         terminated, info = False, {}
         try:
-            with self._interruptible:
-                terminated = self._advance()
+            terminated = self._advance()
         except SimulationError as failure:
             return self._failed(action, failure)
         except BaseException:
@@ -215,9 +210,8 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     def _first_sample(self) -> float:
         try:
-            with self._interruptible:
-                self._time = next(self._samples)
-                return self._runner.measured(self._time)[self._place]
+            self._time = next(self._samples)
+            return self._runner.measured(self._time)[self._place]
         except SimulationError as failure:
             raise FailedEpisodeError(f"the simulation fails at the start of an episode: {failure}") from failure
 
@@ -244,7 +238,9 @@ class TestbedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     def _failed(self, action: Any, failure: SimulationError) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         self._needs_reset = "the simulation has failed"
-        if self.episodes.failure_reward is None:
+        # While a system in Python runs, pydrake may make a TypeError of a Ctrl-C (`drake_workarounds.lost_interrupts`):
+        # that is no outcome.
+        if self.episodes.failure_reward is None or isinstance(failure.__cause__, TypeError):
             raise FailedEpisodeError(
                 f"the simulation fails in step {self._step}, after the action {np.asarray(action).tolist()}: {failure}"
                 "; or say what that is worth, failure_reward=number, and the episode terminates"
