@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import NonSeekingReader
 from pydrake.geometry import Mesh
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -148,6 +149,9 @@ def test_log_has_its_world_by_replay_and_its_signals_at_all_times(log: ControlLo
     # Signals of a simulated world are not in the log, but in its replay.
     assert [time for time, _ in messages["/sense/joint_position"]] == times
     assert len(messages["/cycle/ok"]) == 60
+    with (tmp_path / "run.mcap").open("rb") as file:
+        in_file = [message.log_time for *_, message in NonSeekingReader(file).iter_messages(log_time_order=False)]
+    assert in_file == sorted(in_file)
 
 
 def test_log_without_its_world_has_signals_and_events(tmp_path: Path) -> None:

@@ -64,8 +64,8 @@ class _Choice:
 
     def writer(self, testbed: VirtualTestbed, output: SceneOutput, **options: Any) -> SceneWriter:
         """Return a writer of a testbed."""
-        chosen: dict[str, Any] = {"images": self.images, "record": self.record} | options
-        return SceneWriter(testbed, output, rate=self.rate, **chosen)
+        arguments: dict[str, Any] = {"images": self.images, "record": self.record} | options
+        return SceneWriter(testbed, output, rate=self.rate, **arguments)
 
     def due(self, times: np.ndarray) -> list[int]:
         """Return the numbers of the samples that are written: at most ``rate`` per second, and the last one."""
