@@ -21,10 +21,11 @@ from tests.visualization.scenes.shapes import ShapesScenario
 from vtbdrake.control.clock import SimulatedClock
 from vtbdrake.control.runtime import Runtime
 from vtbdrake.optimization import Motion, Parameter, Problem
-from vtbdrake.recording import ControlLog, LogError, Recorder, read_log, read_table
+from vtbdrake.recording import ControlLog, LogError, Recorder, feed, read_log, read_table
 from vtbdrake.rollout import Quality, RolloutTask
-from vtbdrake.visualization import write_rollout, write_scene
+from vtbdrake.visualization import log_motion, write_rollout, write_scene
 from vtbdrake.visualization.scenes.scene_meshes import triangle_mesh
+from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
 ANGLE = "sim.sys.arm.turn.position"
 PERIOD = 0.01
@@ -152,6 +153,18 @@ def test_log_has_its_world_by_replay_and_its_signals_at_all_times(log: ControlLo
     with (tmp_path / "run.mcap").open("rb") as file:
         in_file = [message.log_time for *_, message in NonSeekingReader(file).iter_messages(log_time_order=False)]
     assert in_file == sorted(in_file)
+
+
+def test_log_of_a_dps_alone_shows_the_world_that_it_believed_in(tmp_path: Path) -> None:
+    times = 0.02 * np.arange(20)
+    columns = {"time": times, "q": np.column_stack([0.1 * times, 3.0 + np.sin(times)]), "v": np.zeros((20, 2))}
+    machine = read_table(columns, sense={"joint_position": "q", "joint_velocity": "v"})
+    log = feed(machine, CartPoleScenario(), tmp_path / "fed.lcm")
+    write_scene(log, tmp_path / "fed.mcap", rate=1000.0)
+    messages = read_mcap(tmp_path / "fed.mcap")
+    positions = [[joint.position for joint in each.joints] for _, each in messages["/joint_states"]]
+    assert np.array_equal(positions, log_motion(log).states[:, :2])
+    assert positions[-1] == pytest.approx([0.038, 3.0 + np.sin(0.38)], abs=0.02)
 
 
 def test_log_without_its_world_has_signals_and_events(tmp_path: Path) -> None:
