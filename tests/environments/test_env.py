@@ -25,6 +25,7 @@ from vtbdrake.components.sensors import ErrorModel
 from vtbdrake.environments import ActionError, FailedEpisodeError, TestbedEnv
 from vtbdrake.state import SnapshotError
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
+from vtbdrake_diagrams.space_climber import SpaceClimberScenario
 
 NOISE = ErrorModel(noise=0.01, drift=0.01)
 NOISY = CartPoleScenario(position_errors=NOISE, velocity_errors=NOISE)
@@ -184,6 +185,27 @@ def test_branches_of_an_integrator_with_error_control_are_bit_identical() -> Non
     expected = steps(env, torques[7:])
     env.restore(state)
     assert_equal(steps(env, torques[7:]), expected)
+
+
+@pytest.mark.slow
+def test_branches_of_a_walking_robot_are_bit_identical() -> None:
+    pitch = "sim.sys.climber.base.pitch"
+    env = vtb.gymnasium_env(
+        SpaceClimberScenario(),
+        action=["heading", "walk"],
+        observation=["imu", "joint_encoders", "foot_contact"],
+        reward=vtb.Reward(lambda angle: -abs(angle), of=pitch),
+        period=0.1,
+        horizon=1.0,
+    )
+    env.reset(seed=0)
+    commands = [[0.05 * k, 1.0] for k in range(10)]
+    steps(env, commands[:5])
+    state = env.state()
+    expected = steps(env, commands[5:])
+    assert np.ptp([step[0] for step in expected], axis=0).max() > 0.1  # It moves.
+    env.restore(state)
+    assert_equal(steps(env, commands[5:]), expected)
 
 
 def test_reset_takes_a_condition_values_and_a_snapshot() -> None:
