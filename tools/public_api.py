@@ -69,7 +69,7 @@ def stub(item: griffe.Object, name: str, indent: str) -> Iterator[str]:
         if item.parent.is_class and "staticmethod" not in item.labels:
             rest = f"{item.parameters[0].name}{'' if rest.startswith(')') else ', '}{rest}"  # griffe leaves it out
         yield f"{indent}def {start}({rest}: ..."
-    else:
+    elif not item.is_module:  # A module that a package lists has a class of its own.
         yield f"{indent}{name}: {item.annotation or 'Any'}"
 
 
