@@ -1,6 +1,6 @@
 """Reinforcement learning: a policy learns to balance the pole, in compiled environments of Gymnasium.
 
-``python -m vtbdrake_diagrams.cart_pole.training balance.onnx`` trains it, and writes the file.
+``python -m vtbdrake_diagrams.cart_pole.training trained.onnx`` trains it, and writes the file.
 """
 
 from __future__ import annotations
@@ -116,4 +116,4 @@ def train(*, generations: int = 40, population: int = 32, starts: int = 4, seed:
 
 
 if __name__ == "__main__":
-    write(train(), sys.argv[1])
+    write(train(), *(sys.argv[1:] or ["trained.onnx"]))
