@@ -31,8 +31,10 @@ _OF_A_STEP = ("reaction_forces", "contact_results", "net_actuation")
 
 # The name of the present step, which several outputs share with the update.
 _STEP = "step"
-# Iterations take the same path as Drake's, on which rounding grows where a problem is nearly degenerate.
-_AGREEMENT_OF_SOLVER = 1e-5
+# Iterations take the same path as Drake's: with stops and drives, whose problem is linear in pieces, up to rounding.
+_AGREEMENT_OF_SOLVER = 1e-10
+# With contact, rounding grows on the path where the problem is nearly degenerate.
+_AGREEMENT_IN_CONTACT = 1e-5
 # The portals in which MPR ends differ with rounding, by 1e-7 m of depth and at a shallow depth by 1e-3 of the normal.
 _AGREEMENT_OF_ITERATED_PAIRS = 1e-3
 
@@ -105,7 +107,9 @@ class PlantEquations(Equations):
                 raise refusal(self._plant, f"has {part}, whose solver is written in C: {error}") from None
             self.doubtful = "a joint reaches a stop, which is compiled only where there is a C compiler"
             return None
-        self.agreement = _AGREEMENT_OF_ITERATED_PAIRS if self._contact.is_iterated() else _AGREEMENT_OF_SOLVER
+        self.agreement = _AGREEMENT_OF_SOLVER
+        if pairs:
+            self.agreement = _AGREEMENT_OF_ITERATED_PAIRS if self._contact.is_iterated() else _AGREEMENT_IN_CONTACT
         return solver
 
     def output(self, port: str, at: At) -> Expression:
