@@ -153,6 +153,7 @@ def test_bad_input_is_one_line(path: Path, tmp_path: Path) -> None:
             ("replay", path, "--scenario", "tests.testbeds:PendulumScenario"),
             "is of the scenario tests.control.scripted",
         ),
+        (("export", path, tmp_path / "run.csv", "--no-images"), "go with a scene (.mcap or .rrd), not with .csv"),
         (("export", path, tmp_path / "run.xls"), "ends in .csv or .parquet or .mcap or .rrd"),
     ]:
         assert expected in error_of(*arguments)

@@ -171,11 +171,11 @@ def _parse_export(text: str) -> Path:
     parse=parse_scenario,
 )
 @option(
-    "--rate HZ", "States of the world per second in a scene.", type=click.FloatRange(0.0, min_open=True), default=30.0
+    "--rate HZ", "States of the world per second in a scene; 30 by default.", type=click.FloatRange(0.0, min_open=True)
 )
-@option("--images/--no-images", "Whether a scene has images and scans.", default=True)
+@option("--no-images", "Leave images and scans out of a scene.", is_flag=True)
 @json_option
-def export(log: Path, out: Path, scenario: Scenario | None, rate: float, images: bool) -> None:
+def export(log: Path, out: Path, scenario: Scenario | None, rate: float | None, no_images: bool) -> None:
     """Write a LOG as CSV or Parquet, or as a scene for Foxglove (MCAP) or Rerun (.rrd).
 
     The suffix of OUT says which. A scene has the signals and events of the log. With --scenario, whose code runs, it
@@ -192,11 +192,15 @@ def export(log: Path, out: Path, scenario: Scenario | None, rate: float, images:
     from vtbdrake.recording import Log, read_log
     from vtbdrake.recording.export import export as export_log
 
+    if out.suffix not in _SCENES and (rate is not None or no_images):
+        raise click.UsageError(
+            f"--rate and --no-images go with a scene ({' or '.join(_SCENES)}), not with {out.suffix}"
+        )
     opened = read_log(log) if scenario is None else opened_log(log, scenario)
     if out.suffix in _SCENES:
         from vtbdrake.visualization import write_scene
 
-        write_scene(opened, out, rate=rate, images=images, world=scenario is not None)
+        write_scene(opened, out, rate=rate or 30.0, images=not no_images, world=scenario is not None)
     else:
         export_log(opened, out)
     if isinstance(opened, Log):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -253,3 +254,13 @@ def test_a_viewer_begins_with_all_that_moves_in_view() -> None:
         X_WB = testbed.plant.EvalBodyPoseInWorld(plant_context, testbed.plant.GetBodyByName(body))
         x, y, z = camera.pose.inverse() @ X_WB.translation()
         assert z > 0.0 and max(abs(x), abs(y)) < np.tan(np.deg2rad(37.5)) * z
+
+
+def test_images_and_scans_can_be_left_out_and_times_begin_at_zero(tmp_path: Path) -> None:
+    testbed = ShapesScenario(sensors=True).build()
+    context = testbed.default_context()
+    with SceneWriter(testbed, tmp_path / "run.mcap", images=False, without=["sense/joint_position"]) as writer:
+        writer.write(context)
+        with pytest.raises(ValueError, match=r"a scene has no times before 0, unlike -1 s: give time=, in ns"):
+            writer.write(context, time=-(10**9))
+    assert set(read_mcap(tmp_path / "run.mcap")) == {"/tf", "/tf_static", "/scene", "/joint_states", "/command/drive"}

@@ -81,8 +81,8 @@ class SceneWriter(Closing):
         output: Where it is written to: a path (.mcap or .rrd), or an open output, which stays open.
         model: What is drawn; None: all that the testbed has, beneath the world.
         rate: States per second that `monitor` writes, of simulated time.
-        images: Whether images of cameras are written.
-        signals: Whether signals and scans are written.
+        images: Whether images of cameras and scans of laser scanners are written.
+        signals: Whether signals are written.
         record: Addresses of variables and vector ports that are written, too.
         without: Streams of signals that are left out, ``sense/position``.
 
@@ -119,7 +119,7 @@ class SceneWriter(Closing):
         self.model = model or SceneModel(testbed)
         self._moving = [frame for frame in self.model.frames if frame.moves]
         self._cameras = self.model.cameras if images else {}
-        self._scanners = _scanners(testbed) if signals else {}
+        self._scanners = _scanners(testbed) if images else {}
         self._shown: dict[str, Any] = {}  # the newest image and scan, by stream
         self._is_own = not isinstance(output, SceneOutput)
         self.output = output if isinstance(output, SceneOutput) else open_scene_file(output)
@@ -143,9 +143,14 @@ class SceneWriter(Closing):
             context: A root context of the testbed, from which the signals are read.
             world: The root context of the world, if that is another one, without images and scans: the world that a
                 DPS believes in, for example.
-            time: The time in ns; None: the one of the context.
+            time: The time in ns, at least 0; None: the one of the context.
+
+        Raises:
+            ValueError: The time is negative.
         """
         at = round(1e9 * context.get_time()) if time is None else time
+        if at < 0:
+            raise ValueError(f"a scene has no times before 0, unlike {1e-9 * at:g} s: give time=, in ns")
         self._begin(at, world or context)
         model, output = self.model, self.output
         if self._moving:
