@@ -23,7 +23,7 @@ from vtbdrake.control.runtime import Runtime
 from vtbdrake.optimization import Motion, Parameter, Problem
 from vtbdrake.recording import ControlLog, LogError, Recorder, feed, read_log, read_table
 from vtbdrake.rollout import Quality, RolloutTask
-from vtbdrake.visualization import log_motion, write_rollout, write_scene
+from vtbdrake.visualization import SceneWriter, log_motion, write_rollout, write_scene
 from vtbdrake.visualization.scenes.scene_meshes import triangle_mesh
 from vtbdrake_diagrams.cart_pole import CartPoleScenario
 
@@ -227,6 +227,16 @@ def test_bad_arguments_are_refused_and_nothing_is_written(log: ControlLog, tmp_p
         with pytest.raises(ValueError, match=message):
             write_scene(source, tmp_path / path, **options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".rrd"])
+def test_file_that_cannot_be_written_is_an_error_of_the_file(tmp_path: Path, suffix: str) -> None:
+    motion = Motion(AcrobotScenario(), np.array([0.0]), np.zeros((1, 4)))
+    path = tmp_path / "nowhere" / f"run{suffix}"
+    with pytest.raises(FileNotFoundError, match=r"No such file or directory, nothing was written: .*nowhere/run"):
+        write_scene(motion, path)
+    with pytest.raises(FileNotFoundError, match="nowhere/run"):
+        SceneWriter(AcrobotScenario().build(), path)
 
 
 @pytest.mark.parametrize(

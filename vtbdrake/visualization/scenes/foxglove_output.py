@@ -6,13 +6,14 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vtbdrake.common.extras import extra_module
 from vtbdrake.common.json_data import plain
-from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput
+from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput, errors_of_file
 from vtbdrake.visualization.scenes.ports import loopback_port
 from vtbdrake.visualization.scenes.scene_meshes import triangle_mesh
 
@@ -180,11 +181,17 @@ class FoxgloveFile(_FoxgloveOutput):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__()
         self.address = os.fspath(path)
+        Path(path).write_bytes(b"")  # An error names the file and the reason.
         self._writer = foxglove_sdk().open_mcap(self.address, allow_overwrite=True, context=self._context)
 
     def close(self) -> None:
-        """Write the file's index."""
-        self._writer.close()
+        """Write the file's index.
+
+        Raises:
+            OSError: The file could not be written.
+        """
+        with errors_of_file(self.address):
+            self._writer.close()
 
 
 class FoxgloveServer(_FoxgloveOutput):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from vtbdrake.common.closing import Closing
+from vtbdrake.common.failures import one_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +39,19 @@ class CameraImage:
     info: CameraInfo
     kind: str
     pixels: NDArray[np.uint8] | NDArray[np.float32]
+
+
+@contextmanager
+def errors_of_file(path: str) -> Iterator[None]:
+    """Let an error that the library of a viewer raises about a file be an OSError of the file.
+
+    Args:
+        path: The file.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(errno.EIO, one_line(error), path) from error
 
 
 class SceneOutput(Closing, ABC):

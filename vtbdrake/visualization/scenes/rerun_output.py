@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import time_ns as wall_time_ns
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vtbdrake.common.extras import extra_module
-from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput
+from vtbdrake.visualization.scenes.output import CameraImage, SceneOutput, errors_of_file
 from vtbdrake.visualization.scenes.ports import loopback_port
 from vtbdrake.visualization.scenes.scene_meshes import triangle_mesh
 from vtbdrake.visualization.scenes.scene_model import WORLD
@@ -87,7 +88,7 @@ class _RerunOutput(SceneOutput):
         self._instants = 0
         self._last: int | None = None
         self._pinholes: dict[str, tuple[Any, ...]] = {}
-        self._stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
 
     # -- rows
 
@@ -109,7 +110,7 @@ class _RerunOutput(SceneOutput):
     def _send(self) -> None:
         for entity, rows in self._buffers.items():
             if rows.times:
-                self._stream.send_columns(entity, self._times(rows), rows.send(rows.rows))
+                self._stream.send_columns(entity, self._times(rows), rows.send(rows.rows), strict=True)
                 rows.times, rows.walls, rows.rows = [], [], []
         self._instants = 0
 
@@ -131,7 +132,7 @@ class _RerunOutput(SceneOutput):
         self._stream.set_time(_TIMELINE, **self._instant(np.int64(time)))
         if self.is_live:
             self._stream.set_time(_WALL_TIMELINE, timestamp=np.datetime64(wall_time_ns(), "ns"))
-        self._stream.log(entity, *archetypes)
+        self._stream.log(entity, *archetypes, strict=True)
 
     # -- what is written
 
@@ -144,10 +145,10 @@ class _RerunOutput(SceneOutput):
                 self._paths[frame.name] = self._path(frame)
             for visual in frame.shapes:
                 place = f"{self._paths[frame.name]}/{rr.escape_entity_path_part(visual.name)}"
-                self._stream.log(place, *_SHAPES[type(visual.shape).__name__](rr, visual), static=True)
+                self._stream.log(place, *_SHAPES[type(visual.shape).__name__](rr, visual), static=True, strict=True)
         for frame, pose in fixed:
             if frame.parent:
-                self._stream.log(self._paths[frame.name], _transform(rr, pose), static=True)
+                self._stream.log(self._paths[frame.name], _transform(rr, pose), static=True, strict=True)
 
     def _path(self, frame: SceneFrame) -> str:
         """Return the path of a frame's entity, in which the parts that its name shares with its parent's stand once."""
@@ -186,7 +187,7 @@ class _RerunOutput(SceneOutput):
     def write_values(self, topic: str, time: int, values: Sequence[float], names: Sequence[str] = ()) -> None:
         entity = topic.removeprefix("/")
         if names and entity not in self._buffers:
-            self._stream.log(entity, self._rr.SeriesLines(names=list(names)), static=True)
+            self._stream.log(entity, self._rr.SeriesLines(names=list(names)), static=True, strict=True)
         self._append(entity, time, values, self._scalar_columns)
 
     def _scalar_columns(self, rows: list[Any]) -> Any:
@@ -222,10 +223,15 @@ class _RerunOutput(SceneOutput):
             self._send()
 
     def close(self) -> None:
-        """Send what is left, and end the recording."""
-        self._send()
-        self._stream.flush()
-        self._stream.disconnect()
+        """Send what is left, and end the recording.
+
+        Raises:
+            OSError: The file could not be written.
+        """
+        with errors_of_file(self.address):
+            self._send()
+            self._stream.flush()
+            self._stream.disconnect()
 
 
 class RerunFile(_RerunOutput):
@@ -242,6 +248,7 @@ class RerunFile(_RerunOutput):
 
     def __init__(self, path: str | os.PathLike[str], *, calendar: bool = False) -> None:
         self.address = os.fspath(path)
+        Path(path).write_bytes(b"")  # An error names the file and the reason.
         super().__init__(rerun_sdk().FileSink(self.address), calendar=calendar)
 
 
