@@ -60,8 +60,8 @@ class _FoxgloveOutput(SceneOutput):
         # A channel is made when its first message comes.
         self._channel = cache(self._new_channel)
         self._value_channel = cache(self._new_value_channel)
-        # Messages that whoever comes later needs, too, by channel.
-        self._latched: dict[int, tuple[Any, Any, int]] = {}
+        # The newest message of each channel with its time, for whoever comes later to a server.
+        self._newest: dict[int, tuple[Any, Any, int]] = {}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
 
     def _new_channel(self, topic: str, kind: str) -> Any:
@@ -70,10 +70,12 @@ class _FoxgloveOutput(SceneOutput):
     def _new_value_channel(self, topic: str) -> Any:
         return foxglove_sdk().Channel(topic, schema=_VALUE_SCHEMA, context=self._context)
 
-    def _log(self, topic: str, kind: str, time: int, *, latch: bool = False, **fields: Any) -> None:
-        channel, message = self._channel(topic, kind), getattr(self._messages, kind)(**fields)
-        if latch:
-            self._latched[channel.id()] = channel, message, time
+    def _log(self, topic: str, kind: str, time: int, **fields: Any) -> None:
+        self._send(self._channel(topic, kind), getattr(self._messages, kind)(**fields), time)
+
+    def _send(self, channel: Any, message: Any, time: int) -> None:
+        if self.is_live:
+            self._newest[channel.id()] = channel, message, time
         channel.log(message, log_time=time)
 
     def _stamp(self, time: int) -> Any:
@@ -99,9 +101,9 @@ class _FoxgloveOutput(SceneOutput):
         hanging = [(frame, pose) for frame, pose in fixed if frame.parent]
         if hanging:
             transforms = self._transforms(time, *zip(*hanging, strict=True))
-            self._log(f"{place}tf_static", "FrameTransforms", time, latch=True, transforms=transforms)
+            self._log(f"{place}tf_static", "FrameTransforms", time, transforms=transforms)
         entities = [self._entity(frame, time) for frame in frames if frame.shapes]
-        self._log(topic, "SceneUpdate", time, latch=True, entities=entities)
+        self._log(topic, "SceneUpdate", time, entities=entities)
 
     def _entity(self, frame: SceneFrame, time: int) -> Any:
         primitives: dict[str, list[Any]] = {}
@@ -126,16 +128,14 @@ class _FoxgloveOutput(SceneOutput):
 
     def write_values(self, topic: str, time: int, values: Sequence[float], names: Sequence[str] = ()) -> None:
         message = {"value": plain(np.asarray(values, dtype=float))}
-        self._value_channel(topic).log(json.dumps(message, allow_nan=False).encode(), log_time=time)
+        self._send(self._value_channel(topic), json.dumps(message, allow_nan=False).encode(), time)
 
     def write_image(self, time: int, image: CameraImage) -> None:
         stamp, info = self._stamp(time), image.info
         optics = (info.width(), info.height(), info.focal_x(), info.focal_y(), info.center_x(), info.center_y())
         if self._calibrations.get(image.name) != optics:
             self._calibrations[image.name] = optics
-            self._log(
-                f"{image.name}/calibration", "CameraCalibration", time, latch=True, **_calibration(stamp, image, optics)
-            )
+            self._log(f"{image.name}/calibration", "CameraCalibration", time, **_calibration(stamp, image, optics))
         height, width = image.pixels.shape[:2]
         self._log(
             f"{image.name}/{image.kind}",
@@ -223,9 +223,9 @@ class FoxgloveServer(_FoxgloveOutput):
         self.address = f"ws://127.0.0.1:{self.port}"
 
     def _repeat(self, channel_id: int) -> None:
-        """Send a message again that whoever subscribes now has missed."""
-        if channel_id in self._latched:
-            channel, message, time = self._latched[channel_id]
+        """Send the message again that whoever subscribes now has missed."""
+        if channel_id in self._newest:
+            channel, message, time = self._newest[channel_id]
             channel.log(message, log_time=time)
 
     def restart(self) -> None:

@@ -24,6 +24,7 @@ from vtbdrake.visualization.scenes.scene_model import SceneModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from pydrake.math import RigidTransform
     from pydrake.systems.framework import Context, System
 
     from vtbdrake.testbed import VirtualTestbed
@@ -124,6 +125,7 @@ class SceneWriter(Closing):
         self._is_own = not isinstance(output, SceneOutput)
         self.output = output if isinstance(output, SceneOutput) else open_scene_file(output)
         self._last_time: int | None = None
+        self._live: tuple[int, bytes] | None = None  # what a live output shows
 
     def monitor(self, context: Context) -> None:
         """Write a state if it is due: for `Simulator.set_monitor`.
@@ -137,7 +139,7 @@ class SceneWriter(Closing):
             self.write(context)
 
     def write(self, context: Context, *, world: Context | None = None, time: int | None = None) -> None:
-        """Write a state.
+        """Write a state; to a live output, unless nothing has moved since.
 
         Args:
             context: A root context of the testbed, from which the signals are read.
@@ -151,10 +153,12 @@ class SceneWriter(Closing):
         at = round(1e9 * context.get_time()) if time is None else time
         if at < 0:
             raise ValueError(f"a scene has no times before 0, unlike {1e-9 * at:g} s: give time=, in ns")
+        poses = [frame.pose(world or context) for frame in self._moving]
+        if self.output.is_live and self._is_same(at, poses):
+            return
         self._begin(at, world or context)
         model, output = self.model, self.output
-        if self._moving:
-            poses = [frame.pose(world or context) for frame in self._moving]
+        if poses:
             output.write_poses(model.topic("tf"), at, self._moving, poses)
         if model.joints:
             output.write_joints(model.topic("joint_states"), at, model.joints, *model.joint_state(world or context))
@@ -166,6 +170,11 @@ class SceneWriter(Closing):
             for name, points in self._new_points(context):
                 output.write_points(model.topic(name), at, points, model.frames[0])
         output.flush()
+
+    def _is_same(self, time: int, poses: Sequence[RigidTransform]) -> bool:
+        """Return whether this is what a live output shows already: what stands still would fill its memory."""
+        before, self._live = self._live, (time, b"".join(pose.GetAsMatrix34().tobytes() for pose in poses))
+        return self._live == before
 
     def _begin(self, time: int, context: Context) -> None:
         """Write what stands still, before the first state."""
