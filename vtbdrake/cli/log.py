@@ -176,11 +176,11 @@ def _parse_export(text: str) -> Path:
 @option("--no-images", "Leave images and scans out of a scene.", is_flag=True)
 @json_option
 def export(log: Path, out: Path, scenario: Scenario | None, rate: float | None, no_images: bool) -> None:
-    """Write a LOG as CSV or Parquet, or as a scene for Foxglove (MCAP) or Rerun (.rrd).
+    """Write a LOG as CSV, Parquet, or a scene for viewers (MCAP, .rrd).
 
-    The suffix of OUT says which. A scene has the signals and events of the log. With --scenario, whose code runs, it
-    also has the world, which a replay of the log computes. A log of lcm-logger needs the scenario of its machine, and
-    has signals alone.
+    The suffix of OUT says which: scenes are for Foxglove (MCAP) and Rerun (.rrd). A scene has the signals and events of
+    the log. With --scenario, whose code runs, it also has the world, which a replay of the log computes. A log of
+    lcm-logger needs the scenario of its machine, and has signals alone.
 
     \b
     Example:

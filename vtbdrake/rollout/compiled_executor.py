@@ -43,7 +43,8 @@ class CompiledExecutor(Executor):
     The testbed is compiled for a task at the first rollout, and compared with Drake's then; machine code is kept for
     the next time. Qualities that work with CasADi's numbers (sums, products, numpy's functions; no branches) are
     compiled, too; others get the recorded samples. A rollout that the compiled testbed cannot make (contact does not
-    converge, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was made.
+    converge, the state is not finite, f fails) is simulated in Drake: ``RolloutResult.computed`` tells how each was
+    made.
     Several threads may call it at once, if that is true of ``drake``.
 
     Args:
