@@ -25,12 +25,13 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.cli.program import ROOT
 from tests.visualization.scenes.reading import Recording, world_poses
-from tests.visualization.scenes.shapes import ShapesScenario
+from tests.visualization.scenes.shapes import SHAPES, ShapesScenario
 from vtbdrake.testbed import VirtualTestbed
 from vtbdrake.visualization import FoxgloveServer, RerunServer, SceneWriter
 from vtbdrake.web.live.simulation_session import SimulationSession
 
 PATIENCE = 60.0  # s
+MOVING = ("world/arm/link", "world/arm/link/slider", "world/arm/ball")
 
 
 class Client:
@@ -170,6 +171,15 @@ def test_command_line_serves_both_viewers_until_it_is_interrupted() -> None:
         program.wait()
 
 
+def has_come(recording: Recording) -> bool:
+    """Return whether all shapes and frames, and some states, are there: messages may overtake each other."""
+    here = recording.entities()
+    shapes = {f"world/arm/link/{name}" for name in SHAPES}
+    samples = min(len(recording.times(path, "Transform3D:translation")) for path in MOVING)
+    samples = min(samples, len(recording.times("joint_states/position", "Scalars:scalars")))
+    return shapes <= here and "world/arm/link/slider/tool" in here and samples > 5
+
+
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_client_of_rerun_gets_the_scene_and_the_poses(testbed: VirtualTestbed, tmp_path: Path) -> None:
     saved = tmp_path / "live.rrd"
@@ -187,7 +197,7 @@ def test_client_of_rerun_gets_the_scene_and_the_poses(testbed: VirtualTestbed, t
         )
         try:
             recording = None
-            while recording is None:
+            while recording is None or not has_come(recording):
                 simulator.AdvanceTo(simulator.get_context().get_time() + 0.1)
                 assert client.poll() is None
                 if saved.exists() and saved.stat().st_size > 50_000:
