@@ -88,6 +88,7 @@ def test_zero_offset_of_an_encoder_is_told(seed: int) -> None:
     assert abs(float(found[1]) - 0.1) < 3.0 * float(found[2])
 
 
+@pytest.mark.slow
 def test_friction_that_chatters_in_the_model_is_not_believed() -> None:
     """A light joint that sticks: T Fc / (I v_c) is 0.004 s 1.2 N m / (0.02 kg m^2 0.02 rad/s) = 12."""
     log = recorded(seed=20, center=0.05, moment=0.0175, coulomb=1.0, amplitude=2.5)
