@@ -102,7 +102,7 @@ class CartPoleScenario(Scenario):
         # A plan begins at a time of the DPS, which runs for thirty years at most.
         limit = np.append(1e9, np.full(self.knots, self.force_limit))
         names = ["start", *(f"force {knot}" for knot in range(1, self.knots + 1))]
-        return [Signal("plan", size=1 + self.knots, unit="s, N", lower=-limit, upper=limit, entry_names=names)]
+        return [Signal("plan", size=1 + self.knots, unit="s, N, ...", lower=-limit, upper=limit, entry_names=names)]
 
     def deployment(self) -> Deployment:
         """Return how the DPS runs on the cart-pole: it answers each state at once; after a fault there is no force.

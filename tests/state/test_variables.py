@@ -298,6 +298,9 @@ def test_an_entry_has_the_unit_and_the_bounds_of_its_place(unit, units):
         ("rad/s, m/s", (6,), ["rad/s"] * 3 + ["m/s"] * 3),
         ("1, 1, 1, m", (3, 4), ["1", "1", "1", "m"] * 3),  # [R | p]
         ("1, m", (7,), ["1, m"] * 7),
+        ("s, N, ...", (5,), ["s", "N", "N", "N", "N"]),  # when a curve begins, and its knots
+        ("s, N, ...", (2,), ["s", "N"]),
+        ("s, N, ...", (1,), ["s, N, ..."]),
         ("m", (), ["m"]),
         ("m", (0,), []),
     ],

@@ -51,7 +51,7 @@ class ExcitedArmScenario(ManipulatorScenario):
         plan = Signal(
             "plan",
             size=1 + lower.size,
-            unit="s, rad",
+            unit="s, rad, ...",
             lower=np.append(-1e9, lower),
             upper=np.append(1e9, upper),
             default=np.append(0.0, np.tile(arm.home, self.knots)),

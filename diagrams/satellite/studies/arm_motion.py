@@ -125,7 +125,7 @@ class ArmMotionScenario(Scenario):
         size = 1 + self.knots * ARM_JOINTS
         # A plan begins at a time of the DPS, which runs for thirty years at most; its knots are turns of joints.
         limit = np.append(1e9, np.full(size - 1, 2.0 * np.pi))
-        plan = Signal("plan", size=size, unit="s, rad", lower=-limit, upper=limit, default=self.initial_plan())
+        plan = Signal("plan", size=size, unit="s, rad, ...", lower=-limit, upper=limit, default=self.initial_plan())
         return Interface(
             sense=[
                 Signal(

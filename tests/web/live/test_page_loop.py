@@ -39,7 +39,7 @@ def test_loop_is_watched_until_it_ends(browser: Browser) -> None:
             page.fill("#vtb-panel input[type=search]", "u.plan")
             page.press("#vtb-panel input[type=search]", "Enter")  # a single match
             drawn(page, "vtb.watched.get('u.plan').values.length > 0")
-            page.fill("[data-address='u.plan'] input[type=text][aria-label='u.plan force 1']", "7")
+            page.fill("[data-address='u.plan'] input[type=text][aria-label='u.plan force 1 in N']", "7")
             page.keyboard.press("Enter")
             drawn(page, "vtb.watched.get('u.plan').values[1] === 7")
             # Esc ends a drag: the release tells the loop nothing.
