@@ -154,8 +154,8 @@ def entry_units(unit: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     """Return the unit of each entry of an array, row by row.
 
     A unit such as ``"rad/s, m/s"`` lists the units of equal groups of the entries of a row. A pose whose orientation is
-    a quaternion has groups of one entry: ``"1, 1, 1, 1, m, m, m"``. In ``"s, N, ..."``, the unit before the dots goes on
-    to the end. If there are no equal groups, the list is the unit of every entry.
+    a quaternion has groups of one entry: ``"1, 1, 1, 1, m, m, m"``. In ``"s, N, ..."``, the unit before the dots
+    continues to the end. If there are no equal groups, the list is the unit of every entry.
 
     Args:
         unit: The unit of the array.
