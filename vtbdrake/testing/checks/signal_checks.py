@@ -52,8 +52,8 @@ def check_signals_have_units(subject: Subject) -> None:
     """
     problems = []
     for signal in _vectors(subject):
-        # A list of units belongs to groups of entries.
-        if not all(_is_si(unit.strip()) for unit in signal.unit.split(",")):
+        # A list of units belongs to groups of entries, see `vtbdrake.state.variables.entry_units`.
+        if not all(_is_si(unit.strip()) for unit in signal.unit.removesuffix(", ...").split(",")):
             problems.append(f"the unit of {signal.name} is {signal.unit!r}, which is no SI unit")
         elif signal.unit == "1" and _unlimited(signal).any():
             problems.append(f"{signal.name} has neither a unit nor limits: give unit='N m', say")
