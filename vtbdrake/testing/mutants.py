@@ -12,6 +12,7 @@ from pydrake.systems.framework import System
 from pydrake.systems.primitives import Gain, MatrixGain, ZeroOrderHold
 
 from vtbdrake.common.failures import error_text
+from vtbdrake.state.variables import entry_units
 from vtbdrake.testbed import DpsAlone, Scenario, Signal, VirtualTestbedBuilder
 from vtbdrake.testbed.parts import WorldAlone
 
@@ -72,14 +73,11 @@ def _sign(signal: Signal, mutant: Mutant) -> System | None:
 
 
 def _degrees(signal: Signal, mutant: Mutant) -> System | None:
-    units = [unit.strip() for unit in signal.unit.split(",")]
+    units = entry_units(signal.unit, (signal.size or 0,))
     angles = [unit.split("/")[0] == "rad" for unit in units]
-    if signal.size is None or not any(angles):
+    # Entries of several units have none of their own where the groups are not equal.
+    if not any(angles) or any(", " in unit for unit in units):
         return None
-    if len(units) != signal.size:
-        if not all(angles):
-            return None  # Which entries are angles is not known.
-        angles = [True] * signal.size
     return Gain([degrees(1.0) if angle else 1.0 for angle in angles])
 
 
