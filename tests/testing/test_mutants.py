@@ -107,7 +107,8 @@ def test_units_tell_which_entries_are_angles() -> None:
 
     assert factors("m, rad", 2) == [1.0, 57.3]
     assert factors("rad, rad/s", 4) == [57.3] * 4
-    assert factors("m, rad", 4) is None and factors("m", 1) is None
+    assert factors("m, rad", 4) == [1.0, 1.0, 57.3, 57.3] and factors("s, rad, ...", 3) == [1.0, 57.3, 57.3]
+    assert factors("m, rad", 3) is None and factors("m", 1) is None
     assert factors("rad/s", 1) == [57.3]
 
 
