@@ -31,7 +31,7 @@ STARTS = [
     vtb.Parameter(f"{_JOINTS}.pole_pin.position", np.pi - 0.2, np.pi + 0.2),
     vtb.Parameter(f"{_JOINTS}.pole_pin.velocity", -0.3, 0.3),
 ]
-"""What each episode draws: position (m) and velocity of the cart, angle (rad) and velocity of the pole."""
+"""Ranges of an episode's start: position (m) and velocity of the cart, angle (rad) and velocity of the pole."""
 FORCE_LIMIT = BalancedCartPole().force_limit
 
 

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from tests.calibration.pendulum import PERIOD
 from vtbdrake.recording import Log, read_table
 
-MASS, CENTER, MOMENT = 1.0, 0.36, 0.03
-COULOMB, VISCOUS = 0.2, 0.03
-GRAVITY = 9.81
+MASS = 1.0  # kg
+CENTER = 0.36  # m
+MOMENT = 0.03  # kg m^2
+COULOMB = 0.2  # N m
+VISCOUS = 0.03  # N m s/rad
+GRAVITY = 9.81  # m/s^2
 # (velocity in rad/s, torque in N m) -> the size of the friction beside the viscous one, in N m.
 Law = Callable[[float, float], float]
 

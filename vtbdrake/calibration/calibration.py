@@ -425,7 +425,8 @@ def _result(
     scenario: Scenario, prepared: _Prepared, noise: Noise, z: Array, held_back: NDArray[np.bool]
 ) -> Calibration:
     model, segments, used = prepared.model, prepared.segments, ~held_back
-    innovations = segments.innovations(noise, segments.linearized(z))
+    linearized = segments.linearized(z)
+    innovations = segments.innovations(noise, linearized)
     white = innovations.white
     fit, holdout = (_rms(white[:, part]) for part in (used, held_back))
     J = innovations.slopes[:, used].reshape(-1, len(z))
@@ -442,7 +443,7 @@ def _result(
     if holdout > WORSE * fit:
         reasons.append(f"the segments that were kept back fit {holdout / fit:.2g} times worse")
     reasons += chattering(segments, prepared.start, z)
-    reasons += map(str, missing_terms(segments, noise, z, used, info))
+    reasons += map(str, missing_terms(segments, linearized, noise, z, used, info))
     verdict = Verdict.DISCREPANT if reasons else Verdict.ACCEPTED
     if not reasons and _start_is_as_good(segments, noise, white, held_back):
         verdict = Verdict.NO_EVIDENCE

@@ -1,4 +1,4 @@
-r"""What a fitted model of joints lacks: torques that depend on speed, direction, load or position, and zero offsets.
+r"""Terms that a fitted model of joints lacks: torques by speed, direction, load or position, and zero offsets.
 
 A disturbance of the torques is part of the filter, and it takes what the friction's law does not have: the innovations
 stay white, and segments that were kept back fit as well. So terms that the model could have are tried one by one, at
@@ -92,18 +92,18 @@ def chattering(segments: Segments, start: Array, z: Array) -> list[str]:
 
 
 def missing_terms(
-    segments: Segments, noise: Noise, z: Array, used: NDArray[np.bool], info: Information
+    segments: Segments, linearized: Linearization, noise: Noise, z: Array, used: NDArray[np.bool], info: Information
 ) -> list[MissingTerm]:
     """Return the most significant term of each joint that the model lacks at its estimate.
 
     Args:
         segments: The recordings, with their filtered trajectories.
+        linearized: The model along these trajectories.
         noise: The likeliest noise.
         z: The estimate, (nz,).
         used: The segments that were fitted.
         info: What they tell about the parameters.
     """
-    linearized = segments.linearized(z)
     terms = list(_terms(segments, linearized, z))
     columns = np.stack([column for *_, column in terms], axis=-1)
     extended = linearized._replace(slopes=np.concatenate([linearized.slopes, columns], axis=-1))

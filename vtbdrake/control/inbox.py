@@ -1,4 +1,4 @@
-"""What a bridge does with a message that it has decoded: it is checked, and updates its signals or is counted."""
+"""The inbox of a bridge: a decoded message is checked, and updates its signals or is counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an episode is: where it begins, its steps, what it is worth, and when it ends."""
+"""Episodes of an environment: where they begin, their steps, what they are worth, and when they end."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def over_lcm(scenario: ForestScenario, *, cycles: int = CYCLES) -> OverLcm:
 
 @dataclass(frozen=True)
 class LocalizationAnswer:
-    """How well the unit knows where it is, with each map.
+    """Accuracy of the localization unit with each map.
 
     Attributes:
         scores: The scores of all drives by map.

@@ -119,7 +119,7 @@ def _range(boundary: Boundary) -> str:
 
 @dataclass(frozen=True)
 class HeadingAnswer:
-    """What became of the robot in each crater.
+    """Decisions and climbs of the robot in each crater.
 
     Attributes:
         cases: The robot's decision among discrete headings in each crater, with the climb straight on beside it.

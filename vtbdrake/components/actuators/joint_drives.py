@@ -167,16 +167,7 @@ class JointDrives(AddressedSystem):
         memory[: 2 * n] = y[n:]
 
 
-# Law of friction, by the names of its numbers for each joint, in the order of the parameters; the units of all numbers.
-FRICTION = (
-    "viscous",
-    "coulomb",
-    "coulomb_velocity",
-    "stribeck",
-    "stribeck_velocity",
-    "load_friction",
-    "asymmetry",
-)
+# Numbers that each joint has, in the order of the parameters.
 _UNITS = {
     "limit": "N m",
     "rate": "N m/s",
@@ -188,6 +179,8 @@ _UNITS = {
     "load_friction": "1",
     "asymmetry": "N m",
 }
+FRICTION = tuple(name for name in _UNITS if name not in ("limit", "rate"))
+"""The numbers of the friction's law."""
 
 
 def _lowest(name: str) -> float:

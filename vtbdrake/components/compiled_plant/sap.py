@@ -77,7 +77,7 @@ class Drive:
 
 
 class Solution(NamedTuple):
-    """What one step of a plant computes.
+    """Results of one step of a plant.
 
     Attributes:
         v_next: Velocities after the step, shape (nv, 1).

@@ -1,4 +1,4 @@
-"""Where two shapes touch in Drake's point contact, as expressions: the deepest point of one, seen by the other.
+"""The point where two shapes touch in Drake's point contact, as expressions: the deepest of one, seen by the other.
 
 Compiled is what Drake computes in closed form: a sphere against the nearest point of another shape, and the deepest
 point of any shape against a half-space. For all other pairs Drake iterates (MPR, of libccd), and the normals that come

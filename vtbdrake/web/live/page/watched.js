@@ -10,7 +10,7 @@ const ENTRIES = 12; // entries of an array that are shown
 /**
  * A variable as the session describes it.
  *
- * `units` are those of its entries, where they differ.
+ * `units` has the unit of each entry, where entries differ.
  *
  * @typedef {{ kind: string, shape: number[], unit: string, units: string[],
  *   bounds: [(number | null)[], (number | null)[]], settable: boolean, entries: string[],
