@@ -122,10 +122,17 @@ def files() -> Iterator[bytes]:
     yield from (chosen.randbytes(chosen.randrange(40)) for _ in range(100))
 
 
+def found_in(content: bytes) -> tuple[dict[bytes, np.ndarray], list[tuple[int, str]]]:
+    """Return the events of each channel, and the damages; two events are kept together, so that parts are joined."""
+    parts: dict[bytes, list[np.ndarray]] = {}
+    damages = find_events(content, lambda channel, places: parts.setdefault(channel, []).append(places), 2)
+    return {channel: np.concatenate(places) for channel, places in parts.items()}, damages
+
+
 def test_find_events_matches_plain_search() -> None:
     damages = 0
     for content in files():
-        places, wrong = find_events(content)
+        places, wrong = found_in(content)
         expected, expected_wrong = events_of(content)
         found = [(channel, *place) for channel, rows in places.items() for place in rows.tolist()]
         assert sorted(found, key=lambda event: event[-1]) == expected
@@ -137,7 +144,7 @@ def test_find_events_matches_plain_search() -> None:
 def test_whole_cycles_matches_plain_search() -> None:
     good = bad = 0
     for content in files():
-        places = find_events(content)[0].get(CYCLE.encode(), np.empty((0, 4), np.int64))
+        places = found_in(content)[0].get(CYCLE.encode(), np.empty((0, 4), np.int64))
         records, frames, wrong = whole_cycles(content, places, LAYOUT.dtype)
         cycles, expected, expected_wrong = cycles_of(content, [(begin, end) for _, _, begin, end in places.tolist()])
         assert [record.tobytes() for record in records] == cycles
@@ -152,7 +159,7 @@ def test_frame_beyond_file_is_wrong_checksum(size: int) -> None:
     record = LAYOUT.blank()
     record["number"], record["size"] = 5, size
     content = event(0, 0, CYCLE.encode(), record.tobytes())
-    places = find_events(content)[0][CYCLE.encode()]
+    places = found_in(content)[0][CYCLE.encode()]
     records, frames, wrong = whole_cycles(content, places, LAYOUT.dtype)
     assert not len(records) and not len(frames)
     assert wrong == [(places[0, 2], "the checksum of cycle 5 is wrong")]

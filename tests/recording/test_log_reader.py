@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import random
@@ -23,15 +24,30 @@ from vtbdrake.control.stepping import Change
 from vtbdrake.lcm.maps import decode
 from vtbdrake.recording.lcm_types.lcmt_vtb_cycle import lcmt_vtb_cycle
 from vtbdrake.recording.lcm_types.lcmt_vtb_log import lcmt_vtb_log
-from vtbdrake.recording.log_codec import find_events
 from vtbdrake.recording.log_events import LogEvents
-from vtbdrake.recording.log_format import EVENT, SYNC, VERSION, CycleLayout, LogError, encode_changes, event
+from vtbdrake.recording.log_format import (
+    CHANGE,
+    CYCLE,
+    DIGEST,
+    END,
+    EVENT,
+    FAULT,
+    LOG,
+    STATE,
+    SYNC,
+    VERSION,
+    CycleLayout,
+    LogError,
+    encode_changes,
+    event,
+)
 from vtbdrake.recording.log_reader import ControlLog, read_log
 from vtbdrake.recording.recorder import Recorder
 from vtbdrake.recording.replay import IDENTICAL, replay
 
 ROOT = Path(__file__).resolve().parents[2]
 CYCLES = 20
+OF_A_RECORDER = (LOG, STATE, CYCLE, CHANGE, FAULT, DIGEST, END)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +109,7 @@ def test_truncated_log_is_read_up_to_its_end(whole: bytes, reference: ControlLog
         complete = sum(bound <= cut for bound in bounds)
         assert_same(log, reference, list(range(complete)))
         assert not log.closed
-        torn = cut not in [end for places in find_events(whole[:cut])[0].values() for end in places[:, 3]]
+        torn = cut not in [end for channel in OF_A_RECORDER for *_, end in log.events.on(channel)]
         assert [damage.description for damage in log.damages] == ["the file ends in the middle of an event"] * torn
         assert not torn or log.damages[0].offset < cut
 
@@ -235,6 +251,26 @@ def test_opening_a_log_takes_less_memory_than_the_file(tmp_path: Path, monkeypat
     # A number, a time and some places for each cycle, and one part of the log; its columns alone are as large as the
     # file, and are read when they are asked for.
     assert len(log) == 1500 and peak < 0.8 * len(log.events.content)
+
+
+def test_memory_of_an_open_log_does_not_grow_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("log_reader.RECORDS_TOGETHER", "log_events.ROWS_TOGETHER", "disk_array.ROWS_TOGETHER"):
+        monkeypatch.setattr(f"vtbdrake.recording.{name}", 128)
+    held, most = [], []
+    for k, cycles in enumerate((500, 500, 2000)):  # What is imported and kept by the first does not count.
+        servo, path = Servo(), tmp_path / f"{k}.lcm"
+        with Recorder(servo.runtime, path, digest_period=100.0):
+            servo.runtime.run(cycles=cycles)
+        gc.collect()
+        tracemalloc.start()
+        log = read_log(path)
+        for memory, value in zip((held, most), tracemalloc.get_traced_memory(), strict=True):
+            memory.append(value)
+        tracemalloc.stop()
+        assert log.numbers.tolist() == list(range(1, cycles + 1)) and len(log.events.on(CYCLE)) == cycles
+    assert len(list(tmp_path.iterdir())) == 3  # The index has no name.
+    # Less than half a number for each of 1500 more cycles.
+    assert abs(held[2] - held[1]) < 4 * 1500 and abs(most[2] - most[1]) < 4 * 1500
 
 
 def test_delayed_cycle_is_no_clock_jump(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import mmap
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,7 +12,9 @@ class CycleWriter:
     def note_message(self, channel: str, event: int) -> None: ...
     def event(self, cycle: Cycle, number: int, utime: int, before: int) -> bytes: ...
 
-def find_events(content: mmap.mmap | bytes) -> tuple[dict[bytes, np.ndarray], list[tuple[int, str]]]: ...
+def find_events(
+    content: mmap.mmap | bytes, keep: Callable[[bytes, np.ndarray], object], together: int
+) -> list[tuple[int, str]]: ...
 def whole_cycles(
     content: mmap.mmap | bytes, places: np.ndarray, dtype: np.dtype
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]: ...

@@ -200,15 +200,17 @@ class _MessageOrigin:
 # -- reading
 
 
-def find_events(content not None):
+def find_events(content not None, keep not None, Py_ssize_t together):
     """Find the events of a file. Where there is none, the search goes on at the next sync word.
 
     Args:
         content: Bytes of the file, or their map.
+        keep: A function of a channel (bytes) and of its next events, in the order of the file, as integers of shape
+            (n, 4): number, time in microseconds, begin and end of the data.
+        together: The number of events of a channel that are kept in one call; the last call has fewer.
 
     Returns:
-        By channel (bytes), the events in the order of the file as integers of shape (n, 4): number, time in
-        microseconds, begin and end of the data. And offset and kind of all bytes that are not events.
+        Offset and kind of all bytes that are not events.
     """
     cdef const unsigned char[::1] view = content
     cdef int64_t size = view.shape[0], at = 0, begin, end, following
@@ -253,10 +255,20 @@ def find_events(content not None):
         place[0], place[1] = <int64_t>get_uint64(&header.number), <int64_t>get_uint64(&header.utime)
         place[2], place[3] = begin, end
         extend_buffer(places_of_channel, <char*>place, 4)
+        if len(places_of_channel) >= 4 * together:
+            keep(channel, _rows(places_of_channel))
+            places[channel] = array("q")
         at = end
     if more:
         damages.append((latest, f"the last of {more} more"))
-    return {channel: np.frombuffer(entry, np.int64).reshape(-1, 4) for channel, entry in places.items()}, damages
+    for channel, entry in places.items():
+        if len(entry):
+            keep(channel, _rows(entry))
+    return damages
+
+
+def _rows(places):
+    return np.frombuffer(places, np.int64).reshape(-1, 4)
 
 
 def whole_cycles(content not None, const int64_t[:, ::1] places, dtype not None):

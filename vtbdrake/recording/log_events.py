@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vtbdrake.recording.disk_array import ROWS_TOGETHER, DiskArray
 from vtbdrake.recording.log_codec import find_events
 from vtbdrake.recording.log_format import LOG, OWN_PREFIX, LogError
 
@@ -50,11 +51,12 @@ class Message(NamedTuple):
 
 
 class LogEvents:
-    """The events of an LCM log, damaged or not.
+    """The events of an LCM log, damaged or not. Where they lie is kept on disk, see `DiskArray`.
 
     Attributes:
         damages: Offset and kind of all bytes that are not events.
         content: Bytes of the file.
+        folder: The folder of the file.
 
     Raises:
         OSError: The file cannot be read.
@@ -64,15 +66,21 @@ class LogEvents:
     def __init__(self, path: Path) -> None:
         if path.exists() and not path.is_file():
             raise LogError(f"{path} is not a log: it is a folder, a device or a pipe, not a file")
+        self.folder = path.parent
         with path.open("rb") as file:
             empty = file.seek(0, 2) == 0  # An empty file cannot be mapped.
             self.content: mmap.mmap | bytes = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        places_by_channel, self.damages = find_events(self.content)
-        self.release()
-        self._places: dict[str, np.ndarray] = {}
-        for channel, places in places_by_channel.items():
+        kept: dict[str, DiskArray] = {}
+
+        def keep(channel: bytes, places: np.ndarray) -> None:
             name = channel.decode(errors="replace")
-            self._places[name] = np.concatenate([self.places(name), places])
+            if name not in kept:
+                kept[name] = DiskArray(np.int64, (4,), self.folder)
+            kept[name].append(places)
+            self.release()
+
+        self.damages = find_events(self.content, keep, ROWS_TOGETHER)
+        self._places = {name: places.array() for name, places in kept.items()}
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from vtbdrake.control.stepping import Change
 from vtbdrake.lcm.maps import decode
 from vtbdrake.lcm.messages import MalformedError
+from vtbdrake.recording.disk_array import DiskArray
 from vtbdrake.recording.lcm_types.lcmt_vtb_change import lcmt_vtb_change
 from vtbdrake.recording.lcm_types.lcmt_vtb_digest import lcmt_vtb_digest
 from vtbdrake.recording.lcm_types.lcmt_vtb_end import lcmt_vtb_end
@@ -83,7 +84,9 @@ class Cycles:
     Attributes:
         layout: The layout of a cycle.
         numbers: The numbers of the cycles, shape (n,).
-        frames: Begin and end of the bytes of each cycle in the file, with the events before it, shape (n, 2).
+        times: The times of the DPS at the ends of the cycles, in seconds, shape (n,).
+        begins: Where in the file the bytes of each cycle begin, with the events before it, shape (n,).
+        ends: Where they end, shape (n,).
         damages: Offset and kind of the cycles that do not count, see `whole_cycles`.
         clock_jumps: The indices of cycles whose time of day does not follow the loop's clock, or whose clock ran
             backwards.
@@ -95,7 +98,8 @@ class Cycles:
         self._events = events
         self._bytes = np.frombuffer(events.content, np.uint8)
         places, digest = events.places(CYCLE), hashlib.sha256()
-        numbers, frames, jumps = [], [], _ClockJumps()
+        numbers, times, begins, ends = (DiskArray(kind, (), events.folder) for kind in (int, float, int, int))
+        jumps = _ClockJumps()
         self.damages: list[tuple[int, str]] = []
         newest = -1
         for begin in range(0, len(places), RECORDS_TOGETHER):
@@ -114,11 +118,13 @@ class Cycles:
                 newest = int(records["number"][-1])
                 digest.update(records["number"].tobytes() + records["crc"].tobytes())
                 jumps.add(1e-6 * records["utime"] - records["now"], records["now"].astype(float))
-                numbers.append(records["number"].astype(int))
-                frames.append(chunk_frames)
+                numbers.append(records["number"])
+                times.append(records["time"])
+                begins.append(chunk_frames[:, 0])
+                ends.append(chunk_frames[:, 1])
             events.release()
-        self.numbers = np.concatenate([np.empty(0, int), *numbers])
-        self.frames = np.concatenate([np.empty((0, 2), np.int64), *frames])
+        self.numbers, self.times = numbers.array(), times.array()
+        self.begins, self.ends = begins.array(), ends.array()
         self.clock_jumps = jumps.indices()
         self.digest = digest.digest()
 
@@ -130,7 +136,7 @@ class Cycles:
             last: Index behind the last cycle.
         """
         size = self.layout.dtype.itemsize
-        begins = self.frames[first:last, 1] - size
+        begins = self.ends[first:last] - size
         if not len(begins):
             return np.empty(0, self.layout.dtype)
         return sliding_window_view(self._bytes, size)[begins].reshape(-1).view(self.layout.dtype)
@@ -207,7 +213,8 @@ class _ClockJumps:
 class ControlLog:
     """A recorded run of a control loop, as `read_log` returns it; n is the number of cycles that could be read.
 
-    The columns (`numbers`, `times`, `fed` and so on) are read from the file when they are asked for, and kept then.
+    The columns (`now`, `fed`, `sent` and so on) are read from the file when they are asked for, and kept then.
+    `numbers` and `times` cannot be changed.
 
     Attributes:
         path: Path of the file.
@@ -247,10 +254,10 @@ class ControlLog:
         """Return the numbers of the cycles, shape (n,)."""
         return self.cycles.numbers
 
-    @cached_property
+    @property
     def times(self) -> np.ndarray:
         """Return the times of the DPS at the ends of the cycles, in seconds, shape (n,)."""
-        return self.cycles.column("time", float)
+        return self.cycles.times
 
     @cached_property
     def now(self) -> np.ndarray:
@@ -491,9 +498,10 @@ def _of_cycles(
     cycles: Cycles,
 ) -> list[Any]:
     """Return the messages of a channel that lie in whole cycles and name one of them."""
-    places, frames, numbers = events.places(channel), cycles.frames, cycles.numbers
-    begins = np.append(frames[:, 0], np.iinfo(np.int64).max)
-    within = places[places[:, 2] >= begins[np.searchsorted(frames[:, 1], places[:, 3])]]
+    places, numbers = events.places(channel), cycles.numbers
+    at = np.searchsorted(cycles.ends, places[:, 3])
+    places, at = places[at < len(numbers)], at[at < len(numbers)]
+    within = places[places[:, 2] >= cycles.begins[at]]
     decoded = []
     for begin, message in _decoded(events, channel, message_type, damages, within):
         at = np.searchsorted(numbers, message.number)
@@ -528,5 +536,10 @@ def _last_numbers(events: LogEvents, damages: list[Damage]) -> list[int]:
 
 
 def _gaps(header: LogHeader, numbers: np.ndarray, ends: Sequence[int]) -> list[Gap]:
-    present = np.concatenate([[header.first_cycle - 1], numbers, np.array(ends, int) + 1])
-    return [Gap(int(present[i]) + 1, int(present[i + 1]) - 1) for i in np.flatnonzero(np.diff(present) > 1)]
+    gaps, last = [], header.first_cycle - 1
+    parts = [numbers[k : k + RECORDS_TOGETHER] for k in range(0, len(numbers), RECORDS_TOGETHER)]
+    for part in (*parts, np.array(ends, int) + 1):
+        present = np.concatenate([[last], part])
+        gaps += [Gap(int(present[i]) + 1, int(present[i + 1]) - 1) for i in np.flatnonzero(np.diff(present) > 1)]
+        last = int(present[-1])
+    return gaps
