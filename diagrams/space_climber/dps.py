@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import casadi
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, DiscreteValues
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import Multiplexer
 
-from vtbdrake.state import AddressedSystem, Quantity
-from vtbdrake_diagrams.space_climber.conditioning import calibrate, limit
-from vtbdrake_diagrams.space_climber.estimation import PerceivedEnvironment
+from vtbdrake.components.casadi_system import clamp
+from vtbdrake.state import NamedVector, Quantity
+from vtbdrake_diagrams.packed_system import Expression, packed_system
+from vtbdrake_diagrams.space_climber.estimation import make_perceived_environment
 from vtbdrake_diagrams.space_climber.gait import GAITS
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
@@ -42,17 +47,17 @@ def make_dps(
     morphology = morphology or Morphology()
     builder = DiagramBuilder()
     sense = builder.AddNamedSystem("sense", _make_sense(period=period, morphology=morphology))
-    env = builder.AddNamedSystem("env", PerceivedEnvironment(period=period, morphology=morphology))
+    env = builder.AddNamedSystem("env", make_perceived_environment(period=period, morphology=morphology))
     walking = make_walking(GAITS[gait], period=period, morphology=morphology, clearance=clearance, navigator=navigator)
     impl = builder.AddNamedSystem("impl", walking)
-    act = builder.AddNamedSystem("act", CommandLimiter(period=period, morphology=morphology))
+    act = builder.AddNamedSystem("act", make_command_limiter(period=period, morphology=morphology))
     for signal in SENSOR_SIGNALS:
         builder.ExportInput(sense.GetInputPort(signal), signal)
     for signal in ("heading", "walk", *(["visual_odometry"] if navigator else [])):
         builder.ExportInput(impl.GetInputPort(signal), signal)
     builder.Connect(sense.get_output_port(), env.get_input_port())
     builder.Connect(env.GetOutputPort("pose"), impl.GetInputPort("pose"))
-    builder.Connect(impl.GetOutputPort("joint_position"), act.GetInputPort("joint_position"))
+    builder.Connect(impl.GetOutputPort("joint_position"), act.GetInputPort("target"))
     builder.ExportOutput(act.GetOutputPort("joint_position"), "joint_position")
     dps = builder.Build()
     dps.set_name("dps")
@@ -62,7 +67,7 @@ def make_dps(
 def _make_sense(*, period: float, morphology: Morphology) -> Diagram:
     builder = DiagramBuilder()
     raw = builder.AddNamedSystem("raw", Multiplexer(list(SENSOR_SIGNALS.values())))
-    calibration = builder.AddNamedSystem("calibration", Calibration(period=period, morphology=morphology))
+    calibration = builder.AddNamedSystem("calibration", make_calibration(period=period, morphology=morphology))
     for k, signal in enumerate(SENSOR_SIGNALS):
         builder.ExportInput(raw.get_input_port(k), signal)
     builder.Connect(raw.get_output_port(), calibration.get_input_port())
@@ -70,12 +75,12 @@ def _make_sense(*, period: float, morphology: Morphology) -> Diagram:
     return builder.Build()
 
 
-class Calibration(AddressedSystem):
-    """A system that calibrates the raw sensor values and filters the IMU's.
+def make_calibration(*, period: float, morphology: Morphology) -> System:
+    """Return the system that calibrates the raw sensor values and filters the IMU's.
 
     .. pydrake_system::
 
-        name: Calibration
+        name: calibration
         input_ports:
         - raw
         output_ports:
@@ -84,64 +89,80 @@ class Calibration(AddressedSystem):
     Both ports are [imu (6), joint_encoders (18), foot_contact (6)]. The IMU's biases and the encoders' offsets are
     subtracted; then the IMU's values pass a first-order low-pass with the time constant tau,
     ``y += (1 - exp(-T / tau)) (u - y)``. The output is the state of the last sample.
+
+    Args:
+        period: The sample period T in s.
+        morphology: The robot's, whose nominal stance is the first measurement.
     """
+    stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
 
-    def __init__(self, *, period: float, morphology: Morphology) -> None:
-        super().__init__()
-        self._period = period
-        stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
-        joints, feet = stance.size, len(LEGS)
-        self._raw = self.DeclareVectorInputPort("raw", 6 + joints + feet)
-        self._measurements = self.declare_discrete_state(
-            imu=Quantity(np.zeros(6), "rad/s, m/s^2"),
-            joint_encoders=Quantity(stance, "rad"),
-            foot_contact=Quantity(np.zeros(feet), bounds=(0.0, 1.0)),
-        )
-        self.DeclareStateOutputPort("measurements", self._measurements.index)
-        # What is subtracted from every raw value, then tau.
-        self._settings = self.declare_parameters(
-            gyro_bias=Quantity(np.zeros(3), "rad/s", (-1.0, 1.0)),
-            accelerometer_bias=Quantity(np.zeros(3), "m/s^2", (-1.0, 1.0)),
-            encoder_offset=Quantity(np.zeros(joints), "rad", (-0.1, 0.1)),
-            contact_offset=Quantity(np.zeros(feet), addressed=False),
-            imu_time_constant=Quantity(0.02, "s", (0.0, 10.0)),
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+    def step(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> Mapping[str, Expression]:
+        tau = p.imu_time_constant
+        decay = casadi.if_else(tau > 0.0, casadi.exp(-period / tau), 0.0)
+        imu = u.imu_raw - casadi.vertcat(p.gyro_bias, p.accelerometer_bias)
+        return {
+            "imu": imu + casadi.if_else(decay > 0.0, decay * (x.imu - imu), 0.0),
+            "joint_encoders": u.joint_encoders_raw - p.encoder_offset,
+            "foot_contact": u.foot_contact_raw,
+        }
 
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        settings, measurements = self._settings.array(context), self._measurements.mutable_array(state)
-        calibrate(settings, self._raw.Eval(context), measurements, filtered=SENSOR_SIGNALS["imu"], period=self._period)
+    raw = NamedVector(**{f"{signal}_raw": Quantity(np.zeros(size)) for signal, size in SENSOR_SIGNALS.items()})
+    measurements = NamedVector(
+        imu=Quantity(np.zeros(6), "rad/s, m/s^2"),
+        joint_encoders=Quantity(stance, "rad"),
+        foot_contact=Quantity(np.zeros(len(LEGS)), bounds=(0.0, 1.0)),
+    )
+    parameters = NamedVector(
+        gyro_bias=Quantity(np.zeros(3), "rad/s", (-1.0, 1.0)),
+        accelerometer_bias=Quantity(np.zeros(3), "m/s^2", (-1.0, 1.0)),
+        encoder_offset=Quantity(np.zeros(stance.size), "rad", (-0.1, 0.1)),
+        imu_time_constant=Quantity(0.02, "s", (0.0, 10.0)),
+    )
+    return packed_system(
+        "calibration",
+        step,
+        state={"measurements": measurements},
+        inputs={"raw": raw},
+        parameters=parameters,
+        period=period,
+    )
 
 
-class CommandLimiter(AddressedSystem):
-    """A system that keeps joint commands within the ranges and the speed of the joints.
+def make_command_limiter(*, period: float, morphology: Morphology) -> System:
+    """Return the system that keeps joint commands within the ranges and the speed of the joints.
 
     .. pydrake_system::
 
-        name: CommandLimiter
+        name: act
         input_ports:
-        - joint_position
+        - target
         output_ports:
         - joint_position
 
-    The output is the state of the last sample: the input, no further than ``rate * T`` from the command before, and
+    The output is the state of the last sample: the target, no further than ``rate * T`` from the command before, and
     between ``lower`` and ``upper``. The first command is the nominal stance.
+
+    Args:
+        period: The sample period T in s.
+        morphology: The robot's, with the ranges and the speed of its joints.
     """
+    stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
 
-    def __init__(self, *, period: float, morphology: Morphology) -> None:
-        super().__init__()
-        self._period = period
-        stance = LegKinematics(morphology).inverse(morphology.stance).ravel()
-        self._target = self.DeclareVectorInputPort("joint_position", stance.size)
-        self._command = self.declare_discrete_state(joint_position=Quantity(stance, "rad"))
-        self.DeclareStateOutputPort("joint_position", self._command.index)
-        self._limits = self.declare_parameters(
-            lower=Quantity(morphology.joint_lower, "rad", (-np.pi, np.pi)),
-            upper=Quantity(morphology.joint_upper, "rad", (-np.pi, np.pi)),
-            rate=Quantity(morphology.joint_speed, "rad/s", (0.0, morphology.joint_speed)),
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+    def step(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> Mapping[str, Expression]:
+        reach = p.rate * period
+        command = x.joint_position + clamp(u.angles - x.joint_position, -reach, reach)
+        return {"joint_position": clamp(command, p.lower, p.upper)}
 
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        limits, command = self._limits.array(context), self._command.mutable_array(state)
-        limit(limits, self._target.Eval(context), command, period=self._period)
+    parameters = NamedVector(
+        lower=Quantity(morphology.joint_lower, "rad", (-np.pi, np.pi)),
+        upper=Quantity(morphology.joint_upper, "rad", (-np.pi, np.pi)),
+        rate=Quantity(morphology.joint_speed, "rad/s", (0.0, morphology.joint_speed)),
+    )
+    return packed_system(
+        "act",
+        step,
+        state={"joint_position": NamedVector(joint_position=Quantity(stance, "rad"))},
+        inputs={"target": NamedVector(angles=Quantity(stance, "rad"))},
+        parameters=parameters,
+        period=period,
+    )

@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import pi
+from types import SimpleNamespace
+from typing import Any
 
+import casadi
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues
+from pydrake.systems.framework import System
 
-from vtbdrake.state import AddressedSystem, Quantity
+from vtbdrake.state import NamedVector, Quantity
+from vtbdrake_diagrams.packed_system import packed_system
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
-from vtbdrake_diagrams.space_climber.morphology import LEGS, Morphology
-from vtbdrake_diagrams.space_climber.pose_filter import PoseFilter
+from vtbdrake_diagrams.space_climber.morphology import JOINT_NAMES, LEGS, Morphology
+
+Expression = Any  # casadi.SX, or numbers
+
+MEASUREMENTS = NamedVector(
+    imu=Quantity(np.zeros(6), "rad/s, m/s^2"),
+    joint_encoders=Quantity(np.zeros(len(JOINT_NAMES)), "rad"),
+    foot_contact=Quantity(np.zeros(len(LEGS)), bounds=(0.0, 1.0)),
+)
+"""What the estimator reads."""
+
+# The rates of roll and yaw are singular at a pitch of +-90 deg.
+_LEAST_COSINE = 0.05
 
 
-class PerceivedEnvironment(AddressedSystem):
-    r"""An estimator: attitude by a complementary filter, position by leg odometry.
+def make_perceived_environment(*, period: float, morphology: Morphology) -> System:
+    r"""Return the estimator: attitude by a complementary filter, position by leg odometry.
 
     .. pydrake_system::
 
-        name: PerceivedEnvironment
+        name: env
         input_ports:
         - measurements
         output_ports:
         - pose
+        - memory
 
     ``measurements`` is [imu (6), joint_encoders (18), foot_contact (6)], ``pose`` is [roll, pitch, yaw, x, y, height],
     the state of the last sample.
@@ -38,29 +55,90 @@ class PerceivedEnvironment(AddressedSystem):
     Position: feet that are on the ground at two successive samples stand still, so the body moves against their mean
     displacement. The height is the torso's centre's over the ground under the feet, on average.
     """
+    legs = LegKinematics(morphology)
+    count = len(LEGS)
 
-    def __init__(self, *, period: float, morphology: Morphology) -> None:
-        super().__init__()
-        self._filter = PoseFilter(LegKinematics(morphology), foot_radius=morphology.foot_radius, period=period)
-        legs = len(LEGS)
-        self._measurements = self.DeclareVectorInputPort("measurements", 6 + 4 * legs)
-        angle, flag = Quantity(0.0, "rad", (-pi, pi)), (0.0, 1.0)
-        self._pose = self.declare_discrete_state(
-            roll=angle, pitch=angle, yaw=angle, position=Quantity([0.0, 0.0, morphology.torso_clearance], "m")
-        )
-        self.DeclareStateOutputPort("pose", self._pose.index)
-        self._memory = self.declare_discrete_state(
-            attitude_known=Quantity(0.0, bounds=flag),
-            standing=Quantity(np.zeros(legs), bounds=flag),
-            feet=Quantity(np.zeros((legs, 2)), "m"),
-        )
-        self._settings = self.declare_parameters(time_constant=Quantity(2.0, "s", (0.0, 1e3)))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+    def step(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> Mapping[str, Expression]:
+        tau = p.time_constant
+        slowly = casadi.logic_and(x.attitude_known != 0.0, tau > 0.0)
+        trust = casadi.if_else(slowly, 1.0 - casadi.exp(-period / tau), 1.0)
+        attitude = casadi.vertcat(x.roll, x.pitch, x.yaw)
+        feels = casadi.sum1(u.imu[3:] != 0.0) > 0.0
+        attitude = casadi.if_else(feels, complementary_filter(attitude, u.imu, period=period, trust=trust), attitude)
+        feet = legs.feet(casadi.reshape(u.joint_encoders, 3, count).T) @ rotation(attitude).T
+        stands = u.foot_contact != 0.0
+        stood = casadi.logic_and(stands, x.standing != 0.0)
+        still, down = casadi.sum1(stood), casadi.sum1(stands)
+        moved = casadi.sum1(casadi.repmat(stood, 1, 2) * (x.feet - feet[:, :2])).T / still
+        height = morphology.foot_radius - casadi.sum1(stands * feet[:, 2]) / down
+        place = casadi.if_else(still > 0.0, x.position[:2] + moved, x.position[:2])
+        return {
+            "roll": attitude[0],
+            "pitch": attitude[1],
+            "yaw": attitude[2],
+            "position": casadi.vertcat(place, casadi.if_else(down > 0.0, height, x.position[2])),
+            "attitude_known": casadi.if_else(feels, 1.0, x.attitude_known),
+            "standing": u.foot_contact,
+            "feet": feet[:, :2],
+        }
 
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        self._filter.step(
-            self._settings.view(context).time_constant,
-            self._measurements.Eval(context),
-            self._pose.mutable_array(state),
-            self._memory.mutable_array(state),
-        )
+    angle, flag = Quantity(0.0, "rad", (-pi, pi)), (0.0, 1.0)
+    pose = NamedVector(
+        roll=angle, pitch=angle, yaw=angle, position=Quantity([0.0, 0.0, morphology.torso_clearance], "m")
+    )
+    memory = NamedVector(
+        attitude_known=Quantity(0.0, bounds=flag),
+        standing=Quantity(np.zeros(count), bounds=flag),
+        feet=Quantity(np.zeros((count, 2)), "m"),
+    )
+    return packed_system(
+        "env",
+        step,
+        state={"pose": pose, "memory": memory},
+        inputs={"measurements": MEASUREMENTS},
+        parameters=NamedVector(time_constant=Quantity(2.0, "s", (0.0, 1e3))),
+        period=period,
+    )
+
+
+def complementary_filter(attitude: Expression, imu: Expression, *, period: float, trust: Expression) -> Expression:
+    """Return [roll, pitch, yaw], (3, 1), after one period.
+
+    Args:
+        attitude: [roll, pitch, yaw] in rad, (3, 1).
+        imu: The angular velocity in rad/s, then the specific force in m/s^2, in the body's frame, (6, 1).
+        period: The sample period in s.
+        trust: The weight of the specific force, in [0, 1].
+    """
+    roll, pitch, yaw = (attitude[k] for k in range(3))
+    wx, wy, wz, fx, fy, fz = (imu[k] for k in range(6))
+    sr, cr, cp = casadi.sin(roll), casadi.cos(roll), casadi.cos(pitch)
+    cp = casadi.if_else(casadi.fabs(cp) > _LEAST_COSINE, cp, casadi.copysign(_LEAST_COSINE, cp))
+    yaw_rate = (sr * wy + cr * wz) / cp
+    roll = roll + period * (wx + casadi.sin(pitch) * yaw_rate)
+    pitch = pitch + period * (cr * wy - sr * wz)
+    yaw = yaw + period * yaw_rate
+    roll = roll + trust * wrap(casadi.atan2(fy, fz) - roll)
+    pitch = pitch + trust * (casadi.atan2(-fx, casadi.sqrt(fy * fy + fz * fz)) - pitch)
+    # Over the top: the same orientation with its pitch in [-90, 90] deg.
+    over = pi * (casadi.fabs(pitch) > pi / 2)
+    pitch = casadi.if_else(over > 0.0, casadi.asin(casadi.sin(pitch)), pitch)
+    return casadi.vertcat(wrap(roll + over), pitch, wrap(yaw + over))
+
+
+def rotation(attitude: Expression) -> Expression:
+    """Return R_WB = Rz(yaw) Ry(pitch) Rx(roll), (3, 3), of [roll, pitch, yaw], (3, 1)."""
+    roll, pitch, yaw = attitude[0], attitude[1], attitude[2]
+    sr, cr, sp, cp = casadi.sin(roll), casadi.cos(roll), casadi.sin(pitch), casadi.cos(pitch)
+    sy, cy = casadi.sin(yaw), casadi.cos(yaw)
+    return casadi.vertcat(
+        casadi.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        casadi.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        casadi.horzcat(-sp, cp * sr, cp * cr),
+    )
+
+
+def wrap(angle: Expression) -> Expression:
+    """Return ``angle`` wrapped to [-pi, pi)."""
+    turned = casadi.fmod(angle + pi, 2.0 * pi)
+    return casadi.if_else(turned < 0.0, turned + 2.0 * pi, turned) - pi

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from math import cos, exp, hypot, pi, sin
+from collections.abc import Mapping
+from math import pi
+from types import SimpleNamespace
 
+import casadi
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, DiscreteValues
+from pydrake.systems.framework import Context, DiscreteValues, System
 
+from vtbdrake.components.casadi_system import clamp
 from vtbdrake.components.sensors import ErrorModel, SampledSensor
-from vtbdrake.state import AddressedSystem, NamedVector, Quantity
-from vtbdrake_diagrams.space_climber.pose_filter import wrap
+from vtbdrake.state import NamedVector, Quantity
+from vtbdrake_diagrams.packed_system import Expression, packed_system
+from vtbdrake_diagrams.space_climber.estimation import rotation, wrap
 
-_ANGLE = Quantity(0.0, "rad")
-# The port ``input`` of a `Navigator`.
+# The port ``input`` of the navigator.
 _INPUT = NamedVector(
-    roll=_ANGLE,
-    pitch=_ANGLE,
-    yaw=_ANGLE,
-    position=Quantity([0.0, 0.0], "m"),
+    rpy=Quantity(np.zeros(3), "rad"),
+    leg_position=Quantity([0.0, 0.0], "m"),
     height=Quantity(0.0, "m"),
-    heading=_ANGLE,
-    walk=Quantity(0.0),
+    commanded_heading=Quantity(0.0, "rad"),
+    commanded_walk=Quantity(0.0),
     visual_odometry=Quantity(np.zeros(3), "m/s"),
 )
 
@@ -72,17 +74,18 @@ class VisualOdometer(SampledSensor):
         return velocity
 
 
-class Navigator(AddressedSystem):
-    r"""A system that turns the command "walk in this direction" into the heading and the walk command of the gait.
+def make_navigator(*, period: float) -> System:
+    r"""Return the system that turns the command "walk in this direction" into heading and walk command of the gait.
 
     .. pydrake_system::
 
-        name: Navigator
+        name: navigator
         input_ports:
         - input
         output_ports:
         - course
         - walk
+        - memory
 
     ``input`` is [roll, pitch, yaw, x, y, height (the estimated pose), heading, walk (the commands), visual_odometry
     (3)]: everything comes from the robot's own sensors and commands.
@@ -101,64 +104,60 @@ class Navigator(AddressedSystem):
     Tip: ``tipped`` becomes 1 when the estimated roll or pitch exceeds ``tip_angle``, and stays 1; the robot then stops.
     """
 
-    def __init__(self, *, period: float) -> None:
-        super().__init__()
-        self._period = period
-        self._input = self.DeclareVectorInputPort("input", _INPUT.size)
-        flag, point = Quantity(0.0, bounds=(0.0, 1.0)), Quantity([0.0, 0.0], "m")
-        self._course = self.declare_discrete_state(course=Quantity(0.0, "rad"))
-        self._walk = self.declare_discrete_state(walk=flag)
-        for port, group in (("course", self._course), ("walk", self._walk)):
-            self.DeclareStateOutputPort(port, group.index)
-        self._memory = self.declare_discrete_state(
-            position=point,
-            slip=Quantity([0.0, 0.0], "m/s"),
-            slipping=flag,
-            tipped=flag,
-            under_way=flag,
-            origin=point,
-            heading=Quantity(0.0, "rad"),
-            last_step=point,
-        )
-        self._settings = self.declare_parameters(
-            course_gain=Quantity(0.3, "rad/m", (0.0, 10.0)),
-            course_limit=Quantity(0.5, "rad", (0.0, pi / 2)),
-            slip_time=Quantity(2.0, "s", (0.0, 1e3)),
-            slip_limit=Quantity(0.05, "m/s", (0.0, 10.0)),
-            tip_angle=Quantity(0.8, "rad", (0.0, pi)),
-        )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+    def step(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> Mapping[str, Expression]:
+        velocity = rotation(u.rpy)[:2, :] @ u.visual_odometry
+        position = x.position + period * velocity
+        share = casadi.if_else(p.slip_time > 0.0, 1.0 - casadi.exp(-period / p.slip_time), 1.0)
+        slip = x.slip + share * ((u.leg_position - x.last_step) / period - velocity - x.slip)
+        tips = casadi.logic_or(casadi.fabs(u.rpy[0]) > p.tip_angle, casadi.fabs(u.rpy[1]) > p.tip_angle)
+        tipped = casadi.if_else(tips, 1.0, x.tipped)
+        walks = u.commanded_walk > 0.0
+        goes_on = casadi.logic_and(x.under_way != 0.0, u.commanded_heading == x.heading)
+        begins = casadi.logic_and(walks, casadi.logic_not(goes_on))
+        origin = casadi.if_else(begins, position, x.origin)
+        apart = position - origin
+        aside = casadi.cos(u.commanded_heading) * apart[1] - casadi.sin(u.commanded_heading) * apart[0]
+        correction = casadi.if_else(walks, clamp(p.course_gain * aside, -p.course_limit, p.course_limit), 0.0)
+        return {
+            "course": wrap(u.commanded_heading - correction),
+            "walk": casadi.if_else(tipped, 0.0, u.commanded_walk),
+            "position": position,
+            "slip": slip,
+            "slipping": casadi.norm_2(slip) > p.slip_limit,
+            "tipped": tipped,
+            "under_way": walks,
+            "origin": origin,
+            "heading": u.commanded_heading,
+            "last_step": u.leg_position,
+        }
 
-    def _update(self, context: Context, state: DiscreteValues) -> None:
-        T, settings, memory = self._period, self._settings.view(context), self._memory.mutable(state)
-        u = _INPUT.view(self._input.Eval(context))
-        heading, walk, roll, pitch = u.heading, u.walk, u.roll, u.pitch
-        # Numbers, which are faster than arrays of two.
-        leg_x, leg_y, last_x, last_y = *u.position.tolist(), *memory.last_step.tolist()
-        x, y, slip_x, slip_y = *memory.position.tolist(), *memory.slip.tolist()
-        vx, vy = horizontal(u.visual_odometry.tolist(), roll, pitch, u.yaw)
-        x, y = x + T * vx, y + T * vy
-        share = 1.0 - exp(-T / settings.slip_time) if settings.slip_time > 0.0 else 1.0
-        slip_x += share * ((leg_x - last_x) / T - vx - slip_x)
-        slip_y += share * ((leg_y - last_y) / T - vy - slip_y)
-        tip_angle, limit = settings.tip_angle, settings.course_limit
-        if abs(roll) > tip_angle or abs(pitch) > tip_angle:
-            memory.tipped = 1.0
-        if walk > 0.0 and not (memory.under_way and heading == memory.heading):
-            memory.origin = x, y
-        x0, y0 = memory.origin.tolist()
-        aside = cos(heading) * (y - y0) - sin(heading) * (x - x0)
-        correction = min(max(settings.course_gain * aside, -limit), limit) if walk > 0.0 else 0.0
-        memory.position, memory.slip, memory.last_step = (x, y), (slip_x, slip_y), u.position
-        memory.slipping = hypot(slip_x, slip_y) > settings.slip_limit
-        memory.under_way, memory.heading = walk > 0.0, heading
-        self._course.mutable(state).course = wrap(heading - correction)
-        self._walk.mutable(state).walk = 0.0 if memory.tipped else walk
-
-
-def horizontal(v_B: list[float], roll: float, pitch: float, yaw: float) -> tuple[float, float]:
-    """Return the horizontal part of a vector of the frame B in the world, for R_WB = Rz(yaw) Ry(pitch) Rx(roll)."""
-    vx, vy, vz = v_B
-    across = cos(roll) * vy - sin(roll) * vz
-    ahead = cos(pitch) * vx + sin(pitch) * (sin(roll) * vy + cos(roll) * vz)
-    return cos(yaw) * ahead - sin(yaw) * across, sin(yaw) * ahead + cos(yaw) * across
+    flag, point = Quantity(0.0, bounds=(0.0, 1.0)), Quantity([0.0, 0.0], "m")
+    memory = NamedVector(
+        position=point,
+        slip=Quantity([0.0, 0.0], "m/s"),
+        slipping=flag,
+        tipped=flag,
+        under_way=flag,
+        origin=point,
+        heading=Quantity(0.0, "rad"),
+        last_step=point,
+    )
+    parameters = NamedVector(
+        course_gain=Quantity(0.3, "rad/m", (0.0, 10.0)),
+        course_limit=Quantity(0.5, "rad", (0.0, pi / 2)),
+        slip_time=Quantity(2.0, "s", (0.0, 1e3)),
+        slip_limit=Quantity(0.05, "m/s", (0.0, 10.0)),
+        tip_angle=Quantity(0.8, "rad", (0.0, pi)),
+    )
+    return packed_system(
+        "navigator",
+        step,
+        state={
+            "course": NamedVector(course=Quantity(0.0, "rad")),
+            "walk": NamedVector(walk=flag),
+            "memory": memory,
+        },
+        inputs={"input": _INPUT},
+        parameters=parameters,
+        period=period,
+    )

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import casadi
 import numpy as np
 import pytest
+from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, LeafSystem
 
 from vtbdrake_diagrams.space_climber.dps import make_dps
+from vtbdrake_diagrams.space_climber.estimation import complementary_filter, rotation, wrap
 from vtbdrake_diagrams.space_climber.kinematics import LegKinematics
 from vtbdrake_diagrams.space_climber.morphology import Morphology
-from vtbdrake_diagrams.space_climber.pose_filter import complementary_filter, wrap
 
 PERIOD = 0.02
 MORPHOLOGY = Morphology()
@@ -99,10 +101,15 @@ def test_first_specific_force_sets_roll_and_pitch() -> None:
     assert element(dps, context, "env", "pitch") == pytest.approx(pitch, abs=1e-12)
 
 
+def filtered(attitude: list[float], imu: list[float], *, period: float, trust: float) -> list[float]:
+    following = complementary_filter(casadi.DM(attitude), casadi.DM(imu), period=period, trust=trust)
+    return following.full().ravel().tolist()
+
+
 def test_complementary_filter_forgets_with_its_time_constant() -> None:
     attitude, trust = [0.1, 0.1, 0.5], 1.0 - np.exp(-0.02 / 2.0)
     for _ in range(100):  # one time constant of 2 s, at rest and level
-        attitude = complementary_filter(attitude, [0, 0, 0, 0, 0, 9.81], period=0.02, trust=trust)
+        attitude = filtered(attitude, [0, 0, 0, 0, 0, 9.81], period=0.02, trust=trust)
     np.testing.assert_allclose(attitude, [0.1 * np.exp(-1), 0.1 * np.exp(-1), 0.5], rtol=1e-9)
 
 
@@ -112,13 +119,20 @@ def test_gyro_alone_integrates_a_turn_of_a_tilted_body() -> None:
     attitude = [0.0, pitch, 0.0]
     w_B = [-rate * np.sin(pitch), 0.0, rate * np.cos(pitch)]
     for _ in range(2000):
-        attitude = complementary_filter(attitude, [*w_B, 0, 0, 1.0], period=dt, trust=0.0)
+        attitude = filtered(attitude, [*w_B, 0, 0, 1.0], period=dt, trust=0.0)
     np.testing.assert_allclose(attitude, [0.0, pitch, 1.0], atol=1e-9)
 
 
 def test_wrap() -> None:
     np.testing.assert_allclose(
-        [wrap(a) for a in (0.0, 3.5, -3.5, 7.0)], [0.0, 3.5 - 2 * np.pi, 2 * np.pi - 3.5, 7 - 2 * np.pi]
+        [float(wrap(a)) for a in (0.0, 3.5, -3.5, 7.0)], [0.0, 3.5 - 2 * np.pi, 2 * np.pi - 3.5, 7 - 2 * np.pi]
+    )
+
+
+def test_rotation_is_that_of_roll_pitch_yaw() -> None:
+    rpy = [0.3, -0.4, 2.0]
+    np.testing.assert_allclose(
+        rotation(casadi.DM(rpy)).full(), RollPitchYaw(rpy).ToRotationMatrix().matrix(), atol=1e-15
     )
 
 

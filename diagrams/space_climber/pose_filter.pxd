@@ -1,1 +1,0 @@
-cpdef double wrap(double angle) noexcept
