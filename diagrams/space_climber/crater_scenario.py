@@ -7,14 +7,15 @@ from typing import Self
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram, DiscreteValues, EventStatus
 
 from vtbdrake.common.settings import setting
 from vtbdrake.components.sensors import ErrorModel
+from vtbdrake.components.sensors.laser_scanner import LaserScannerConfig
 from vtbdrake.state import AddressedSystem, Quantity
 from vtbdrake.testbed import Interface, ScenarioError, Signal, VirtualTestbedBuilder
 from vtbdrake_diagrams.space_climber.dps import make_dps
@@ -37,6 +38,29 @@ FASTEST = 2.0
 
 TIPPED_OVER = np.radians(60.0)
 """From which roll or pitch on the robot has tipped over."""
+
+
+SCANNER_NOISE = 0.012
+"""Standard deviation of a range in m; see `scanner_config`."""
+
+X_BL = RigidTransform(RollPitchYaw(0.0, np.radians(15.0), 0.0), [0.35, 0.0, 0.45])
+"""Pose of the scanner on the torso: on a mast, 0.65 m over the ground, tilted down by 15 deg."""
+
+
+def scanner_config() -> LaserScannerConfig:
+    """Return a nodding line scanner: the numbers of a SICK LMS111, 50 lines per second, a point every 0.5 deg, 20 m.
+
+    Of each line the 120 deg in front are used. The mount nods over 50 deg in two seconds.
+    """
+    return LaserScannerConfig(
+        frequency=0.5,
+        rays_per_second=12_000.0,
+        azimuth=np.radians(120.0),
+        elevation=np.radians(50.0),
+        rows=0,
+        max_range=60.0,
+        reflectivity=0.12,
+    )
 
 
 def _cenic() -> SimulatorConfig:
@@ -72,6 +96,10 @@ class CraterScenario(SpaceClimberScenario):
     boulders: bool = True
     waviness: float = setting(0.0, unit="m", ge=0.0, le=0.1)
     waviness_seed: int = setting(0, ge=0)
+    rock_cover: float = setting(
+        0.0, "Share of the ground that rocks cover, beside the fields of boulders.", ge=0.0, le=0.2
+    )
+    scans: bool = setting(False, "Whether a laser scanner on a mast looks at the terrain in front of the robot.")
     patience: float = setting(
         0.0,
         "A simulation ends when the robot has come no further from the axis (by `PROGRESS`) for so long; 0: never.",
@@ -95,6 +123,7 @@ class CraterScenario(SpaceClimberScenario):
             boulders=self.boulders,
             waviness=self.waviness,
             waviness_seed=self.waviness_seed,
+            rock_cover=self.rock_cover,
         )
 
     def mental(self) -> Self:
@@ -133,10 +162,31 @@ class CraterScenario(SpaceClimberScenario):
         builder.add_sensor("visual_odometry", VisualOdometer(base, period=self._odometer_period, errors=errors))
         monitor = builder.add("env", "climb", EndOfClimb(base, period=10 * self.period, patience=self.patience))
         builder.connect(builder.plant.GetOutputPort("body_poses"), monitor.get_input_port())
+        if self.scans:
+            self._add_scanner(builder)
+
+    def _add_scanner(self, builder: VirtualTestbedBuilder) -> None:
+        # Imported here: without the scanner, the testbed needs no Embree.
+        from vtbdrake.components.ray_casting import RayCaster
+        from vtbdrake.components.sensors.laser_scanner import LaserScanner, connect_laser_scanner
+
+        plant = builder.plant
+        assert plant is not None
+        # What it sees of the robot itself is left out, as a filter would.
+        base = plant.GetBodyByName("base")
+        frame = plant.GetFrameByName("scanner")
+        own = [plant.get_body(index) for index in plant.GetBodyIndices(base.model_instance())]
+        caster = RayCaster(plant, builder.scene_graph, without=own)
+        config, errors = scanner_config(), ErrorModel(noise=SCANNER_NOISE)
+        scanner = LaserScanner(plant, frame, caster, config=config, slice_period=0.2, errors=errors)
+        builder.add("sense", "scanner", scanner)
+        connect_laser_scanner(builder.diagram_builder, scanner, plant)
 
     def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
         crater = self.crater
         add_crater(plant, crater)
+        if self.scans:
+            plant.AddFrame(FixedOffsetFrame("scanner", plant.GetBodyByName("base").body_frame(), X_BL))
         # Level, on the highest of the places under its feet: no foot begins in the ground.
         return RigidTransform([0.0, 0.0, float(crater.mesh_height(Morphology().stance[:, :2]).max())])
 

@@ -19,6 +19,11 @@ d high in every direction; beyond, the ground is flat. What was chosen, and why:
   h^-2.5 between 6 and 50 cm. Counts of blocks on the moon follow power laws too (Cintala and McBride, NASA TM 104804,
   1995); the exponent, and how dense the fields are, are assumed.
 
+* Rocks all around, if `Crater.rock_cover` says so: the share F of the ground that rocks of a diameter of at least D cover
+  is F(D) = k exp(-q D), q = 1.79 + 0.152 / k (1/m), the fit of Golombek and Rapp, J. Geophys. Res. 102 (E2), 1997, to
+  counts at landing sites; k is the rock cover. Those sites have 3 to 18 % (Golombek et al., J. Geophys. Res. 108 (E12),
+  2003). Rocks lie between 0.12 and 1 m, half as high as wide or a little less, where the wall is and not at its foot.
+
 First versions were steeper and had more harmonics, gullies and boulders. Rollouts in craters 0 to 8 showed that half of
 them had no passable direction, and therefore no decision. So the terrain was made easier twice. The present depth,
 slopes and harmonics were chosen by the slopes of 40 craters.
@@ -65,6 +70,12 @@ FIELD_DENSITY = (0.5, 1.5)
 BOULDER_HEIGHT = (0.06, 0.5)
 BOULDER_EXPONENT = 2.5
 
+ROCK_DIAMETER = (0.12, 1.0)
+# Height of a rock over the ground by its diameter, from and to.
+ROCK_HEIGHT = (0.35, 0.5)
+# Distance from the axis from which on there are rocks, and up to which, in m.
+ROCK_DISTANCE = (6.0, RIM_RADIUS + 2.0)
+
 # Distance of the mesh's vertices in the sector, in m.
 _FINE = 2.5
 # Distance of the vertices along gullies, in m.
@@ -73,7 +84,7 @@ _ALONG_GULLY = 1.5
 _COARSE = 12.0
 _THICKNESS = 1.0
 
-_GREY = np.array([0.55, 0.53, 0.50, 1.0])
+GREY = np.array([0.55, 0.53, 0.50, 1.0])
 _BOULDER_GREY = np.array([0.42, 0.40, 0.38, 1.0])
 
 
@@ -135,6 +146,7 @@ class Crater:
         waviness: Standard deviation of the mesh's vertices around the surface, in m. They are `_FINE` apart or more:
             these are waves of metres, and each of the triangles, larger than the robot, is smooth.
         waviness_seed: Determines the waves.
+        rock_cover: Share of the ground that rocks cover, beside the fields of boulders; 0 for none.
     """
 
     seed: int = 0
@@ -142,6 +154,7 @@ class Crater:
     boulders: bool = True
     waviness: float = 0.0
     waviness_seed: int = 0
+    rock_cover: float = 0.0
 
     def wall_slope(self, azimuth: ArrayLike) -> Array:
         """Return a(theta), the largest slope of the wall in rad, at azimuths in rad."""
@@ -185,9 +198,12 @@ class Crater:
 
     @cached_property
     def blocks(self) -> tuple[Boulder, ...]:
-        """Return the boulders; none if they are removed."""
+        """Return the boulders and rocks; none if they are removed."""
         if not self.boulders:
             return ()
+        return (*self._fields(), *self._rocks())
+
+    def _fields(self) -> list[Boulder]:
         rng = np.random.default_rng([self.seed, 2])
         smallest, largest = np.array(BOULDER_HEIGHT) ** -BOULDER_EXPONENT
         scattered = []
@@ -205,7 +221,25 @@ class Crater:
                 Boulder(*row[:2], tuple(row[2:5]), tuple(row[5:]))
                 for row in np.column_stack([x, y, size, rpy]).tolist()
             ]
-        return tuple(scattered)
+        return scattered
+
+    def _rocks(self) -> list[Boulder]:
+        if not self.rock_cover > 0.0:
+            return []
+        rng = np.random.default_rng([self.seed, 4])
+        inner, outer = ROCK_DISTANCE
+        edges = np.linspace(*ROCK_DIAMETER, 89)
+        middles = 0.5 * (edges[1:] + edges[:-1])
+        q = 1.79 + 0.152 / self.rock_cover
+        density = self.rock_cover * -np.diff(np.exp(-q * edges)) / (0.25 * np.pi * middles**2)
+        counts = rng.poisson(density * SECTOR * (outer**2 - inner**2))
+        D = rng.permutation(np.repeat(middles, counts))
+        r = np.sqrt(rng.uniform(inner**2, outer**2, size=D.size))
+        azimuth = rng.uniform(-SECTOR, SECTOR, size=D.size)
+        size = D[:, None] * rng.uniform([0.8, 0.8, 2.0 * ROCK_HEIGHT[0]], [1.2, 1.2, 2.0 * ROCK_HEIGHT[1]], (D.size, 3))
+        rpy = rng.uniform([-0.3, -0.3, -np.pi], [0.3, 0.3, np.pi], (D.size, 3))
+        rows = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), size, rpy]).tolist()
+        return [Boulder(*row[:2], tuple(row[2:5]), tuple(row[5:])) for row in rows]
 
     @cached_property
     def mesh(self) -> tuple[Array, NDArray[np.int64]]:
@@ -268,10 +302,10 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
     vertices, triangles = crater.mesh
     for k, triangle in enumerate(triangles):
         top = vertices[triangle]
-        X_WT, prism = _prism(top)
-        plant.RegisterCollisionGeometry(world, X_WT, prism, f"ground_{k}", default)
+        X_WT, shape = prism(top)
+        plant.RegisterCollisionGeometry(world, X_WT, shape, f"ground_{k}", default)
     plant.RegisterVisualGeometry(
-        world, RigidTransform(), Mesh(obj_mesh(vertices, triangles, name="terrain"), 1.0), "ground", _GREY
+        world, RigidTransform(), Mesh(obj_mesh(vertices, triangles, name="terrain"), 1.0), "ground", GREY
     )
     for k, block in enumerate(crater.blocks):
         X_WB = RigidTransform(RollPitchYaw(block.rpy), [block.x, block.y, float(crater.height(block.x, block.y))])
@@ -279,7 +313,7 @@ def add_crater(plant: MultibodyPlant, crater: Crater) -> None:
         plant.RegisterVisualGeometry(world, X_WB, Box(*block.size), f"boulder_{k}", _BOULDER_GREY)
 
 
-def _prism(top: Array) -> tuple[RigidTransform, Convex]:
+def prism(top: Array) -> tuple[RigidTransform, Convex]:
     """Return pose and shape of the prism below a triangle, (3, 3): from the triangle straight down."""
     center = top.mean(axis=0)
     upper = top - center

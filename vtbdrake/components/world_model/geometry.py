@@ -12,7 +12,7 @@ from vtbdrake.components.world_model.objects import WorldObject
 from vtbdrake.components.world_model.world_model import WorldModel
 
 if TYPE_CHECKING:
-    from pydrake.geometry import Shape
+    from pydrake.geometry import ProximityProperties, Shape
     from pydrake.multibody.plant import MultibodyPlant
 
 # Height at which a crown without its own attributes begins, as a share of the tree's height; assumed.
@@ -36,6 +36,7 @@ class Part:
         X_OS: The pose of the shape in O.
         color: Red, green, blue and opacity, from 0 to 1.
         solid: Whether it also collides; False for leaves.
+        friction: Its coefficient of friction, static and dynamic; None for the default of the SceneGraph.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Part:
     X_OS: RigidTransform
     color: tuple[float, float, float, float]
     solid: bool = True
+    friction: float | None = None
 
 
 def tree_parts(tree: WorldObject) -> Sequence[Part]:
@@ -124,5 +126,17 @@ def add_to_plant(plant: MultibodyPlant, model: WorldModel, *, parts: Mapping[str
         X_WS, name = standing.X_WO @ part.X_OS, f"{standing.identity}/{part.name}"
         plant.RegisterVisualGeometry(world, X_WS, part.shape, name, part.color)
         if part.solid:
-            plant.RegisterCollisionGeometry(world, X_WS, part.shape, name, default)
+            plant.RegisterCollisionGeometry(world, X_WS, part.shape, name, _material(part) or default)
     return len(placed)
+
+
+def _material(part: Part) -> ProximityProperties | None:
+    """Return the properties of a part with a friction of its own."""
+    if part.friction is None:
+        return None
+    from pydrake.geometry import AddContactMaterial, ProximityProperties
+    from pydrake.multibody.plant import CoulombFriction
+
+    properties = ProximityProperties()
+    AddContactMaterial(properties=properties, friction=CoulombFriction(part.friction, part.friction))
+    return properties
