@@ -40,7 +40,7 @@ class BelievedCraterScenario(CraterScenario):
         return self
 
     def _add_ground(self, plant: MultibodyPlant) -> RigidTransform:
-        add_to_plant(plant, self.world, parts=PARTS | {"ground": partial(ground_parts, feet=self.friction)})
+        add_to_plant(plant, self.world, parts={**PARTS, "ground": partial(ground_parts, feet=self.friction)})
         stance = Morphology().stance[:, :2]
         x, y = self.world.find("ground")[0].p_WoOo_W[:2]
         return RigidTransform([x, y, max(self.ground_height(x + dx, y + dy) for dx, dy in stance)])

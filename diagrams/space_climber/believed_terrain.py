@@ -1,4 +1,4 @@
-"""What the robot believes of the terrain: heights, rocks and friction, from a survey and from what it sees and feels."""
+"""What the robot believes of the terrain: heights, rocks, friction, from a survey and what it sees and feels."""
 
 from __future__ import annotations
 
@@ -58,8 +58,9 @@ _LEAST_AROUND = 6
 # Standard deviation of a friction that follows from slip, and how far beside the path it holds, in m.
 _FELT_DEVIATION = 0.04
 _FELT_RANGE = 1.5
-# Below this slope, slip says nothing about friction: something else held the robot back.
-_LEAST_SLOPE = 0.1
+# Below this slope, or with a larger advance, slip says little about friction: turns and steps cost some of the way.
+_LEAST_SLOPE = 0.2
+_LARGEST_ADVANCE = 0.6
 
 LIFE_CYCLE = LifeCycleConfig(confirm=1, forget=2, retire=2, revise=1)
 """One scan from a standing robot confirms a rock, two that should have shown it and do not remove it."""
@@ -113,7 +114,9 @@ class BelievedTerrain:
         away = np.hypot(*(points[:, :2] - p_WL[:2]).T)
         points = points[(away < _GROUND_RANGE) & self.ground.covers(points[:, :2])]
         if not len(points):
-            raise NoReturnError(f"{scan!r} has no return within {_GROUND_RANGE:g} m on the map: look again, or elsewhere")
+            raise NoReturnError(
+                f"{scan!r} has no return within {_GROUND_RANGE:g} m on the map: look again, or elsewhere"
+            )
         over = points[:, 2] - self.ground.height(points[:, :2])
         low = over - _lower(points[:, :2], over)
         about = self.ground.measured(points[np.abs(low) < _ABOUT_GROUND])
@@ -133,10 +136,8 @@ class BelievedTerrain:
             advance: Its way over the ground by the way that its legs stepped.
         """
         path = np.asarray(path, dtype=float)
-        ends = self.ground.height(path[[0, -1]])
-        run = max(float(np.hypot(*(path[-1] - path[0]))), 0.3)
-        slope = float(np.hypot(*self.slopes()[:, *self._vertex(path[-1])])) if run <= 0.3 else float(np.ptp(ends)) / run
-        if slope < _LEAST_SLOPE:
+        slope = float(np.hypot(*(self.slopes()[axis][self._vertex(path[-1])] for axis in range(2))))
+        if slope < _LEAST_SLOPE or advance > _LARGEST_ADVANCE:
             return self
         held_back = np.clip(1.0 - advance, 0.0, 1.0) ** (1.0 / SLIP_EXPONENT)
         measured = slope / max(float(held_back), 0.3)

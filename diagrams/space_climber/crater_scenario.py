@@ -33,6 +33,15 @@ PROGRESS = 0.5
 PASSED = "the robot has passed the rim"
 """The message of a simulation that ends there."""
 
+TIPPED = "the robot has tipped over"
+"""The message of a simulation in which it has."""
+
+STUCK = "the robot is stuck"
+"""The message of a simulation in which it has come no further for its patience."""
+
+ENDS = (PASSED, TIPPED, STUCK)
+"""How a climb may end."""
+
 FASTEST = 2.0
 """The most that the visual odometer measures, in m/s: twenty times as fast as the robot walks."""
 
@@ -231,12 +240,12 @@ class EndOfClimb(AddressedSystem):
             return EventStatus.ReachedTermination(self, PASSED)
         rotation = X_WB.rotation().ToRollPitchYaw()
         if max(abs(rotation.roll_angle()), abs(rotation.pitch_angle())) > TIPPED_OVER:
-            return EventStatus.ReachedTermination(self, "the robot has tipped over")
+            return EventStatus.ReachedTermination(self, TIPPED)
         progress = self._progress.mutable(state)
         if distance > progress.farthest + PROGRESS:
             progress.farthest, progress.checks_since = distance, 0.0
         else:
             progress.checks_since += 1.0
             if self._checks and progress.checks_since >= self._checks:
-                return EventStatus.ReachedTermination(self, "the robot is stuck")
+                return EventStatus.ReachedTermination(self, STUCK)
         return EventStatus.Succeeded()

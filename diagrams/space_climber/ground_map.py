@@ -6,8 +6,8 @@ Gaussian fields and Gaussian Markov random fields", J. R. Stat. Soc. B 73, 2011)
 
     B e = s w,    B = k^2 I + L,    s^2 = 4 pi k^2 sigma^2,    k = sqrt(8) cell / range,    w white,
 
-where L is the graph Laplacian of the grid. So the information of e is Q = B^T B / s^2, which is sparse. A measured point
-at (x, y) is the bilinear interpolation of the four vertices around it, row A_i, plus an error of variance R:
+where L is the graph Laplacian of the grid. So the information of e is Q = B^T B / s^2, which is sparse. A measured
+point at (x, y) is the bilinear interpolation of the four vertices around it, row A_i, plus an error of variance R:
 
     (Q + A^T A / R) z = Q survey + A^T m / R.
 
@@ -97,8 +97,10 @@ class GroundMap:
         """
         places = np.asarray(places, dtype=float).reshape(-1, 2)
         if not (inside := self.covers(places)).all():
-            raise OffTheMapError(f"{places[~inside][0]} m is beside the map: it begins at {self.origin} m, with "
-                                 f"{self.survey.shape} vertices every {self.cell:g} m")
+            raise OffTheMapError(
+                f"{places[~inside][0]} m is beside the map: it begins at {self.origin} m, with "
+                f"{self.survey.shape} vertices every {self.cell:g} m"
+            )
         z: Array = self._interpolation(places) @ (self.heights if heights is None else heights).ravel()
         return z
 
@@ -126,7 +128,9 @@ class GroundMap:
 
     def vertices(self) -> Array:
         """Return (x, y) of the vertices in row-major order, shape (n m, 2)."""
-        x, y = (start + self.cell * np.arange(count) for start, count in zip(self.origin, self.survey.shape, strict=True))
+        x, y = (
+            start + self.cell * np.arange(count) for start, count in zip(self.origin, self.survey.shape, strict=True)
+        )
         return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def _interpolation(self, places: Array) -> sparse.csr_matrix:

@@ -2,9 +2,9 @@ r"""Routes over believed terrain: the cost from every place to beyond the rim, a
 
 A metre costs what it takes in time, in metres on level ground: on a slope s with the friction mu the robot advances by
 1 - (s / mu)^3.7 of its steps (`SLIP_EXPONENT`), so a metre costs the inverse of it, `STEEPEST` at most. A rock that is
-higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. The costs
-to the goal are those of shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths from one
-place).
+higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. The
+costs to the goal are those of shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths from
+one place).
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ class Route:
 
     def path(self, place: ArrayLike, *, length: float) -> Array:
         """Return (x, y) of the nodes of the route from a place on, for a length in m, shape (n, 2)."""
-        i, j = np.clip(np.round((np.asarray(place)[:2] - self.origin) / _STEP).astype(int), 0, np.array(self.cost.shape) - 1)
+        i, j = np.clip(
+            np.round((np.asarray(place)[:2] - self.origin) / _STEP).astype(int), 0, np.array(self.cost.shape) - 1
+        )
         nodes = [(int(i), int(j))]
         steps = [(di * s, dj * s) for di, dj in _NEIGHBOURS for s in (1, -1)]
         while len(nodes) * _STEP < length and self.cost[nodes[-1]] > 0.0:

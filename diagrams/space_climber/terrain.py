@@ -19,8 +19,8 @@ d high in every direction; beyond, the ground is flat. What was chosen, and why:
   h^-2.5 between 6 and 50 cm. Counts of blocks on the moon follow power laws too (Cintala and McBride, NASA TM 104804,
   1995); the exponent, and how dense the fields are, are assumed.
 
-* Rocks all around, if `Crater.rock_cover` says so: the share F of the ground that rocks of a diameter of at least D cover
-  is F(D) = k exp(-q D), q = 1.79 + 0.152 / k (1/m), the fit of Golombek and Rapp, J. Geophys. Res. 102 (E2), 1997, to
+* Rocks all around, if `Crater.rock_cover` says so: rocks of a diameter of at least D cover the share of the ground
+  F(D) = k exp(-q D), q = 1.79 + 0.152 / k (1/m), the fit of Golombek and Rapp, J. Geophys. Res. 102 (E2), 1997, to
   counts at landing sites; k is the rock cover. Those sites have 3 to 18 % (Golombek et al., J. Geophys. Res. 108 (E12),
   2003). Rocks lie between 0.12 and 1 m, half as high as wide or a little less, where the wall is and not at its foot.
 

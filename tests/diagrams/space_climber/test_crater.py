@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.common.value import Value
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 
@@ -15,7 +15,7 @@ import vtbdrake as vtb
 from vtbdrake.rollout import RolloutRunner, RolloutTask
 from vtbdrake.testbed import ScenarioError, VirtualTestbed
 from vtbdrake_diagrams.space_climber import CraterScenario, SpaceClimberScenario
-from vtbdrake_diagrams.space_climber.crater_scenario import EndOfClimb
+from vtbdrake_diagrams.space_climber.crater_scenario import X_BL, EndOfClimb
 from vtbdrake_diagrams.space_climber.terrain import BEYOND, DEPTH, RIM_RADIUS, SECTOR, WALL_DEG, Crater
 
 AROUND = np.linspace(-np.pi, np.pi, 721)
@@ -209,6 +209,25 @@ def test_the_believed_elevation_is_that_of_the_map(mental: VirtualTestbed) -> No
     pose = mental.read(context, "sim.sys.climber.base.pose")
     np.testing.assert_allclose(pose[:3], [*place, 0.21 + float(Crater(1).height(*place))], atol=1e-9)
     assert pose[2] > 0.5
+
+
+@pytest.mark.slow
+def test_the_scanner_sees_the_ground_in_front_of_the_robot() -> None:
+    scenario = replace(CraterScenario(seed=1, boulders=False).mental(), scans=True)
+    testbed = scenario.build()
+    context = testbed.default_context()
+    testbed.write(context, {"u.walk": 0.0})
+    testbed.simulator(context).AdvanceTo(4.2)
+    scanner = testbed.diagram.GetSubsystemByName("sim.sense.scanner")
+    scan = scanner.GetOutputPort("scan").Eval(scanner.GetMyContextFromRoot(context))
+    pose = testbed.read(context, "sim.sys.climber.base.pose")
+    points = (RigidTransform(RollPitchYaw(pose[3:]), pose[:3]) @ X_BL @ scan.points().T).T
+    away = np.hypot(points[:, 0], points[:, 1])
+    assert (np.abs(np.arctan2(points[:, 1], points[:, 0] - 0.35)) < np.radians(70.0)).all()
+    assert 5.0 < away.max() < 20.0
+    over = points[:, 2] - scenario.crater.mesh_height(points[:, :2])
+    assert np.abs(over[away < 6.0]).max() < 0.1
+    assert np.std(over[away < 6.0]) < 0.03
 
 
 @pytest.mark.parametrize(

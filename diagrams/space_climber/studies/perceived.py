@@ -1,0 +1,554 @@
+"""Application R1 from perception to action: the robot sees, builds its world, tries, acts, and looks again.
+
+Before it starts, the robot has a survey from orbit, which is coarse and partly wrong (`survey`). At each stop it looks
+around with its laser scanner, adds what it sees to its semantic world model, builds a mental world of that, tries
+headings there from its belief, and walks `LEG` seconds in the best one. Slip that it felt on the way is friction of the
+patches it walked on. It never sees the crater's seed, and of the true terrain nothing but scans and its own motion.
+
+What a heading is worth is the believed cost to the rim (`route`) at the end of its rollout: less is better. The rollout
+tells what the robot's feet do among the rocks and on the slope next to it, the route what lies beyond.
+
+``python -m vtbdrake_diagrams.space_climber.studies.perceived`` runs craters, and adds them to a file of results.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import date
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlantConfig
+from pydrake.systems.analysis import SimulatorConfig
+
+import vtbdrake as vtb
+from vtbdrake.common.arrays import Array
+from vtbdrake.common.scan import Scan
+from vtbdrake.reasoning import Budget, Decision, Reasoner, SearchConfig
+from vtbdrake.testbed import VirtualTestbed
+from vtbdrake_diagrams.space_climber.believed_scenario import BelievedCraterScenario, believed_world
+from vtbdrake_diagrams.space_climber.believed_terrain import FRICTION, BelievedTerrain, NoReturnError
+from vtbdrake_diagrams.space_climber.crater_scenario import ENDS, PASSED, X_BL, CraterScenario
+from vtbdrake_diagrams.space_climber.ground_map import OffTheMapError
+from vtbdrake_diagrams.space_climber.route import Route, route
+from vtbdrake_diagrams.space_climber.studies.crater import HEADING, LIMIT, MASS, POSE, WALK, differing
+from vtbdrake_diagrams.space_climber.survey import survey
+from vtbdrake_diagrams.space_climber.terrain import RIM_RADIUS
+
+ROCK_COVER = 0.03
+"""The share of the ground that rocks cover, as at the least rocky landing sites; see `terrain`."""
+
+FIRST_SEED = 1000
+"""Craters from this seed on are judged; those below are for looking at."""
+
+LEG = 20.0
+"""How long the robot walks until it looks again, in s: 3.8 m on level ground."""
+
+LOOKING = 4.2
+"""How long it stands and looks, in s: until it stands, and one scan from then on."""
+
+TRIED = 28.0
+"""Horizon of a rollout in s: longer than a leg, so that it does not end in front of a rock."""
+
+SPREAD = np.radians(40.0)
+"""How far beside the route headings are tried, in rad."""
+
+CANDIDATES = 4
+"""How many headings are tried beside the one along the route."""
+
+SPEED = 0.19
+"""What the robot walks on level ground, in m/s."""
+
+ENOUGH = 0.75
+"""The share of the best that is possible from which on no other headings are tried."""
+
+LEAST_GAIN = 0.2
+"""A rollout that brings the robot less far down the cost to the rim, in m, brings it nowhere."""
+
+LONGEST = 450.0
+"""How long a robot may take, its stops included, in s."""
+
+RADIUS = SPEED * TRIED + 3.0
+"""How far a mental world reaches, in m."""
+
+IMPATIENT = 90.0
+"""After how long without progress away from the axis a walk is given up, in s: the way may lead aside."""
+
+HEADINGS = np.linspace(-LIMIT, LIMIT, 13)
+"""Fixed headings in rad, 7.5 deg apart, by which a crater counts as passable, and of which the least steep is one."""
+
+LOOKING_STRATEGIES = ("reasoned", "perceived route")
+STRATEGIES = ("reasoned", "surveyed route", "least slope", "straight", "perceived route")
+COMPARED = STRATEGIES[:4]
+"""The decision, and the baselines that it is compared with. The route over what is seen shows what trying adds."""
+
+RESULTS = Path(__file__).with_name("perceived.jsonl")
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What the robot knew and did at one stop.
+
+    Attributes:
+        time: Simulated time in s.
+        place: Believed place (x, y, z) in m.
+        heading: Heading it went on with, in rad; None if it stood still.
+        tried: Headings in rad that were tried, and by how much each lowers the cost to the rim, in m.
+        said: Why the decision is poor, or why it stands still; empty if it is neither.
+    """
+
+    time: float
+    place: tuple[float, float, float]
+    heading: float | None
+    tried: tuple[tuple[float, float], ...] = ()
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How a strategy ended in a crater.
+
+    Attributes:
+        seed: The crater's seed.
+        strategy: One of `STRATEGIES`, or a fixed heading.
+        reached: Whether the robot passed the rim.
+        duration: Simulated time in s.
+        end: (x, y, z) of the torso at the end, in m.
+        reason: How the simulation ended.
+        stops: The stops.
+        thinking: Processor time in s of building and trying, over all stops.
+    """
+
+    seed: int
+    strategy: str
+    reached: bool
+    duration: float
+    end: tuple[float, float, float]
+    reason: str
+    stops: tuple[Stop, ...] = field(default=(), repr=False)
+    thinking: float = 0.0
+
+
+@dataclass(frozen=True)
+class CostToRim:
+    """The quality of a rollout, which is to be small: the believed cost to the rim in m, see `route`.
+
+    Attributes:
+        route: The route over the believed terrain.
+    """
+
+    route: Route
+
+    def __call__(self, pose: Array) -> float:
+        return self.route.cost_at(pose[:2])
+
+
+def true_world(seed: int) -> CraterScenario:
+    """Return the simulated reality of a crater: friction and mass differ from what is usual, and its ground is wavy."""
+    return replace(
+        differing(seed, seed).scenario,
+        rock_cover=ROCK_COVER,
+        patience=IMPATIENT,
+        scans=True,
+        simulator_config=SimulatorConfig(),
+        plant_config=MultibodyPlantConfig(time_step=0.02, contact_model="point", discrete_contact_approximation="sap"),
+    )
+
+
+class Rover:
+    """The robot in the simulated reality, with what it has in its own sensors and estimates.
+
+    Attributes:
+        testbed: The simulated reality.
+        context: Its state.
+        ended: The message with which the simulation ended; empty while it goes on.
+    """
+
+    def __init__(self, testbed: VirtualTestbed, *, mass: float) -> None:
+        self.testbed = testbed
+        self.context = testbed.default_context()
+        testbed.write(self.context, {WALK: 0.0, MASS: mass * testbed.read(self.context, MASS)})
+        self._simulator = testbed.simulator(self.context)
+        self.ended: str = ""
+
+    @property
+    def time(self) -> float:
+        """Return the simulated time in s."""
+        return float(self.context.get_time())
+
+    @property
+    def place(self) -> Array:
+        """Return where the robot believes to be, (x, y) in m."""
+        place: Array = np.array(self.testbed.read(self.context, "dps.impl.navigator.position"))
+        return place
+
+    @property
+    def stepped(self) -> Array:
+        """Return where its legs have stepped to, (x, y) in m: leg odometry."""
+        stepped: Array = np.array(self.testbed.read(self.context, "dps.env.position"))[:2]
+        return stepped
+
+    def X_WL(self, terrain: BelievedTerrain) -> RigidTransform:
+        """Return the believed pose of the scanner: the elevation is the believed ground's plus the legs' height."""
+        rpy = [float(self.testbed.read(self.context, f"dps.env.{name}")) for name in ("roll", "pitch", "yaw")]
+        height = float(self.testbed.read(self.context, "dps.env.position")[2])
+        place = self.place
+        z = float(terrain.ground.height([place])[0]) + height
+        return RigidTransform(RollPitchYaw(rpy), [*place, z]) @ X_BL
+
+    def scan(self) -> Scan:
+        """Return the last complete scan."""
+        scanner = self.testbed.diagram.GetSubsystemByName("sim.sense.scanner")
+        scan: Scan = scanner.GetOutputPort("scan").Eval(scanner.GetMyContextFromRoot(self.context))
+        return scan
+
+    def advance(self, duration: float, **commands: float) -> None:
+        """Give commands, and go on for a time in s, or to the end of the simulation."""
+        self.testbed.write(self.context, {f"u.{name}": value for name, value in commands.items()})
+        status = self._simulator.AdvanceTo(self.time + duration)
+        if status.reason() == status.ReturnReason.kReachedTerminationCondition:
+            message = status.FormatMessage()
+            self.ended = next((end for end in ENDS if end in message), message)
+
+
+@dataclass
+class Explorer:
+    """The robot's head: what it believes, and how it decides at a stop.
+
+    Attributes:
+        scenario: The robot's own scenario; of its crater nothing is used.
+        terrain: What it believes of the terrain.
+        tries: Whether it tries headings in mental worlds; False follows the route.
+        draws: In how many draws of the terrain each heading is tried, beside the believed one.
+        thinking: Processor time of building and trying so far, in s.
+    """
+
+    scenario: CraterScenario
+    terrain: BelievedTerrain
+    tries: bool = True
+    draws: int = 0
+    thinking: float = 0.0
+
+    def look(self, rover: Rover) -> str:
+        """Add what the robot sees to what it believes; return why it could not, or nothing."""
+        try:
+            self.terrain = self.terrain.seen(rover.scan(), rover.X_WL(self.terrain))
+        except (NoReturnError, OffTheMapError) as error:
+            return str(error)
+        return ""
+
+    def decide(self, rover: Rover) -> Stop:
+        """Return the next heading, or why the robot stands still."""
+        place = rover.place
+        said = self.look(rover)
+        here = (float(place[0]), float(place[1]), float(rover.X_WL(self.terrain).translation()[2]) if not said else 0.0)
+        if said:
+            return Stop(rover.time, here, None, said=said)
+        way = route(self.terrain)
+        ahead = way.heading(place)
+        if not self.tries:
+            return Stop(rover.time, here, ahead)
+        begin = time.process_time()
+        gains = self._try(rover, way, ahead)
+        self.thinking += time.process_time() - begin
+        heading, gain = max(gains.items(), key=lambda pair: pair[1])
+        tried = tuple((float(angle), float(value)) for angle, value in gains.items())
+        if gain < LEAST_GAIN:
+            said = f"poor: of {len(gains)} headings none lowers the cost to the rim by {LEAST_GAIN:g} m"
+        return Stop(rover.time, here, heading, tried, said)
+
+    def _try(self, rover: Rover, way: Route, ahead: float) -> dict[float, float]:
+        """Return for the headings that were tried by how much they lower the cost to the rim, in m: at worst."""
+        rover.testbed.write(rover.context, {HEADING: ahead, WALK: 1.0})
+        start = way.cost_at(rover.place)
+        reasoners = [self._reasoner(way, ahead, rover.place, draw) for draw in range(self.draws + 1)]
+        first = [each.decide(rover.testbed, rover.context, budget=Budget(rollouts=1)) for each in reasoners]
+        along = _gains(first, ahead, start)
+        # As far as the route goes down on the level, over the horizon and without a rock.
+        end = way.path(rover.place, length=SPEED * TRIED)[-1]
+        if min(along.values(), default=-np.inf) >= ENOUGH * (start - way.cost_at(end)):
+            return along
+        return _gains([each.decide(rover.testbed, rover.context) for each in reasoners], ahead, start)
+
+    def _reasoner(self, way: Route, ahead: float, place: Array, draw: int) -> Reasoner:
+        heights = self.terrain.ground.draw(np.random.default_rng(draw)) if draw else None
+        return heading_reasoner(
+            self.mental(place, towards=ahead, heights=heights), CostToRim(way), about=ahead, spread=SPREAD
+        )
+
+    def mental(
+        self, place: ArrayLike, *, towards: float | None = None, heights: Array | None = None
+    ) -> BelievedCraterScenario:
+        """Return the mental world around a place: what the robot believes, as a scenario to simulate."""
+        near = np.asarray(place, dtype=float).tolist()
+        world = self.terrain.world_model(near=near, radius=RADIUS, towards=towards, heights=heights)
+        return believed_world(self.scenario, world, friction=FRICTION[0] - FRICTION[1])
+
+    def felt(self, path: Sequence[Array], stepped: float) -> None:
+        """Take what the robot felt on its way: how far it came by how far it stepped."""
+        way = float(np.linalg.norm(np.diff(np.array(path), axis=0), axis=1).sum())
+        if stepped > 0.5:
+            self.terrain = self.terrain.felt(path, way / stepped)
+
+
+def heading_reasoner(
+    scenario: BelievedCraterScenario, quality: Callable[[Array], float], *, about: float, spread: float
+) -> Reasoner:
+    """Return the reasoner of one stop, which decides the next heading.
+
+    Args:
+        scenario: The mental world.
+        quality: What the pose at the end of a rollout costs, in m.
+        about: The middle of the headings, in rad.
+        spread: How far they reach to either side, in rad.
+    """
+    lower, upper = np.clip([about - spread, about + spread], -np.pi, np.pi)
+    return Reasoner(
+        scenario=scenario,
+        decision=[vtb.Parameter(HEADING, lower, upper)],
+        quality=vtb.Quality(quality, of=POSE, reading="end", minimize=True),
+        budget=Budget(rollouts=CANDIDATES + 1),
+        horizon=TRIED,
+        sample_period=4.0,
+        search=SearchConfig(method="grid", options={"points": CANDIDATES}, executor="serial"),
+    )
+
+
+def _gains(decisions: Sequence[Decision], ahead: float, start: float) -> dict[float, float]:
+    """Return for each heading (rad) the least gain over several decisions, in m; of a failed rollout, a loss of all."""
+    gains: dict[float, float] = {}
+    for decision in decisions:
+        for candidate in decision.candidates:
+            heading = float(candidate.values.get(HEADING, ahead))
+            value = start - candidate.quality if np.isfinite(candidate.quality) else -start
+            gains[heading] = min(gains.get(heading, np.inf), value)
+    return gains
+
+
+class Site:
+    """A crater with the simulated reality and the survey of it, for all strategies.
+
+    Attributes:
+        seed: The crater's seed.
+        world: The simulated reality.
+        terrain: What is known before the robot looks.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.seed: int = seed
+        self.world: CraterScenario = true_world(seed)
+        known = survey(self.world.crater, seed=0)
+        self.terrain: BelievedTerrain = BelievedTerrain(known.ground, known.rocks)
+
+    @cached_property
+    def _testbed(self) -> VirtualTestbed:
+        return self.world.build()
+
+    def rover(self) -> Rover:
+        """Return a robot that stands at the bottom."""
+        return Rover(self._testbed, mass=differing(self.seed, self.seed).mass)
+
+    def run(self, strategy: str) -> Walk:
+        """Let a strategy of `STRATEGIES` find its way out.
+
+        Raises:
+            ValueError: There is no such strategy.
+        """
+        if strategy == "straight":
+            return self.fixed(0.0, strategy)
+        if strategy == "least slope":
+            return self.fixed(least_slope(self.terrain), strategy)
+        if strategy not in STRATEGIES:
+            raise ValueError(f"a strategy is one of {', '.join(STRATEGIES)}, not {strategy!r}")
+        return self.explore(strategy)
+
+    def explore(self, strategy: str = "reasoned", *, draws: int = 0) -> Walk:
+        """Let the robot find its way out with looking, or along the route over the survey.
+
+        Args:
+            strategy: ``reasoned`` tries headings, ``perceived route`` follows the route over what it sees, ``surveyed
+                route`` that over the survey.
+            draws: See `Explorer`.
+        """
+        rover = self.rover()
+        explorer = Explorer(self.world, self.terrain, tries=strategy == "reasoned", draws=draws)
+        way = route(self.terrain)
+        stops: list[Stop] = []
+        while not rover.ended and rover.time < LONGEST:
+            if strategy in LOOKING_STRATEGIES:
+                rover.advance(LOOKING, walk=0.0)
+                stops.append(explorer.decide(rover))
+            else:
+                x, y = rover.place.tolist()
+                stops.append(Stop(rover.time, (x, y, 0.0), way.heading([x, y])))
+            if stops[-1].heading is None or rover.ended:
+                break
+            self._leg(rover, explorer, stops[-1].heading)
+        return _walk(self.seed, strategy, rover, stops, explorer.thinking)
+
+    @staticmethod
+    def _leg(rover: Rover, explorer: Explorer, heading: float) -> None:
+        path, begun = [rover.place], rover.stepped
+        for _ in range(4):
+            rover.advance(0.25 * LEG, heading=heading, walk=1.0)
+            path.append(rover.place)
+        explorer.felt(path, float(np.linalg.norm(rover.stepped - begun)))
+
+    def fixed(self, heading: float, strategy: str = "") -> Walk:
+        """Walk in one heading (rad) until the end."""
+        rover = self.rover()
+        rover.advance(LOOKING, walk=0.0)
+        rover.advance(LONGEST - LOOKING, heading=heading, walk=1.0)
+        return _walk(self.seed, strategy or heading_name(heading), rover)
+
+
+def heading_name(heading: float) -> str:
+    """Return the name of the walk in one heading (rad), which is none of `STRATEGIES`."""
+    return f"{np.degrees(heading):g} deg"
+
+
+def _walk(seed: int, strategy: str, rover: Rover, stops: Sequence[Stop] = (), thinking: float = 0.0) -> Walk:
+    x, y, z = (float(value) for value in rover.testbed.read(rover.context, POSE)[:3])
+    reached = PASSED in rover.ended
+    reason = rover.ended or ("stands still: " + stops[-1].said if stops and stops[-1].heading is None else "time")
+    return Walk(seed, strategy, reached, rover.time, (x, y, z), reason, tuple(stops), thinking)
+
+
+def least_slope(terrain: BelievedTerrain) -> float:
+    """Return the heading in rad, of those at most 45 deg aside, along which the steepest place is the least steep."""
+    gradients, ground = terrain.slopes(), terrain.ground
+    along = np.arange(1.0, RIM_RADIUS + 1.0)
+
+    def steepest(heading: float) -> float:
+        ways = along[:, None] * [np.cos(heading), np.sin(heading)]
+        return float(np.hypot(*(ground.height(ways, gradient) for gradient in gradients)).max())
+
+    return float(min(HEADINGS, key=steepest))
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """All walks in one crater.
+
+    Attributes:
+        seed: The crater's seed.
+        walks: The walks by the names of their strategies, and of fixed headings.
+    """
+
+    seed: int
+    walks: Mapping[str, Walk]
+
+    @property
+    def passable(self) -> bool | None:
+        """Return whether in the true world some fixed heading of `HEADINGS` reaches the rim; None: not known yet."""
+        names = ["straight", "least slope", *map(heading_name, HEADINGS)]
+        if any(self.walks[name].reached for name in names if name in self.walks):
+            return True
+        known = {*self.walks, *([heading_name(0.0)] if "straight" in self.walks else [])}
+        return False if known.issuperset(map(heading_name, HEADINGS)) else None
+
+
+def crossings(walks: Sequence[Walk]) -> tuple[Crossing, ...]:
+    """Return walks by crater, in the order of the seeds."""
+    seeds = sorted({walk.seed for walk in walks})
+    return tuple(Crossing(seed, {walk.strategy: walk for walk in walks if walk.seed == seed}) for seed in seeds)
+
+
+def judged(walks: Sequence[Walk]) -> tuple[Crossing, ...]:
+    """Return the passable craters, from `FIRST_SEED` on, in which all of `COMPARED` have walked."""
+    return tuple(
+        crossing
+        for crossing in crossings(walks)
+        if crossing.seed >= FIRST_SEED and crossing.passable and crossing.walks.keys() >= set(COMPARED)
+    )
+
+
+def digest() -> str:
+    """Return what a result depends on, as a hash of the modules of the testbed and of the studies' parts."""
+    folder = Path(__file__).resolve().parent.parent
+    parts = sorted([*folder.glob("*.py"), folder / "studies" / "crater.py", Path(__file__).resolve()])
+    return sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()[:16]
+
+
+def save(walk: Walk, path: Path = RESULTS) -> None:
+    """Append a walk to a file, a line of JSON each, with the digest of the program and the date."""
+    record = {"digest": digest(), "date": date.today().isoformat(), **asdict(walk)}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+
+
+def load(path: Path = RESULTS) -> tuple[Walk, ...]:
+    """Return the walks of a file; none if there is no file.
+
+    Raises:
+        ValueError: A line of the file is no walk.
+    """
+    if not path.exists():
+        return ()
+    walks = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            walks.append(_read_walk(json.loads(line)))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"line {number} of {path} is no walk: {error!r}") from error
+    return tuple(walks)
+
+
+def _read_walk(record: Mapping[str, Any]) -> Walk:
+    stops = tuple(
+        Stop(stop["time"], tuple(stop["place"]), stop["heading"], tuple(map(tuple, stop["tried"])), stop["said"])
+        for stop in record["stops"]
+    )
+    values = {field.name: record[field.name] for field in fields(Walk)}
+    return Walk(**{**values, "end": tuple(record["end"]), "stops": stops})
+
+
+@click.command()
+@click.option("--first", default=FIRST_SEED, show_default=True, help="Seed of the first crater.")
+@click.option("--count", default=1, show_default=True, help="Number of craters.")
+@click.option("--file", default=str(RESULTS), show_default=True, help="File of results, to which walks are added.")
+@click.option("--strategy", "strategies", multiple=True, default=STRATEGIES, show_default=True, help="What to compare.")
+def main(first: int, count: int, file: str, strategies: tuple[str, ...]) -> None:
+    """Let the robot find its way out of craters, and compare strategies; walks of the file are not repeated."""
+    path = Path(file)
+    for seed in range(first, first + count):
+        site = Site(seed)
+        for strategy in strategies:
+            if not any(walk.seed == seed and walk.strategy == strategy for walk in load(path)):
+                save(site.run(strategy), path)
+        for heading in sorted(HEADINGS, key=abs):
+            crossing = next(each for each in crossings(load(path)) if each.seed == seed)
+            if crossing.passable is None and heading and heading_name(heading) not in crossing.walks:
+                save(site.fixed(heading), path)
+        crossing = next(each for each in crossings(load(path)) if each.seed == seed)
+        for name, walk in crossing.walks.items():
+            click.echo(f"crater {seed}, {name}: {_told(walk)}")
+    cases = judged(load(path))
+    for strategy in COMPARED:
+        count_reached = sum(case.walks[strategy].reached for case in cases)
+        click.echo(f"{strategy}: the rim in {count_reached} of {len(cases)} passable craters")
+
+
+def _told(walk: Walk) -> str:
+    x, y, _ = walk.end
+    end = (
+        f"the rim in {walk.duration:.0f} s" if walk.reached else f"{np.hypot(x, y):.0f} m from the axis, {walk.reason}"
+    )
+    thought = f", {len(walk.stops)} stops, {walk.thinking:.0f} s of thinking" if walk.stops else ""
+    return end + thought
+
+
+if __name__ == "__main__":
+    # Under its own name, so that its functions can be pickled.
+    from vtbdrake_diagrams.space_climber.studies.perceived import main as program
+
+    program(prog_name="python -m vtbdrake_diagrams.space_climber.studies.perceived")
