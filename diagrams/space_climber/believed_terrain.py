@@ -51,7 +51,7 @@ _WIDEST = 1.2
 # Standard deviations of a rock's place and sizes as the scanner sees them, in m.
 _SEEN_PLACE = 0.1
 _SEEN_SIZE = 0.08
-# A rock that is nearer and has so many points within this distance around should have been seen, in m.
+# A rock that is nearer (m) and has at least this many points around it (m) should have been seen.
 _EXPECTED_RANGE = 6.0
 _AROUND = 0.4
 _LEAST_AROUND = 6
@@ -96,7 +96,7 @@ class BelievedTerrain:
         """Return the friction less its standard deviation, at the vertices."""
         return np.maximum(self.friction - np.sqrt(self.friction_variance), 0.05)
 
-    def seen(self, scan: Scan, X_WL: RigidTransform) -> BelievedTerrain:
+    def after_scan(self, scan: Scan, X_WL: RigidTransform) -> BelievedTerrain:
         """Return the belief after a scan of a standing robot.
 
         Low points are ground. What stands out of the ground is a rock; rocks that should have been seen and were not
@@ -128,7 +128,7 @@ class BelievedTerrain:
         expected = self._expected(points, p_WL)
         return replace(self, ground=ground, rocks=observe(self.rocks, sightings, expected=expected, rules=LIFE_CYCLE))
 
-    def felt(self, path: ArrayLike, advance: float) -> BelievedTerrain:
+    def after_slip(self, path: ArrayLike, advance: float) -> BelievedTerrain:
         """Return the belief after the robot walked: where it came forward less than it stepped, friction is less.
 
         Args:
@@ -181,11 +181,11 @@ class BelievedTerrain:
         middles = 0.25 * (vertices[:-1, :-1] + vertices[1:, :-1] + vertices[:-1, 1:] + vertices[1:, 1:])
         offsets = middles - np.asarray(near, dtype=float)
         away = np.hypot(offsets[..., 0], offsets[..., 1])
-        wanted = away < radius
+        in_reach = away < radius
         if towards is not None:
             along = offsets @ [np.cos(towards), np.sin(towards)]
-            wanted &= (away < 2.5) | (along > 0.0)
-        cells = np.argwhere(wanted)
+            in_reach &= (away < 2.5) | (along > 0.0)
+        cells = np.argwhere(in_reach)
         corner = cells[:, :1] * z.shape[1] + cells[:, 1:]
         numbers = corner + np.array([0, z.shape[1], z.shape[1] + 1, 1])
         deviations = ground.deviations(np.unique(numbers))
@@ -256,14 +256,16 @@ def _rocks_of(points: Array, over: Array, p_WL: Array, ground: GroundMap) -> lis
     cluster = numbers[tuple(raster.T)]
     sightings = []
     for number in np.unique(cluster):
-        own, own_over = points[cluster == number], over[cluster == number]
-        parts = np.zeros(len(own), dtype=int)
-        if np.ptp(own[:, :2], axis=0).max() > _WIDEST:
-            _, parts = np.unique(np.floor(own[:, :2] / (0.5 * _WIDEST)).astype(int), axis=0, return_inverse=True)
+        members, heights = points[cluster == number], over[cluster == number]
+        parts = np.zeros(len(members), dtype=int)
+        if np.ptp(members[:, :2], axis=0).max() > _WIDEST:
+            _, parts = np.unique(np.floor(members[:, :2] / (0.5 * _WIDEST)).astype(int), axis=0, return_inverse=True)
         for part in np.unique(parts):
-            chosen = parts.ravel() == part
-            if chosen.sum() >= _LEAST_POINTS:
-                sightings.append(_sighting(own[chosen], float(own_over[chosen].max()), p_WL, ground))
+            members_of_part = parts.ravel() == part
+            if members_of_part.sum() >= _LEAST_POINTS:
+                sightings.append(
+                    _sighting(members[members_of_part], float(heights[members_of_part].max()), p_WL, ground)
+                )
     return sightings
 
 

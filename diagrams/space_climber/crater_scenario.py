@@ -59,7 +59,7 @@ X_BL = RigidTransform(RollPitchYaw(0.0, np.radians(15.0), 0.0), [0.35, 0.0, 0.45
 def scanner_config() -> LaserScannerConfig:
     """Return a nodding line scanner: the numbers of a SICK LMS111, 50 lines per second, a point every 0.5 deg, 20 m.
 
-    Of each line the 120 deg in front are used. The mount nods over 50 deg in two seconds.
+    The 120 deg in front are used of each line. The mount nods over 50 deg in two seconds.
     """
     return LaserScannerConfig(
         frequency=0.5,
@@ -184,8 +184,8 @@ class CraterScenario(SpaceClimberScenario):
         # What it sees of the robot itself is left out, as a filter would.
         base = plant.GetBodyByName("base")
         frame = plant.GetFrameByName("scanner")
-        own = [plant.get_body(index) for index in plant.GetBodyIndices(base.model_instance())]
-        caster = RayCaster(plant, builder.scene_graph, without=own)
+        robot = [plant.get_body(index) for index in plant.GetBodyIndices(base.model_instance())]
+        caster = RayCaster(plant, builder.scene_graph, without=robot)
         config, errors = scanner_config(), ErrorModel(noise=SCANNER_NOISE)
         scanner = LaserScanner(plant, frame, caster, config=config, slice_period=0.2, errors=errors)
         builder.add("sense", "scanner", scanner)

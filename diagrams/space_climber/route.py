@@ -3,8 +3,8 @@ r"""Routes over believed terrain: the cost from every place to beyond the rim, a
 A metre costs what it takes in time, in metres on level ground: on a slope s with the friction mu the robot advances by
 1 - (s / mu)^3.7 of its steps (`SLIP_EXPONENT`), so a metre costs the inverse of it, `STEEPEST` at most. A rock that is
 higher than the feet are lifted costs `ROCK_COST` more per metre within its radius plus half the robot's width. The
-costs to the goal are those of shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths from
-one place).
+costs to the goal are the costs of shortest paths on a grid with eight neighbours (Dijkstra; A* finds the same paths
+from one place).
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ IMPATIENT = 90.0
 """After how long without progress away from the axis a walk is given up, in s: the way may lead aside."""
 
 HEADINGS = np.linspace(-LIMIT, LIMIT, 13)
-"""Fixed headings in rad, 7.5 deg apart, by which a crater counts as passable, and of which the least steep is one."""
+"""Fixed headings in rad, 7.5 deg apart: a crater is passable if one passes; the least steep one is a strategy."""
 
 LOOKING_STRATEGIES = ("reasoned", "perceived route")
 STRATEGIES = ("reasoned", "surveyed route", "least slope", "straight", "perceived route")
@@ -241,7 +241,7 @@ class Explorer:
     def look(self, rover: Rover) -> str:
         """Add what the robot sees to what it believes; return why it could not, or nothing."""
         try:
-            self.terrain = self.terrain.seen(rover.scan(), rover.X_WL(self.terrain))
+            self.terrain = self.terrain.after_scan(rover.scan(), rover.X_WL(self.terrain))
         except (NoReturnError, OffTheMapError) as error:
             return str(error)
         return ""
@@ -297,7 +297,7 @@ class Explorer:
         """Take what the robot felt on its way: how far it came by how far it stepped."""
         way = float(np.linalg.norm(np.diff(np.array(path), axis=0), axis=1).sum())
         if stepped > 0.5:
-            self.terrain = self.terrain.felt(path, way / stepped)
+            self.terrain = self.terrain.after_slip(path, way / stepped)
 
 
 def heading_reasoner(
@@ -346,8 +346,8 @@ class Site:
     def __init__(self, seed: int) -> None:
         self.seed: int = seed
         self.world: CraterScenario = true_world(seed)
-        known = survey(self.world.crater, seed=0)
-        self.terrain: BelievedTerrain = BelievedTerrain(known.ground, known.rocks)
+        prior = survey(self.world.crater, seed=0)
+        self.terrain: BelievedTerrain = BelievedTerrain(prior.ground, prior.rocks)
 
     @cached_property
     def _testbed(self) -> VirtualTestbed:
@@ -453,8 +453,8 @@ class Crossing:
         names = ["straight", "least slope", *map(heading_name, HEADINGS)]
         if any(self.walks[name].reached for name in names if name in self.walks):
             return True
-        known = {*self.walks, *([heading_name(0.0)] if "straight" in self.walks else [])}
-        return False if known.issuperset(map(heading_name, HEADINGS)) else None
+        walked = {*self.walks, *([heading_name(0.0)] if "straight" in self.walks else [])}
+        return False if walked.issuperset(map(heading_name, HEADINGS)) else None
 
 
 def crossings(walks: Sequence[Walk]) -> tuple[Crossing, ...]:
@@ -531,14 +531,14 @@ def main(first: int, count: int, file: str, strategies: tuple[str, ...]) -> None
                 save(site.fixed(heading), path)
         crossing = next(each for each in crossings(load(path)) if each.seed == seed)
         for name, walk in crossing.walks.items():
-            click.echo(f"crater {seed}, {name}: {_told(walk)}")
+            click.echo(f"crater {seed}, {name}: {_summary(walk)}")
     cases = judged(load(path))
     for strategy in COMPARED:
         count_reached = sum(case.walks[strategy].reached for case in cases)
         click.echo(f"{strategy}: the rim in {count_reached} of {len(cases)} passable craters")
 
 
-def _told(walk: Walk) -> str:
+def _summary(walk: Walk) -> str:
     x, y, _ = walk.end
     end = (
         f"the rim in {walk.duration:.0f} s" if walk.reached else f"{np.hypot(x, y):.0f} m from the axis, {walk.reason}"

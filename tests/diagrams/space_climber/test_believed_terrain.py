@@ -1,4 +1,4 @@
-"""What the robot makes of a scan, against terrain of known shape; the mental world against Drake's own queries."""
+"""The robot's belief after a scan, against terrain of known shape; the mental world against Drake's own queries."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ X_WL = RigidTransform(RollPitchYaw(0.0, -np.arctan(SLOPE), 0.0), [0.0, 0.0, 0.2]
 
 def test_a_scan_shows_ground_and_rock() -> None:
     before = BelievedTerrain(flat_survey(), WorldModel())
-    after = before.seen(scan_of_a_ball_on_a_slope(X_WL), X_WL)
+    after = before.after_scan(scan_of_a_ball_on_a_slope(X_WL), X_WL)
     places = np.array([[2.0, 0.0], [4.0, -2.0], [5.0, 2.0], [4.0, 1.0]])
     np.testing.assert_allclose(after.ground.height(places), SLOPE * places[:, 0], atol=0.03)
     # What it does not see follows from the survey, shifted as its surroundings are.
@@ -73,14 +73,14 @@ def test_rocks_that_are_not_there_are_removed_and_those_out_of_sight_stay() -> N
     behind = rock("survey-1", [-3.0, 0.0, -0.9], diameter=0.5, deviation=0.3, source="survey")
     terrain = BelievedTerrain(flat_survey(), WorldModel([invented, behind]))
     for _ in range(2):
-        terrain = terrain.seen(scan_of_a_ball_on_a_slope(X_WL, ball=False), X_WL)
+        terrain = terrain.after_scan(scan_of_a_ball_on_a_slope(X_WL, ball=False), X_WL)
     assert [each.identity for each in terrain.rocks if each.is_known] == ["survey-1"]
 
 
 def test_a_scan_without_a_return_is_named() -> None:
     terrain = BelievedTerrain(flat_survey(), WorldModel())
     with pytest.raises(NoReturnError, match="no return within 14 m on the map"):
-        terrain.seen(Scan.empty(), X_WL)
+        terrain.after_scan(Scan.empty(), X_WL)
 
 
 def test_slip_is_less_friction_of_the_patches_where_it_was_felt() -> None:
@@ -89,11 +89,11 @@ def test_slip_is_less_friction_of_the_patches_where_it_was_felt() -> None:
     path = [[3.0, 0.0], [3.2, 0.0]]
     at, beside = (7, 10), (7, 15)
     # On 0.6 with 0.2 of the way, mu = 0.6 / 0.8^(1/3.7) = 0.64: no less than believed. On 0.3 it is 0.32.
-    assert terrain.felt(path, 0.2).friction[at] == FRICTION[0]
-    after = BelievedTerrain(flat_survey(), WorldModel()).felt(path, 0.2)
+    assert terrain.after_slip(path, 0.2).friction[at] == FRICTION[0]
+    after = BelievedTerrain(flat_survey(), WorldModel()).after_slip(path, 0.2)
     assert after.cautious_friction[at] == pytest.approx(0.37, abs=0.05)
     assert after.friction[beside] == FRICTION[0]
-    assert BelievedTerrain(flat_survey(), WorldModel()).felt(path, 0.9).friction[at] == FRICTION[0]
+    assert BelievedTerrain(flat_survey(), WorldModel()).after_slip(path, 0.9).friction[at] == FRICTION[0]
     world = after.world_model(near=[3.0, 0.0], radius=2.0)
     patch = next(each for each in world.find("ground") if "friction" in each.attributes)
     testbed = believed_world(CraterScenario(), world, friction=0.54).build()
