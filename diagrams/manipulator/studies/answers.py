@@ -21,6 +21,8 @@ from vtbdrake_diagrams.manipulator.scenario import ManipulatorScenario
 from vtbdrake_diagrams.manipulator.studies.trials import (
     DURATIONS,
     PROGRAM,
+    LawAlongX,
+    RestingForce,
     Track,
     Trial,
     rms,
@@ -39,6 +41,8 @@ SEED = 7
 TOLERANCE = 0.005
 # Largest ratio of the tracking error on the machine to the one in simulation.
 RATIO = 2.0
+# Largest difference of the force on the wall from statics, in simulation and on the machine.
+FORCE_TOLERANCE = 0.05
 
 # Cycles for which the whole testbed commands the machine, in the short version; fewer show nothing.
 COMPARED = 3000
@@ -53,6 +57,7 @@ class Trials:
 
     Attributes:
         simulated, real: The tracks in simulation and on the machine.
+        pressed: The forces on the wall at rest, in simulation and on the machine.
         compared: The number of cycles in which the whole testbed commanded a machine of its own.
         identical: Whether the DPS alone sent the same actuator commands in these cycles, bit for bit.
         latched: The faults for which the guards latched; empty if they did not.
@@ -60,6 +65,7 @@ class Trials:
 
     simulated: Track
     real: Track
+    pressed: tuple[RestingForce, RestingForce]
     compared: int
     identical: bool
     latched: str
@@ -71,10 +77,14 @@ class Trials:
 
     @property
     def holds(self) -> bool:
-        """Return whether the arm follows its motions in both, with the same commands of testbed and DPS alone."""
+        """Return whether the arm follows its motions and presses as statics says in both, by the same commands.
+
+        Testbed and DPS alone have to send the same ones.
+        """
         simulated, real = self.errors
         follows = simulated <= TOLERANCE and real <= min(TOLERANCE, RATIO * simulated)
-        return follows and self.identical and self.compared >= COMPARED and not self.latched
+        presses = all(force.error <= FORCE_TOLERANCE for force in self.pressed)
+        return follows and presses and self.identical and self.compared >= COMPARED and not self.latched
 
 
 def control(full: bool) -> Answer:
@@ -102,10 +112,20 @@ def control(full: bool) -> Answer:
         note=(
             "in simulation "
             + ", ".join(f"{name} {1e3 * simulated:.2f} mm" for name, (simulated, _) in errors.items())
+            + ". Force on the wall: "
+            + "; ".join(f"{name} {_forces(trial)}" for name, trial in trials.items())
             + f". Commands of testbed and DPS alone: {same} in "
             + f"{cycles} cycles. "
             + (f"The guards latched: {latched}." if latched else "The guards never latched.")
         ),
+    )
+
+
+def _forces(trial: Trials) -> str:
+    simulated, real = trial.pressed
+    return (
+        f"by the statics of two springs {simulated.predicted:.1f} N, in simulation {simulated.felt:.1f} N, on the "
+        f"machine {real.felt:.1f} N (off by {real.error:.1%})"
     )
 
 
@@ -130,9 +150,11 @@ def _trials(law: str, full: bool) -> Trials:
         track = run_trial(loop)
         latched += loop.guards.latched
     compared = min(len(sent_by_testbed), len(sent_by_dps))
+    along_x = LawAlongX.of(testbed)
     return Trials(
         simulated,
         track,
+        (simulated.pressing(along_x, scenario), track.pressing(along_x, scenario)),
         compared,
         np.array_equal(sent_by_testbed[:compared], sent_by_dps[:compared]),
         "; ".join(fault.reason for fault in latched),

@@ -30,6 +30,7 @@ FREE = (Motion.SWING, Motion.CIRCLE)
 
 _STEP = 1e-4  # s, of the prediction's integration
 _AT_REST = 1.0  # N/s; a force that changes less belongs to a rest
+_WAITING = 1e-6  # m; a reference that is no further from the end of its press waits there
 
 
 def trial_scenario(law: str) -> ManipulatorScenario:
@@ -128,6 +129,20 @@ class Track:
         clock, along_x = self.clock[during], self.reference[during, 0]
         return Contact(clock, law.force(clock, along_x, scenario), -self.force[during, 0])
 
+    def pressing(self, law: LawAlongX, scenario: ManipulatorScenario) -> RestingForce:
+        """Return the force at which a press has come to rest: the mean over the last quarter of the wait at its end.
+
+        Args:
+            law: The behaviour of the arm along x, whose stiffness counts.
+            scenario: The scenario of the wall.
+        """
+        press = np.flatnonzero(self.motion == Motion.PRESS)
+        along_x = self.reference[press, 0]
+        waiting = press[along_x > along_x.max() - _WAITING]
+        last = waiting[-max(len(waiting) // 4, 1) :]
+        predicted = law.static_force(self.reference[last, 0], scenario)
+        return RestingForce(float(predicted.mean()), float(-self.force[last, 0].mean()))
+
 
 @dataclass(frozen=True)
 class LawAlongX:
@@ -155,6 +170,17 @@ class LawAlongX:
         }
         return cls(**values)
 
+    def static_force(self, along_x: NDArray[np.float64], scenario: ManipulatorScenario) -> NDArray[np.float64]:
+        """Return the force on the wall at rest, of two springs in series, shape (n,), in N.
+
+        Args:
+            along_x: The reference of the tip along x, shape (n,), in m.
+            scenario: The scenario of the wall.
+        """
+        k, depth = scenario.wall_stiffness, np.maximum(along_x - _face(scenario), 0.0)
+        series: NDArray[np.float64] = self.stiffness * k / (self.stiffness + k) * depth
+        return series
+
     def force(
         self, clock: NDArray[np.float64], along_x: NDArray[np.float64], scenario: ManipulatorScenario
     ) -> NDArray[np.float64]:
@@ -163,11 +189,10 @@ class LawAlongX:
         Without inertia the stiffness of two springs in series; else of the mass against the wall, which pushes back by
         Hunt and Crossley's k d (1 + c d').
         """
-        beyond = along_x - (scenario.wall_distance - Arm().ball_radius)
-        k, c = scenario.wall_stiffness, scenario.wall_dissipation
         if self.inertia == 0.0:
-            series: NDArray[np.float64] = self.stiffness * k / (self.stiffness + k) * np.maximum(beyond, 0.0)
-            return series
+            return self.static_force(along_x, scenario)
+        beyond = along_x - _face(scenario)
+        k, c = scenario.wall_stiffness, scenario.wall_dissipation
         fine = np.arange(clock[0], clock[-1], _STEP)
         depths = np.interp(fine, clock, beyond).tolist()
         speeds = np.interp(fine, clock, np.gradient(beyond, clock)).tolist()
@@ -179,6 +204,29 @@ class LawAlongX:
             x += _STEP * rate
             forces.append(push)
         return np.interp(clock, fine, forces)
+
+
+def _face(scenario: ManipulatorScenario) -> float:
+    """Return where the tip meets the wall along x, in m."""
+    return scenario.wall_distance - Arm().ball_radius
+
+
+@dataclass(frozen=True)
+class RestingForce:
+    """The force on the wall at the end of a press.
+
+    Attributes:
+        predicted: By the statics of two springs in series: the law's and the wall's, in N.
+        felt: As the DPS perceives it, in N.
+    """
+
+    predicted: float
+    felt: float
+
+    @property
+    def error(self) -> float:
+        """Return the difference from statics, as a share."""
+        return abs(self.felt / self.predicted - 1.0)
 
 
 @dataclass(frozen=True)

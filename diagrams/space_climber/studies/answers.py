@@ -5,18 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
 from vtbdrake.optimization import Boundary
 from vtbdrake_diagrams.answers import Answer
+from vtbdrake_diagrams.space_climber.scenario import SpaceClimberScenario
 from vtbdrake_diagrams.space_climber.studies import crater
+from vtbdrake_diagrams.space_climber.studies.other_engine import CONTACTS, MujocoClimber
 from vtbdrake_diagrams.space_climber.studies.payload import (
     EARTH,
     ENVIRONMENTS,
     MOON,
     PAPER,
     PHASES,
+    SLOPE,
+    SOLVERS,
     locked_problem,
     payload_problem,
     static_limit,
@@ -25,6 +30,12 @@ from vtbdrake_diagrams.space_climber.studies.payload import (
 
 # How far simulated and static limit of the locked robot may be apart, in kg: the step at which masses were tried.
 LOCKED_STEP = 1.0
+# The environments that are simulated in MuJoCo, too.
+SECOND_ENGINE = (MOON, EARTH, SLOPE)
+# The masses that are tried in MuJoCo, in kg.
+MUJOCO_MASSES = (20.0, 60.0)
+# How far the boundaries of one environment in MuJoCo may be apart, in kg: a wider interval would agree with anything.
+LARGEST_SPREAD = 6.0
 # From how many samples of its belief the robot in the crater tries each heading.
 SAMPLES = 3
 # The share of the craters in which the robot must reach the rim, and by how much more than straight on.
@@ -38,13 +49,35 @@ class PayloadAnswer:
 
     Attributes:
         boundaries: The boundary in each of `ENVIRONMENTS`.
+        solvers: The moon's boundary with each of `SOLVERS`.
         locked: The simulated boundary of the robot with locked legs.
         static: Its boundary by statics, in kg.
+        mujoco: Environment -> (lower, upper) in kg in MuJoCo, over `CONTACTS`.
     """
 
     boundaries: Mapping[str, Boundary]
+    solvers: Mapping[str, Boundary]
     locked: Boundary
     static: float
+    mujoco: Mapping[str, tuple[float, float]]
+
+    def interval(self, environment: str) -> tuple[float, float]:
+        """Return (lower, upper) of an environment in kg; the moon's includes what settings of the solver move.
+
+        Args:
+            environment: One of `boundaries`.
+        """
+        bounds = [self.boundaries[environment], *(self.solvers.values() if environment == MOON else [])]
+        return min(bound.lower for bound in bounds), max(bound.upper for bound in bounds)
+
+    @property
+    def apart(self) -> list[str]:
+        """Return the environments in which the two engines disagree: intervals without a common mass, or too wide."""
+        return [name for name, (lower, upper) in self.mujoco.items() if not self._common(name, lower, upper)]
+
+    def _common(self, environment: str, lower: float, upper: float) -> bool:
+        least, most = self.interval(environment)
+        return max(lower, least) <= min(upper, most) and upper - lower <= LARGEST_SPREAD
 
     @property
     def open(self) -> list[str]:
@@ -53,7 +86,9 @@ class PayloadAnswer:
         The slower gaits are beside the question: they show where the order of the worlds comes from.
         """
         walked = {name: bound for name, bound in self.boundaries.items() if "stride" not in ENVIRONMENTS[name]}
-        return [name for name, bound in walked.items() if not (isfinite(bound.lower) and isfinite(bound.upper))]
+        solvers = {f"{MOON}, {name}": bound for name, bound in self.solvers.items()}
+        bounds = {**walked, **solvers}.items()
+        return [name for name, bound in bounds if not (isfinite(bound.lower) and isfinite(bound.upper))]
 
     @property
     def agrees(self) -> bool:
@@ -64,8 +99,8 @@ class PayloadAnswer:
 
     @property
     def holds(self) -> bool:
-        """Return whether each boundary is found, and the one that statics knows is right."""
-        return self.agrees and not self.open
+        """Return whether each boundary is found, statics knows one of them, and MuJoCo those of `SECOND_ENGINE`."""
+        return self.agrees and not self.open and not self.apart and set(SECOND_ENGINE) <= set(self.mujoco)
 
 
 def payload(full: bool) -> Answer:
@@ -80,29 +115,50 @@ def payload(full: bool) -> Answer:
         problem = payload_problem(phases=phases, **fields)
         boundaries[name] = problem.boundary(resolution=0.5 if full else 1.0, coarse=5.0)
     moon = boundaries[MOON]
+    solvers = {
+        name: payload_problem(phases=PHASES if full else PHASES[::2], **fields).boundary(resolution=1.0, coarse=5.0)
+        for name, fields in SOLVERS.items()
+    }
     locked = locked_problem()
     simulated = locked.boundary(resolution=LOCKED_STEP, coarse=10.0, repeats=0)
-    result = PayloadAnswer(boundaries, simulated, static_limit(locked.testbed))
+    mujoco = {name: _in_mujoco(ENVIRONMENTS[name], full) for name in SECOND_ENGINE}
+    result = PayloadAnswer(boundaries, solvers, simulated, static_limit(locked.testbed), mujoco)
     environments = "; ".join(f"{name} {_range(boundary)}" for name, boundary in boundaries.items())
+    settings = "; ".join(f"{name} {_range(boundary)}" for name, boundary in solvers.items())
     feet = "; ".join(f"{name} {limit:.1f} kg" for name, limit in statics(payload_problem().testbed).items())
+    engines = "; ".join(f"{name} {lower:g} to {upper:g} kg" for name, (lower, upper) in mujoco.items())
     return Answer(
         id="O4",
         question="How heavy may a component attached to the SpaceClimber's front be before it is no longer stable?",
         answer=moon.lower,
         unit="kg",
-        interval=(moon.lower, moon.upper),
+        interval=result.interval(MOON),
         paper=PAPER,
         cases=f"{len(boundaries)} environments, {len(moon.by_condition)} start phases of the gait on the moon, "
         f"{len(boundaries[EARTH].by_condition)} elsewhere",
-        held_out="",
+        held_out=f"MuJoCo, its contact, with {len(CONTACTS)} settings: {engines}",
         baseline=f"statics while it walks: {feet}",
         refused=len(result.open),
         holds=result.holds,
         note=(
             "Stable in every rollout up to the first mass, and in none from some start phase at the second; undecided "
-            f"between: {environments}. With locked legs {_range(simulated)}, by statics {result.static:.1f} kg."
+            f"between: {environments}. With other settings of the solver, on the moon: {settings}. With locked legs "
+            f"{_range(simulated)}, by statics {result.static:.1f} kg. "
+            + (f"The engines DISAGREE: {', '.join(result.apart)}." if result.apart else "The engines agree.")
         ),
     )
+
+
+def _in_mujoco(fields: Mapping[str, Any], full: bool) -> tuple[float, float]:
+    """Return the interval of the boundary in MuJoCo, over `CONTACTS`."""
+    phases = PHASES if full else PHASES[::2]
+    bounds = [
+        MujocoClimber(SpaceClimberScenario(**fields), contact=contact).boundary(
+            *MUJOCO_MASSES, resolution=1.0, coarse=5.0, phases=phases
+        )
+        for contact in CONTACTS
+    ]
+    return min(lower for lower, _ in bounds), max(upper for _, upper in bounds)
 
 
 def _range(boundary: Boundary) -> str:

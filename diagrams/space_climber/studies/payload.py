@@ -44,16 +44,27 @@ PAPER = "about 45 kg"
 # Name -> fields of the scenario, or the stride.
 MOON = "moon"
 EARTH = "earth"
+SLOPE = "moon, 10 deg downhill"
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     MOON: {},
     "Mars": {"gravity": 3.71},
     EARTH: {"gravity": 9.81},
-    "moon, 10 deg downhill": {"slope_deg": 10.0},
+    SLOPE: {"slope_deg": 10.0},
     "moon, friction 0.5": {"friction": 0.5},
     "moon, friction 1.1": {"friction": 1.1},
     # How fast it walks for its gravity, by the Froude number v^2 / (g l), decides which of two worlds carries more.
     "moon, a stride in 8 s": {"stride": 8.0},
     "earth, a stride in 8 s": {"gravity": 9.81, "stride": 8.0},
+}
+
+# Name -> fields of the scenario: how else the same world may be integrated, at least as accurately.
+SOLVERS: dict[str, dict[str, Any]] = {
+    "steps of 10 ms": {
+        "simulator_config": SimulatorConfig(integration_scheme="cenic", max_step_size=0.01, accuracy=1e-3)
+    },
+    "an accuracy of 5e-4": {
+        "simulator_config": SimulatorConfig(integration_scheme="cenic", max_step_size=0.025, accuracy=5e-4)
+    },
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vtbdrake_diagrams.manipulator.studies.answers import COMPARED, Trials
-from vtbdrake_diagrams.manipulator.studies.trials import FREE, Track
+from vtbdrake_diagrams.manipulator.studies.trials import FREE, RestingForce, Track
 
 pytestmark = pytest.mark.one_python
 
@@ -21,7 +21,8 @@ def track(error: float) -> Track:
     return Track(motion, 0.001 * np.arange(n), wanted, wanted + np.array([error, 0.0, 0.0]), np.zeros((n, 3)))
 
 
-GOOD = Trials(track(0.002), track(0.003), COMPARED, identical=True, latched="")
+FORCES = (RestingForce(50.0, 50.5), RestingForce(50.0, 48.0))
+GOOD = Trials(track(0.002), track(0.003), FORCES, COMPARED, identical=True, latched="")
 
 
 def test_an_arm_that_follows_holds() -> None:
@@ -36,6 +37,9 @@ def test_an_arm_that_follows_holds() -> None:
         {"simulated": track(np.nan)},
         {"real": track(0.006), "simulated": track(0.004)},
         {"real": track(0.0041)},
+        {"pressed": (FORCES[0], RestingForce(50.0, 52.6))},
+        {"pressed": (RestingForce(50.0, 47.4), FORCES[1])},
+        {"pressed": (FORCES[0], RestingForce(50.0, np.nan))},
         {"identical": False},
         {"compared": 0},
         {"latched": "the torque is not finite"},

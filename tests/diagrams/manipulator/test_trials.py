@@ -60,6 +60,22 @@ def test_statics_against_the_wall_are_those_of_two_springs() -> None:
         assert force[-1] == pytest.approx(expected, rel=1e-3)
 
 
+def test_the_resting_force_is_felt_at_the_end_of_the_wait() -> None:
+    clock = np.arange(0.0, 3.0, 0.005)
+    face = SCENARIO.wall_distance - Arm().ball_radius
+    along_x = face + 0.04 * np.clip(np.minimum(clock, 3.0 - clock), 0.0, 1.0)
+    felt = np.where(clock < 1.75, 0.0, np.where(clock < 2.0, 21.0, 99.0))
+    reference, force = np.zeros((len(clock), 3)), np.zeros((len(clock), 3))
+    reference[:, 0], force[:, 0] = along_x, -felt
+    motion = np.full(len(clock), float(Motion.PRESS))
+    track = Track(motion, clock, reference, reference, force)
+    K, k = 500.0, SCENARIO.wall_stiffness
+    pressing = track.pressing(LawAlongX(8.0, 160.0, K), SCENARIO)
+    assert pressing.predicted == pytest.approx(0.04 * K * k / (K + k))
+    assert pressing.felt == pytest.approx(21.0, abs=2.0)
+    assert pressing.error == pytest.approx(21.0 / pressing.predicted - 1.0, abs=0.1)
+
+
 def test_trial_that_does_not_end_is_told() -> None:
     testbed = SCENARIO.build()
     bridge = protocol_of(SCENARIO).bridge(SCENARIO.interface(), "memq://")

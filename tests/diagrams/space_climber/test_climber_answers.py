@@ -20,7 +20,13 @@ def bounds(lower: float, upper: float) -> Boundary:
     return Boundary("mass", "kg", lower, upper, np.array([[lower, upper]]))
 
 
-HEAVY = PayloadAnswer({"moon": bounds(31.0, 33.0), "earth": bounds(40.0, 41.0)}, bounds(95.0, 96.0), static=96.5)
+HEAVY = PayloadAnswer(
+    {"moon": bounds(31.0, 33.0), "earth": bounds(40.0, 41.0), "moon, 10 deg downhill": bounds(30.0, 31.0)},
+    {"half the step": bounds(32.0, 35.0)},
+    bounds(95.0, 96.0),
+    static=96.5,
+    mujoco={"moon": (34.0, 36.0), "earth": (36.0, 40.0), "moon, 10 deg downhill": (31.0, 32.0)},
+)
 
 
 def test_boundaries_that_are_found_hold() -> None:
@@ -28,16 +34,29 @@ def test_boundaries_that_are_found_hold() -> None:
     assert replace(HEAVY, boundaries=HEAVY.boundaries | {"moon, a stride in 8 s": bounds(60.0, inf)}).holds
 
 
+def test_the_interval_includes_settings_of_the_solver() -> None:
+    assert HEAVY.interval("moon") == (31.0, 35.0)
+    assert HEAVY.interval("earth") == (40.0, 41.0)
+
+
 @pytest.mark.parametrize(
     "change",
     [
-        {"boundaries": {"moon": bounds(-inf, 33.0)}},
-        {"boundaries": {"moon": bounds(31.0, 33.0), "earth": bounds(40.0, inf)}},
+        {"boundaries": HEAVY.boundaries | {"moon": bounds(-inf, 33.0)}},
+        {"boundaries": HEAVY.boundaries | {"earth": bounds(40.0, inf)}},
+        {"solvers": {"half the step": bounds(32.0, inf)}},
+        {"solvers": {"half the step": bounds(-inf, 35.0)}},
+        {"solvers": {}},
         {"locked": bounds(95.0, inf)},
         {"locked": bounds(-inf, 96.0)},
         {"static": 97.1},
         {"static": 93.9},
         {"static": nan},
+        {"mujoco": HEAVY.mujoco | {"earth": (37.0, 39.0)}},
+        {"mujoco": HEAVY.mujoco | {"earth": (42.0, 43.0)}},
+        {"mujoco": HEAVY.mujoco | {"earth": (35.0, 42.0)}},
+        {"mujoco": HEAVY.mujoco | {"earth": (-inf, 40.0)}},
+        {"mujoco": {"moon": (34.0, 36.0), "earth": (36.0, 40.0)}},
     ],
 )
 def test_each_part_of_the_mass_can_fail(change: dict[str, object]) -> None:
