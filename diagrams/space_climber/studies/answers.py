@@ -99,7 +99,7 @@ class PayloadAnswer:
 
     @property
     def holds(self) -> bool:
-        """Return whether each boundary is found, statics knows one of them, and MuJoCo those of `SECOND_ENGINE`."""
+        """Return whether each boundary is bounded, statics confirms one, and MuJoCo confirms `SECOND_ENGINE`."""
         return self.agrees and not self.open and not self.apart and set(SECOND_ENGINE) <= set(self.mujoco)
 
 

@@ -152,11 +152,11 @@ def _hinge(joint: ET.Element) -> str:
 
 def _inertial(link: ET.Element, mass: float | None = None) -> str:
     """Return the inertia of a link; another mass scales it."""
-    own = float(_text(link, "inertial/mass"))
-    scale = 1.0 if mass is None else mass / own
+    nominal = float(_text(link, "inertial/mass"))
+    scale = 1.0 if mass is None else mass / nominal
     tensor = [scale * float(_text(link, f"inertial/inertia/{name}")) for name in _TENSOR]
     place = _pose(link.find("inertial/pose")).translation()
-    return f'<inertial pos="{_numbers(place)}" mass="{scale * own:.12g}" fullinertia="{_numbers(tensor)}"/>'
+    return f'<inertial pos="{_numbers(place)}" mass="{scale * nominal:.12g}" fullinertia="{_numbers(tensor)}"/>'
 
 
 # MuJoCo's order.

@@ -17,6 +17,7 @@ from vtbdrake_diagrams.satellite.studies.trajectory import (
     Comparison,
     Course,
     Survey,
+    TrajectoryAnswer,
     compare,
     plot,
     random_scenarios,
@@ -171,6 +172,40 @@ def test_the_answer_can_be_no(factors, holds, course):
     # One plan beyond a limit is enough.
     fast = replace(comparisons[0].best, rates=1.2 * np.ones(7))
     assert not Survey((*comparisons[1:], Comparison(course, fast))).holds
+
+
+@pytest.mark.parametrize(
+    ("reaching", "anywhere", "onboard", "holds"),
+    [
+        (30.0, 8.0, 20.0, True),
+        (8.0, 30.0, 20.0, False),
+        (30.0, 0.9, 20.0, False),
+        (30.0, 8.0, 9.0, False),
+    ],
+)
+def test_each_kind_of_motion_has_a_verdict(reaching, anywhere, onboard, holds, course):
+    def turned(factor):
+        # A worse plan has to be judged by its end alone.
+        deviations = course.deviations.copy()
+        deviations[-1] /= factor
+        return Comparison(course, replace(course, deviations=deviations))
+
+    kinds = [Survey((turned(factor),) * 20) for factor in (reaching, anywhere)]
+    answer = TrajectoryAnswer(*kinds, turned(onboard))
+    assert answer.holds == holds
+    shown = "a factor of 10 holds" if anywhere > 10.0 else "a factor of 10 is NOT shown"
+    assert f"From any pose to any ({shown})" in str(answer)
+    fast = Comparison(course, replace(course, rates=1.2 * np.ones(7)))
+    assert not replace(answer, onboard=fast).holds
+    assert not replace(answer, anywhere=Survey((*kinds[1].comparisons, fast))).holds
+
+
+def test_largest_deviation_and_integral_are_ratios_to_the_straight_path(course):
+    half = replace(course, deviations=0.5 * course.deviations)
+    survey = Survey((Comparison(course, half),) * 3)
+    assert survey.disturbance == pytest.approx({"largest": 0.5, "integral": 0.5})
+    level = replace(course, times=np.array([0.0, 1.0, 3.0]), deviations=np.array([0.0, 0.2, 0.4]))
+    assert level.integral == pytest.approx(0.7)
 
 
 @pytest.mark.parametrize(
