@@ -362,12 +362,19 @@ class TrajectoryAnswer:
         onboard = self.onboard.factor >= _FACTOR and self.onboard.within_limits
         return self.reaching.holds and self.anywhere.interval[0] > 1.0 and not self.anywhere.outside and onboard
 
-    def __str__(self) -> str:
-        kinds = {"From near the stowed pose to the workspace": self.reaching, "From any pose to any": self.anywhere}
-        return " ".join(
-            f"{kind} (a factor of {_FACTOR:g} {'holds' if result.holds else 'is NOT shown'}): {result}"
-            for kind, result in kinds.items()
-        )
+
+def verdicts(reaching: Survey, anywhere: Survey) -> str:
+    """Return the verdicts about the factor of 10 for two kinds of motions, in words.
+
+    Args:
+        reaching: Motions from near the stowed pose to the workspace.
+        anywhere: Motions from any pose to any.
+    """
+    kinds = {"From near the stowed pose to the workspace": reaching, "From any pose to any": anywhere}
+    return " ".join(
+        f"{kind} (a factor of {_FACTOR:g} {'holds' if result.holds else 'is NOT shown'}): {result}"
+        for kind, result in kinds.items()
+    )
 
 
 def survey(scenarios: Sequence[ArmMotionScenario], *, echo: Callable[[str], None] = lambda line: None) -> Survey:
@@ -413,7 +420,7 @@ def answer(full: bool) -> Answer:
         note=(
             f"In the full testbed: the DPS's decision on board turns the base by {turned[1]:.3f} deg instead of "
             f"{turned[0]:.2f} in the end, by {np.degrees(onboard.best.largest):.2f} instead of "
-            f"{np.degrees(onboard.straight.largest):.2f} at most. {result}"
+            f"{np.degrees(onboard.straight.largest):.2f} at most. {verdicts(result.reaching, anywhere)}"
         ),
     )
 
@@ -446,8 +453,7 @@ def main(figure: str, pairs: int | None, seed: int) -> None:
     if pairs:
         everything = survey(random_scenarios(pairs, seed=seed), echo=click.echo)
         click.echo(str(everything))
-        kinds = Survey(everything.comparisons[0::2]), Survey(everything.comparisons[1::2])
-        click.echo(str(TrajectoryAnswer(*kinds, compare(ArmMotionScenario(onboard=True)))))
+        click.echo(verdicts(Survey(everything.comparisons[0::2]), Survey(everything.comparisons[1::2])))
         return
     comparison = compare(ArmMotionScenario(onboard=True))
     plot({"straight path": comparison.straight, "decided on board": comparison.best}).savefig(figure, dpi=120)
